@@ -1,0 +1,94 @@
+"""Small networks and batches for the losses' tests, all seeded, in float64 unless a test asks otherwise."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+
+from torchrl_h2o.objectives import (
+    DynamicsRatioLoss,
+    ExpectileValueLoss,
+    H2OPlusLoss,
+    MixedBellmanLoss,
+    make_actor,
+    make_dynamics_ratio_estimator,
+    make_qvalue,
+    make_value,
+)
+
+OBSERVATION_DIM, ACTION_DIM = 3, 2
+CELLS = (8, 8)
+
+
+def _spread(module: torch.nn.Module) -> torch.nn.Module:
+    """Last layers start close to zero; spread them, so that a term that is missing shows."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(torch.randn_like(parameter) * 0.5)
+    return module
+
+
+def make_batch(num_real: int = 4, num_sim: int = 3, seed: int = 0, dtype=torch.float64) -> TensorDict:
+    rng = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=rng, dtype=dtype)
+
+    size = num_real + num_sim
+    terminated = torch.arange(size)[:, None] % 3 == 0
+    truncated = torch.arange(size)[:, None] % 3 == 1
+    return TensorDict(
+        observation=normal(size, OBSERVATION_DIM),
+        action=torch.tanh(normal(size, ACTION_DIM)),
+        real=torch.arange(size) < num_real,
+        next=TensorDict(
+            observation=normal(size, OBSERVATION_DIM),
+            reward=normal(size, 1),
+            terminated=terminated,
+            truncated=truncated,
+            done=terminated | truncated,
+        ),
+        batch_size=size,
+    )
+
+
+class Parts:
+    """Fresh networks of one seed and the losses built of them."""
+
+    def __init__(self, seed: int = 0, dtype=torch.float64) -> None:
+        torch.manual_seed(seed)
+        self.dtype = dtype
+        self.actor = self._own(make_actor(OBSERVATION_DIM, Bounded(-1, 1, (ACTION_DIM,), dtype=dtype), CELLS))
+        self.qvalues = [self._own(make_qvalue(OBSERVATION_DIM, ACTION_DIM, CELLS)) for _ in range(2)]
+        self.value = self._own(make_value(OBSERVATION_DIM, CELLS))
+        self.estimator = self._own(make_dynamics_ratio_estimator(OBSERVATION_DIM, ACTION_DIM, CELLS))
+
+    def _own(self, module: torch.nn.Module) -> torch.nn.Module:
+        return _spread(module).to(self.dtype)
+
+    def bellman(self, **kwargs) -> MixedBellmanLoss:
+        return _move_targets(MixedBellmanLoss(self.actor, self.qvalues, self.value, **kwargs))
+
+    def h2o_plus(self, value_loss=ExpectileValueLoss, ratio: bool = True, **kwargs) -> H2OPlusLoss:
+        ratio_loss = DynamicsRatioLoss(self.estimator) if ratio else None
+        loss = H2OPlusLoss(self.actor, self.qvalues, value_loss(self.value), ratio_loss, **kwargs)
+        return _move_targets(loss)
+
+
+def _move_targets(loss):
+    """Targets apart from the online networks, so that reading the wrong one shows."""
+    with torch.no_grad():
+        for target in loss.target_qvalue_network_params.values(True, True):
+            target.add_(0.1 * torch.randn_like(target))
+    loss._has_update_associated = dict.fromkeys(loss._has_update_associated, True)
+    return loss
+
+
+@pytest.fixture
+def parts() -> Parts:
+    return Parts()
+
+
+@pytest.fixture
+def batch() -> TensorDict:
+    return make_batch()

@@ -1,0 +1,152 @@
+"""Dynamics ratio: Eq. (9), its switches, and what the trained estimator says where the truth is known."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.objectives import reference
+from tests.objectives.conftest import CELLS, OBSERVATION_DIM, Parts, make_batch
+from torchrl_h2o.objectives import DynamicsRatioEstimator, DynamicsRatioLoss, make_dynamics_ratio_estimator
+
+
+def log_odds(p):
+    return math.log(p / (1 - p))
+
+
+@pytest.mark.parametrize("bound", [2.0, None])
+@pytest.mark.parametrize("residual", [True, False])
+def test_log_ratio_is_equation_9(parts, batch, bound, residual):
+    estimator = DynamicsRatioEstimator(
+        parts.estimator.sa_network, parts.estimator.sas_network, logit_bound=bound, residual=residual
+    )
+    sa = reference.layers(TensorDict.from_module(estimator.sa_network))
+    sas = reference.layers(TensorDict.from_module(estimator.sas_network))
+    got = estimator(batch)
+    for row, log_ratio, ratio in zip(
+        reference.rows(batch), got["log_dynamics_ratio"], got["dynamics_ratio"], strict=True
+    ):
+        pair = row["observation"] + row["action"]
+        added = reference.bounded(reference.mlp(sa, pair), bound) if residual else (0.0, 0.0)
+        p_sa = reference.discriminator_probability(sa, pair, bound)
+        p_sas = reference.discriminator_probability(sas, pair + row["next_observation"], bound, added)
+        expected = ((1 - p_sa) / p_sa) / ((1 - p_sas) / p_sas)
+        assert log_ratio.item() == pytest.approx(math.log(expected), rel=1e-9)
+        assert ratio.item() == pytest.approx(min(max(expected, 1e-5), 1.0), rel=1e-9)
+
+
+def test_losses_are_the_mean_cross_entropies_of_both_streams(parts, batch):
+    loss = DynamicsRatioLoss(parts.estimator, input_noise=None)
+    sa = reference.layers(TensorDict.from_module(parts.estimator.sa_network))
+    sas = reference.layers(TensorDict.from_module(parts.estimator.sas_network))
+    terms = {True: ([], []), False: ([], [])}
+    for row in reference.rows(batch):
+        pair = row["observation"] + row["action"]
+        p_sa = reference.discriminator_probability(sa, pair, 2.0)
+        added = reference.bounded(reference.mlp(sa, pair), 2.0)
+        p_sas = reference.discriminator_probability(sas, pair + row["next_observation"], 2.0, added)
+        for column, p in zip(terms[row["real"]], (p_sa, p_sas), strict=True):
+            column.append(-math.log(p if row["real"] else 1 - p))
+    got = loss(batch)
+    for index, key in enumerate(("loss_ratio_sa", "loss_ratio_sas")):
+        expected = reference.mean(terms[True][index]) + reference.mean(terms[False][index])
+        assert got[key].item() == pytest.approx(expected, rel=1e-12)
+
+
+def test_each_discriminator_is_trained_by_its_own_loss_alone(parts, batch):
+    loss = DynamicsRatioLoss(parts.estimator)
+    for key, own in (("loss_ratio_sa", "sa_network"), ("loss_ratio_sas", "sas_network")):
+        loss.zero_grad()
+        loss(batch)[key].backward()
+        moved = {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
+        assert moved
+        assert all(f".{own}." in name for name in moved)
+
+
+def test_input_noise_is_drawn_in_training_only(parts, batch):
+    loss = DynamicsRatioLoss(parts.estimator)
+    assert loss(batch)["loss_ratio_sas"] != loss(batch)["loss_ratio_sas"]
+    loss.eval()
+    assert loss(batch)["loss_ratio_sas"] == loss(batch)["loss_ratio_sas"]
+
+
+def test_input_noise_has_the_asked_standard_deviation(parts):
+    seen = []
+    batch = make_batch(4000, 4000)
+    parts.estimator.sas_network.register_forward_pre_hook(lambda module, args: seen.append(args[0].clone()))
+    DynamicsRatioLoss(parts.estimator, input_noise=0.3)(batch)
+    for key in ("observation", "action", ("next", "observation")):
+        assert (seen[0][key] - batch[key]).std().item() == pytest.approx(0.3, rel=0.05)
+
+
+def test_ratio_is_a_constant(parts, batch):
+    assert not parts.estimator(batch)["log_dynamics_ratio"].requires_grad
+
+
+def test_accuracy_weighs_both_streams_the_same(parts):
+    batch = make_batch(90, 10)
+    estimator = parts.estimator
+    with torch.no_grad():  # a classifier that says 'real' whatever it sees
+        for network in (estimator.sa_network, estimator.sas_network):
+            network.module[-1].weight.zero_()
+            network.module[-1].bias.copy_(torch.tensor([1.0, -1.0]))
+    assert DynamicsRatioLoss(estimator)(batch)["accuracy"] == pytest.approx(0.5)
+
+
+def gaussian_transitions(size, real_shift, sim_shift, rng, std=0.5):
+    """s' = s + a + shift(s, a) + std * noise on the line; returns a marked batch and the true log ratio."""
+    real = torch.arange(size) < size // 2
+    observation = torch.randn(size, 1, generator=rng)
+    action = torch.rand(size, 1, generator=rng) * 2 - 1
+    action = torch.where(real[:, None], action + 0.3, action)  # other behaviour: the ratio must not see it
+    means = [observation + action + shift * torch.sin(observation + action) for shift in (real_shift, sim_shift)]
+    mean = torch.where(real[:, None], *means)
+    following = mean + std * torch.randn(size, 1, generator=rng)
+    truth = ((following - means[1]) ** 2 - (following - means[0]) ** 2).squeeze(-1) / (2 * std**2)
+    following = TensorDict(observation=following, batch_size=size)
+    return TensorDict(observation=observation, action=action, real=real, next=following, batch_size=size), truth
+
+
+def trained_estimator(real_shift, sim_shift, steps=600):
+    torch.manual_seed(0)
+    rng = torch.Generator().manual_seed(1)
+    estimator = make_dynamics_ratio_estimator(1, 1, (64, 64), logit_bound=None, clamp=None)
+    loss = DynamicsRatioLoss(estimator, input_noise=None)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
+        batch, _ = gaussian_transitions(2048, real_shift, sim_shift, rng)
+        losses = loss(batch)
+        optimiser.zero_grad()
+        (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
+        optimiser.step()
+        schedule.step()
+    return estimator, gaussian_transitions(10_000, real_shift, sim_shift, rng)
+
+
+def test_trained_log_ratio_is_the_true_one_on_gaussian_dynamics():
+    estimator, (batch, truth) = trained_estimator(real_shift=0.6, sim_shift=0.0)
+    got = estimator(batch)["log_dynamics_ratio"]
+    correlation = torch.corrcoef(torch.stack([got, truth]))[0, 1]
+    slope = (got - got.mean()).mul(truth - truth.mean()).mean() / truth.var()
+    assert correlation > 0.95
+    assert slope == pytest.approx(1.0, abs=0.15)
+
+
+def test_trained_ratio_is_one_where_the_dynamics_agree():
+    estimator, (batch, _) = trained_estimator(real_shift=0.4, sim_shift=0.4, steps=300)
+    log_ratio = estimator(batch)["log_dynamics_ratio"]
+    assert log_ratio.abs().mean() < 0.1
+
+
+def test_a_discriminator_without_two_logits_is_refused(batch):
+    one = Parts(dtype=torch.float64).qvalues[0]
+    with pytest.raises(ValueError, match="two logits"):
+        DynamicsRatioEstimator(one, one)(batch)
+
+
+@pytest.mark.parametrize("bad", [{"logit_bound": 0.0}, {"clamp": (1.0, 0.5)}])
+def test_bounds_that_cannot_be_are_refused(bad):
+    with pytest.raises(ValueError, match=r"logit_bound|clamp"):
+        make_dynamics_ratio_estimator(OBSERVATION_DIM, 1, CELLS, **bad)

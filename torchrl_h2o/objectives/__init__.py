@@ -1,0 +1,37 @@
+"""The losses of H2O+ as TorchRL loss modules. Needs torch, tensordict and torchrl alone."""
+
+from torchrl_h2o.objectives.bellman import EntropyBonus, MixedBellmanLoss
+from torchrl_h2o.objectives.common import HybridLoss
+from torchrl_h2o.objectives.h2o_plus import H2OPlusLoss
+from torchrl_h2o.objectives.importance import ImportanceWeightedLoss
+from torchrl_h2o.objectives.networks import (
+    make_actor,
+    make_dynamics_ratio_estimator,
+    make_qvalue,
+    make_value,
+)
+from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss
+from torchrl_h2o.objectives.value import (
+    ExpectileValueLoss,
+    ExponentialValueLoss,
+    InSampleValueLoss,
+    SparseValueLoss,
+)
+
+__all__ = [
+    "DynamicsRatioEstimator",
+    "DynamicsRatioLoss",
+    "EntropyBonus",
+    "ExpectileValueLoss",
+    "ExponentialValueLoss",
+    "H2OPlusLoss",
+    "HybridLoss",
+    "ImportanceWeightedLoss",
+    "InSampleValueLoss",
+    "MixedBellmanLoss",
+    "SparseValueLoss",
+    "make_actor",
+    "make_dynamics_ratio_estimator",
+    "make_qvalue",
+    "make_value",
+]

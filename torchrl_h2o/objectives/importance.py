@@ -1,0 +1,114 @@
+"""Any TorchRL loss, each row weighted by the dynamics ratio: the discriminators' weighting for other algorithms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torchrl_h2o.objectives.common import HybridLoss
+
+
+class ImportanceWeightedLoss(HybridLoss):
+    """A TorchRL loss with every row's terms multiplied by a weight found in the batch.
+
+    If the batch has ``real``, rows marked True keep weight 1, as in Eq. (8): measured rows need no correction. Only
+    the ``loss_*`` terms are weighted, and the weights are constants. ``SoftUpdate`` works on it as on the loss inside.
+
+    Args:
+        loss (LossModule): built with ``reduction="none"`` (TorchRL's SACLoss and IQLLoss also want
+            ``scalar_output_mode="exclude"``).
+        key (NestedKey, optional): the weights, ``[*B]`` or ``[*B, 1]``. Defaults to ``"dynamics_ratio"``.
+
+    Keyword Args:
+        reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"`` of the weighted terms over all rows.
+            Defaults to ``"mean"``.
+
+    Raises:
+        ValueError: if the loss inside reduces its terms already.
+        KeyError: if the batch has no weights.
+
+    Source:
+        H2O+, Eq. (8), the weight P / P̂.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.objectives import SACLoss, SoftUpdate
+        >>> from torchrl_h2o.objectives import make_actor, make_qvalue
+        >>> actor = make_actor(observation_dim=3, action_spec=Bounded(-1, 1, (1,)))
+        >>> sac = SACLoss(actor, make_qvalue(3, 1), reduction="none", scalar_output_mode="exclude")
+        >>> loss = ImportanceWeightedLoss(sac)
+        >>> targets = SoftUpdate(loss, tau=0.005)
+        >>> step = {"done": torch.zeros(4, 1, dtype=torch.bool), "terminated": torch.zeros(4, 1, dtype=torch.bool)}
+        >>> batch = TensorDict(observation=torch.randn(4, 3), action=torch.rand(4, 1), dynamics_ratio=torch.rand(4),
+        ...                    next=TensorDict(observation=torch.randn(4, 3), reward=torch.randn(4, 1), **step),
+        ...                    batch_size=4)
+        >>> loss(batch)["loss_qvalue"].backward()
+    """
+
+    def __init__(self, loss: LossModule, key: NestedKey = "dynamics_ratio", *, reduction: str = "mean") -> None:
+        super().__init__(reduction=reduction)
+        if getattr(loss, "reduction", None) != "none":
+            raise ValueError(
+                f"{type(loss).__name__} reduces its terms ({getattr(loss, 'reduction', None)!r}) before they could be "
+                "weighted: build it with reduction='none'."
+            )
+        self.loss = loss
+        self.key = key
+
+    def _read_keys(self) -> Iterable[NestedKey]:
+        return *self.loss.in_keys, self.key
+
+    def _written_keys(self) -> Iterable[NestedKey]:
+        return tuple(key for key in self.loss.out_keys if str(key).startswith("loss_"))
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        terms = self.loss(tensordict)
+        weights = self._weights(tensordict)
+        return self._output(
+            {key: self._reduce_loss(_scale(terms.get(key), weights), tensordict) for key in self._written_keys()},
+            tensordict,
+        )
+
+    def _weights(self, tensordict: TensorDictBase) -> Tensor:
+        weights = tensordict.get(self.key, None)
+        if weights is None:
+            raise KeyError(
+                f"the batch has no weights at {self.key!r}: call a DynamicsRatioEstimator on it first, or name their key."
+            )
+        real = tensordict.get(self.tensor_keys.real, None)
+        if real is not None:
+            weights = torch.where(self._expand_loss_mask(real.bool(), weights), 1.0, weights)
+        return weights.detach()
+
+    # What follows lets SoftUpdate find the targets of the loss inside.
+    @property
+    def _has_update_associated(self) -> dict[str, bool]:
+        return self.loss._has_update_associated if "loss" in self._modules else {}
+
+    @_has_update_associated.setter
+    def _has_update_associated(self, value: dict[str, bool]) -> None:
+        """The loss inside keeps its own."""
+
+    def named_children(self) -> Iterator[tuple[str, nn.Module]]:
+        yield from super().named_children()
+        yield from ((n, m) for n, m in self.loss.named_children() if n.startswith("target_"))
+
+    def __getattr__(self, name: str):
+        if name.endswith("_params"):
+            return getattr(self.loss, name)
+        return super().__getattr__(name)
+
+
+def _scale(terms: Tensor, weights: Tensor) -> Tensor:
+    """``terms * weights`` with the weights' shape brought to the terms' batch shape."""
+    while weights.ndim > terms.ndim:
+        weights = weights.squeeze(-1)
+    return terms * weights.reshape(weights.shape + (1,) * (terms.ndim - weights.ndim))

@@ -1,0 +1,120 @@
+"""The paper's networks as TensorDict modules: two hidden layers of 256, ReLU, a small last layer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torchrl.data import TensorSpec
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
+
+from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
+
+HIDDEN = (256, 256)
+
+
+def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
+    network = MLP(in_features, out_features, num_cells=list(num_cells), activation_class=nn.ReLU)
+    nn.init.xavier_uniform_(network[-1].weight, gain=1e-2)
+    nn.init.zeros_(network[-1].bias)
+    return network
+
+
+def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequence[int] = HIDDEN) -> ProbabilisticActor:
+    """Tanh-Gaussian policy within the action's bounds.
+
+    Args:
+        observation_dim (int): size of ``observation`` ``[*B, observation_dim]``.
+        action_spec (TensorSpec): of one environment, ``[action_dim]``, bounded.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Returns:
+        A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its standard deviation
+        starts at exp(-1) before the tanh, the authors' log-std offset.
+
+    Source:
+        The authors' published code.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data import Bounded
+        >>> actor = make_actor(observation_dim=4, action_spec=Bounded(-3, 3, (1,)))
+        >>> loc, scale, action, log_prob = actor(observation=torch.zeros(5, 4))
+        >>> action.shape
+        torch.Size([5, 1])
+    """
+    action_dim = action_spec.shape[-1]
+    network = _mlp(observation_dim, 2 * action_dim, num_cells)
+    with torch.no_grad():
+        network[-1].bias[action_dim:].fill_(-1.0)
+    return ProbabilisticActor(
+        TensorDictModule(
+            nn.Sequential(network, NormalParamExtractor(scale_mapping="exp")),
+            in_keys=["observation"],
+            out_keys=["loc", "scale"],
+        ),
+        in_keys=["loc", "scale"],
+        spec=action_spec,
+        distribution_class=TanhNormal,
+        distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
+        return_log_prob=True,
+        log_prob_key="_log_prob",
+    )
+
+
+def make_qvalue(observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN) -> ValueOperator:
+    """Q(s, a), writing ``state_action_value`` ``[*B, 1]``.
+
+    Args:
+        observation_dim (int): size of ``observation``.
+        action_dim (int): size of ``action``.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Examples:
+        >>> import torch
+        >>> make_qvalue(4, 1)(observation=torch.zeros(5, 4), action=torch.zeros(5, 1)).shape
+        torch.Size([5, 1])
+    """
+    return ValueOperator(_mlp(observation_dim + action_dim, 1, num_cells), in_keys=["observation", "action"])
+
+
+def make_value(observation_dim: int, num_cells: Sequence[int] = HIDDEN) -> ValueOperator:
+    """V(s), writing ``state_value`` ``[*B, 1]``.
+
+    Args:
+        observation_dim (int): size of ``observation``.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Examples:
+        >>> import torch
+        >>> make_value(4)(observation=torch.zeros(5, 4)).shape
+        torch.Size([5, 1])
+    """
+    return ValueOperator(_mlp(observation_dim, 1, num_cells), in_keys=["observation"])
+
+
+def make_dynamics_ratio_estimator(
+    observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN, **kwargs
+) -> DynamicsRatioEstimator:
+    """The two discriminators of Eq. (9).
+
+    Args:
+        observation_dim (int): size of ``observation``.
+        action_dim (int): size of ``action``.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+        **kwargs: of :class:`DynamicsRatioEstimator`.
+
+    Examples:
+        >>> make_dynamics_ratio_estimator(17, 6, logit_bound=None).in_keys
+        ['observation', 'action', ('next', 'observation')]
+    """
+    keys = ["observation", "action", ("next", "observation")]
+    sa_dim, sas_dim = observation_dim + action_dim, 2 * observation_dim + action_dim
+    hidden = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
+    return DynamicsRatioEstimator(
+        TensorDictModule(MLP(sa_dim, 2, **hidden), in_keys=keys[:2], out_keys=["sa_logits"]),
+        TensorDictModule(MLP(sas_dim, 2, **hidden), in_keys=keys, out_keys=["sas_logits"]),
+        **kwargs,
+    )

@@ -1,0 +1,204 @@
+"""The dynamics ratio P(s'|s,a) / P̂(s'|s,a) from two discriminators, Eq. (9), and the loss that trains them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchrl_h2o.objectives.common import HybridLoss
+
+
+class DynamicsRatioEstimator(TensorDictModuleBase):
+    r"""Dynamics ratio of a transition, real over sim, from two real-or-simulated classifiers.
+
+    .. math::
+        \frac{P}{\hat P}=\frac{p(real|s,a,s')}{1-p(real|s,a,s')}\Big/\frac{p(real|s,a)}{1-p(real|s,a)}
+
+    A transform for any replay buffer or loss: it reads a transition and writes two entries. Both are constants,
+    no gradient flows through them; :class:`DynamicsRatioLoss` trains the networks.
+
+    Args:
+        sa_network (TensorDictModule): reads observation and action, writes logits ``[*B, 2]``, (real, simulated).
+        sas_network (TensorDictModule): the same with ``("next", "observation")`` beside them.
+
+    Keyword Args:
+        logit_bound (float or None, optional): every logit is ``bound * tanh(logit)``, so the log-ratio stays
+            within ``2 * bound`` of zero. ``None`` switches it off. Defaults to 2.0.
+        residual (bool, optional): whether the first network's logits are added to the second's, which then learns
+            what s' adds. Defaults to ``True``.
+        clamp (tuple of float or None, optional): bounds of ``dynamics_ratio`` (``log_dynamics_ratio`` has none).
+            ``None`` switches it off. Defaults to ``(1e-5, 1.0)``.
+        out_keys (sequence of NestedKey, optional): Defaults to ``["log_dynamics_ratio", "dynamics_ratio"]``, each of
+            the batch's shape ``[*B]``.
+
+    Raises:
+        ValueError: if the bound is not positive or the clamp not an interval of positive numbers.
+
+    Source:
+        H2O+, Eq. (9); the defaults are those of the authors' published code.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.modules import MLP
+        >>> sa = TensorDictModule(MLP(4, 2), in_keys=["observation", "action"], out_keys=["sa_logits"])
+        >>> sas = TensorDictModule(MLP(7, 2), out_keys=["sas_logits"],
+        ...                        in_keys=["observation", "action", ("next", "observation")])
+        >>> estimator = DynamicsRatioEstimator(sa, sas)
+        >>> batch = TensorDict(observation=torch.randn(5, 3), action=torch.randn(5, 1),
+        ...                    next=TensorDict(observation=torch.randn(5, 3)), batch_size=5)
+        >>> estimator(batch)["dynamics_ratio"].shape
+        torch.Size([5])
+    """
+
+    def __init__(
+        self,
+        sa_network: TensorDictModule,
+        sas_network: TensorDictModule,
+        *,
+        logit_bound: float | None = 2.0,
+        residual: bool = True,
+        clamp: tuple[float, float] | None = (1e-5, 1.0),
+        out_keys: Sequence[NestedKey] = ("log_dynamics_ratio", "dynamics_ratio"),
+    ) -> None:
+        if logit_bound is not None and not logit_bound > 0:
+            raise ValueError(f"logit_bound must be positive or None (no bound), not {logit_bound}.")
+        if clamp is not None and not 0 <= clamp[0] < clamp[1]:
+            raise ValueError(f"clamp must be (low, high) with 0 <= low < high, or None, not {clamp}.")
+        super().__init__()
+        self.sa_network = sa_network
+        self.sas_network = sas_network
+        self.logit_bound = logit_bound
+        self.residual = residual
+        self.clamp = clamp
+        self.in_keys = list(dict.fromkeys((*sa_network.in_keys, *sas_network.in_keys)))
+        self.out_keys = list(out_keys)
+
+    def log_odds(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Log-odds of real over simulated.
+
+        Args:
+            tensordict (TensorDictBase): transitions, ``[*B]``.
+
+        Returns:
+            The log-odds given (s, a) and given (s, a, s'), ``[*B]`` each. With ``residual`` the second holds the
+            first as a constant, so that each is trained by its own loss alone.
+        """
+        sa = self._network_log_odds(self.sa_network, tensordict)
+        sas = self._network_log_odds(self.sas_network, tensordict)
+        return sa, sas + sa.detach() if self.residual else sas
+
+    def _network_log_odds(self, network: TensorDictModule, tensordict: TensorDictBase) -> Tensor:
+        logits = network(tensordict.select(*network.in_keys)).get(network.out_keys[0])
+        if logits.shape[-1] != 2:
+            raise ValueError(f"a discriminator must write two logits (real, simulated), not {logits.shape[-1]}.")
+        if self.logit_bound is not None:
+            logits = self.logit_bound * torch.tanh(logits)
+        return logits[..., 0] - logits[..., 1]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.no_grad():
+            sa, sas = self.log_odds(tensordict)
+            log_ratio = sas - sa  # Eq. (9)
+            ratio = log_ratio.exp()
+            if self.clamp is not None:
+                ratio = ratio.clamp(*self.clamp)
+        log_key, key = self.out_keys
+        return tensordict.set(log_key, log_ratio).set(key, ratio)
+
+
+class DynamicsRatioLoss(HybridLoss):
+    """Cross-entropy of the two discriminators, each stream weighing one half.
+
+    In training mode Gaussian noise is added to every input; after ``loss.eval()`` there is none, which makes
+    ``accuracy`` on a held-out batch a measure of how visible the dynamics gap is (0.5: not at all).
+
+    Unlike the authors' code, the second loss does not reach the first network through the added logits: each
+    network is trained by its own loss.
+
+    Args:
+        estimator (DynamicsRatioEstimator): holds the two networks.
+
+    Keyword Args:
+        input_noise (float or None, optional): standard deviation, in each input's own unit. 0 or ``None`` switches
+            it off. Defaults to 0.1.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.common.HybridLoss`.
+
+    Reads what the estimator reads and ``real`` ``[*B]``. Writes ``loss_ratio_sa``, ``loss_ratio_sas``, and
+    ``accuracy_sa`` and ``accuracy`` (of the classifier of (s, a, s')), the mean of the two streams' hit rates.
+
+    Source:
+        H2O+, Eq. (9), after DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_h2o.objectives import make_dynamics_ratio_estimator
+        >>> loss = DynamicsRatioLoss(make_dynamics_ratio_estimator(observation_dim=3, action_dim=1))
+        >>> batch = TensorDict(observation=torch.randn(6, 3), action=torch.randn(6, 1), real=torch.arange(6) < 2,
+        ...                    next=TensorDict(observation=torch.randn(6, 3)), batch_size=6)
+        >>> losses = loss(batch)
+        >>> (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
+    """
+
+    estimator: DynamicsRatioEstimator
+    estimator_params: TensorDictParams
+    target_estimator_params: TensorDictParams
+
+    def __init__(
+        self,
+        estimator: DynamicsRatioEstimator,
+        *,
+        input_noise: float | None = 0.1,
+        reduction: str = "mean",
+    ) -> None:
+        super().__init__(reduction=reduction)
+        if input_noise is not None and input_noise < 0:
+            raise ValueError(f"input_noise is a standard deviation and cannot be {input_noise}; None is no noise.")
+        self.convert_to_functional(estimator, "estimator", create_target_params=False)
+        self.input_noise = input_noise
+
+    def _read_keys(self) -> Iterable[NestedKey]:
+        return *self.estimator.in_keys, self.tensor_keys.real
+
+    def _written_keys(self) -> Iterable[NestedKey]:
+        return "loss_ratio_sa", "loss_ratio_sas", "accuracy_sa", "accuracy"
+
+    def log_dynamics_ratio(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The transitions with the estimator's two entries, ``[*B]`` each, from this loss's current parameters."""
+        with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
+            return self.estimator(tensordict.select(*self.estimator.in_keys))
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        inputs = tensordict.select(*self.estimator.in_keys)
+        if self.training and self.input_noise:
+            inputs = inputs.apply(lambda x: x + self.input_noise * torch.randn_like(x))
+        with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
+            sa, sas = self.estimator.log_odds(inputs)
+        return self._output(
+            {
+                "loss_ratio_sa": self._cross_entropy(sa, tensordict),
+                "loss_ratio_sas": self._cross_entropy(sas, tensordict),
+                "accuracy_sa": self._accuracy(sa, tensordict),
+                "accuracy": self._accuracy(sas, tensordict),
+            },
+            tensordict,
+        )
+
+    def _cross_entropy(self, log_odds: Tensor, tensordict: TensorDictBase) -> Tensor:
+        real, _ = self._rows(log_odds, tensordict)
+        terms = F.softplus(torch.where(real, -log_odds, log_odds))  # -log p(own stream)
+        return self._sum_of_means(terms, tensordict)
+
+    def _accuracy(self, log_odds: Tensor, tensordict: TensorDictBase) -> Tensor:
+        real, _ = self._rows(log_odds, tensordict)
+        hits = ((log_odds > 0) == real).to(log_odds.dtype)
+        return self._metric(hits, tensordict)

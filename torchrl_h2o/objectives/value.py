@@ -1,0 +1,228 @@
+"""In-sample state-value losses, Eq. (4): V(s) is regressed on Q(s, a) at the data's own actions.
+
+The three backbones differ in one function of the advantage y = Q(s, a) - V(s), their ``penalty``.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from torch import Tensor
+
+from torchrl_h2o.objectives.common import HybridLoss
+
+
+class InSampleValueLoss(HybridLoss):
+    r"""In-sample value loss :math:`\min_V E_{(s,a)\sim 𝒟}\,L^f_V(Q(s,a)-V(s))`, abstract in :meth:`penalty`.
+
+    A backbone of one's own is a subclass with that one method.
+
+    Args:
+        value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
+
+    Keyword Args:
+        reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"``. Defaults to ``"mean"``, the mean over the
+            real rows. Simulated rows never count.
+
+    Reads ``observation`` (what the network reads), ``state_action_value`` ``[*B]`` or ``[*B, 1]`` (target Q at the
+    data's own action, taken as a constant) and ``real`` ``[*B]``; writes ``loss_value``.
+
+    Source:
+        H2O+, Eq. (4), after SQL and EQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import ValueOperator
+        >>> from torchrl_h2o.objectives import InSampleValueLoss
+        >>> class HuberValueLoss(InSampleValueLoss):
+        ...     def penalty(self, advantage):
+        ...         return torch.nn.functional.huber_loss(advantage, torch.zeros_like(advantage), reduction="none")
+        >>> loss = HuberValueLoss(ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"]))
+        >>> batch = TensorDict(observation=torch.randn(4, 3), state_action_value=torch.randn(4, 1),
+        ...                    real=torch.tensor([True, True, False, False]), batch_size=4)
+        >>> loss(batch)["loss_value"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys(HybridLoss._AcceptedKeys):
+        """Keys that ``set_keys`` renames.
+
+        Attributes:
+            value: V(s). Defaults to ``"state_value"``.
+            state_action_value: target Q at the data's own action. Defaults to ``"state_action_value"``.
+        """
+
+        value: NestedKey = "state_value"
+        state_action_value: NestedKey = "state_action_value"
+
+    tensor_keys: _AcceptedKeys
+    value_network: TensorDictModule
+    value_network_params: TensorDictParams
+    target_value_network_params: TensorDictParams
+
+    def __init__(self, value_network: TensorDictModule, *, reduction: str = "mean") -> None:
+        super().__init__(reduction=reduction)
+        self.convert_to_functional(value_network, "value_network", create_target_params=False)
+
+    @abstractmethod
+    def penalty(self, advantage: Tensor) -> Tensor:
+        """:math:`L^f_V(y)` of the advantage y, elementwise: ``[*B]`` to ``[*B]``."""
+
+    def _read_keys(self) -> Iterable[NestedKey]:
+        return (
+            *self.value_network.in_keys,
+            self.tensor_keys.state_action_value,
+            self.tensor_keys.real,
+        )
+
+    def _written_keys(self) -> Iterable[NestedKey]:
+        return ("loss_value",)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self._output({"loss_value": self.value_loss(tensordict)}, tensordict)
+
+    def value_loss(self, tensordict: TensorDictBase) -> Tensor:
+        """Eq. (4), reduced."""
+        states = tensordict.select(*self.value_network.in_keys)
+        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
+            value = self.value_network(states).get(self.tensor_keys.value).squeeze(-1)
+        qvalue = tensordict.get(self.tensor_keys.state_action_value).detach().reshape(value.shape)
+        return self._real_mean(self.penalty(qvalue - value), tensordict)  # Eq. (4)
+
+
+class ExpectileValueLoss(InSampleValueLoss):
+    r"""IQL's expectile loss :math:`|\tau-1(y<0)|\,y^2`.
+
+    Args:
+        value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
+        expectile (float, optional): :math:`\tau` in (0, 1); 0.5 regresses the mean, towards 1 the maximum over the
+            data's actions. Defaults to 0.7.
+
+    Keyword Args:
+        reduction (str, optional): see :class:`InSampleValueLoss`.
+
+    Raises:
+        ValueError: if ``expectile`` is not inside (0, 1).
+
+    Source:
+        H2O+, Eq. (4) and its table; IQL (Kostrikov et al., 2021, https://arxiv.org/abs/2110.06169), Eq. (5).
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import ValueOperator
+        >>> loss = ExpectileValueLoss(ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"]), expectile=0.9)
+        >>> loss.penalty(torch.tensor([-1.0, 0.0, 2.0]))
+        tensor([0.1000, 0.0000, 3.6000])
+    """
+
+    def __init__(self, value_network: TensorDictModule, expectile: float = 0.7, *, reduction: str = "mean") -> None:
+        if not 0 < expectile < 1:
+            raise ValueError(f"expectile must lie inside (0, 1), not {expectile}; 0.5 is the mean.")
+        super().__init__(value_network, reduction=reduction)
+        self.expectile = expectile
+
+    def penalty(self, advantage: Tensor) -> Tensor:
+        return (self.expectile - (advantage < 0).to(advantage.dtype)).abs() * advantage**2
+
+
+class SparseValueLoss(InSampleValueLoss):
+    r"""SQL's loss :math:`1(1+y/2\alpha>0)\,(1+y/2\alpha)^2-y/\alpha`.
+
+    Args:
+        value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
+        alpha (float, optional): in units of the return; small is greedy, large is close to the mean.
+            Defaults to 1.0.
+
+    Keyword Args:
+        reduction (str, optional): see :class:`InSampleValueLoss`.
+
+    Raises:
+        ValueError: if ``alpha`` is not positive.
+
+    Source:
+        H2O+, Eq. (4) and its table, f = x - 1; SQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import ValueOperator
+        >>> loss = SparseValueLoss(ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"]), alpha=1.0)
+        >>> loss.penalty(torch.tensor([-4.0, 0.0, 2.0]))
+        tensor([4., 1., 2.])
+    """
+
+    def __init__(self, value_network: TensorDictModule, alpha: float = 1.0, *, reduction: str = "mean") -> None:
+        _check_alpha(alpha)
+        super().__init__(value_network, reduction=reduction)
+        self.alpha = alpha
+
+    def penalty(self, advantage: Tensor) -> Tensor:
+        return (1 + advantage / (2 * self.alpha)).clamp_min(0) ** 2 - advantage / self.alpha
+
+
+class ExponentialValueLoss(InSampleValueLoss):
+    r"""EQL's and XQL's loss :math:`\exp(y/\alpha)-y/\alpha`, finite for any advantage.
+
+    Above ``clip`` the exponential goes on as its tangent: value and gradient stay finite and keep their sign, so
+    that an outlier still pulls V up. Below, both are exact.
+
+    Args:
+        value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
+        alpha (float, optional): in units of the return; small is greedy, large is close to the mean.
+            Defaults to 1.0.
+        clip (float, optional): the largest :math:`y/\alpha` with an exact exponential. Defaults to 7.0, as in XQL.
+
+    Keyword Args:
+        reduction (str, optional): see :class:`InSampleValueLoss`.
+
+    Raises:
+        ValueError: if ``alpha`` is not positive, or ``clip`` is outside (0, 20].
+
+    Source:
+        H2O+, Eq. (4) and its table, f = log x; EQL (https://arxiv.org/abs/2303.15810); XQL (Garg et al., 2023,
+        https://arxiv.org/abs/2301.02328).
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import ValueOperator
+        >>> loss = ExponentialValueLoss(ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"]), alpha=2.0)
+        >>> loss.penalty(torch.tensor([-4.0, 0.0, 2.0]))
+        tensor([2.1353, 1.0000, 1.7183])
+        >>> loss.penalty(torch.tensor([1e38, float("inf")])).isfinite()
+        tensor([True, True])
+    """
+
+    # Past this the loss is a constant. Tangent slope times bound, summed over a batch, stays far inside float32.
+    _BOUND = 1e25
+
+    def __init__(
+        self,
+        value_network: TensorDictModule,
+        alpha: float = 1.0,
+        clip: float = 7.0,
+        *,
+        reduction: str = "mean",
+    ) -> None:
+        _check_alpha(alpha)
+        if not 0 < clip <= 20:
+            raise ValueError(f"clip must lie in (0, 20], not {clip}: beyond exp(20) float32 has no room for a batch.")
+        super().__init__(value_network, reduction=reduction)
+        self.alpha = alpha
+        self.clip = clip
+
+    def penalty(self, advantage: Tensor) -> Tensor:
+        y = (advantage / self.alpha).clamp(-self._BOUND, self._BOUND)
+        exact = y.clamp_max(self.clip)
+        return torch.exp(exact) * (1 + (y - exact)) - y
+
+
+def _check_alpha(alpha: float) -> None:
+    if not alpha > 0:
+        raise ValueError(f"alpha must be positive, not {alpha}; it divides the advantage.")
