@@ -1,0 +1,237 @@
+"""What an effect is: one named physical cause by which two dynamics differ.
+
+An effect is a frozen dataclass. Its parameters carry a unit, bounds and a neutral value; what it
+touches is one of four kinds: the model, the actions, the forces or the observations.
+"""
+
+import dataclasses
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+
+Process = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of an effect, with what a fit or a reader needs to know of it.
+
+    Args:
+        value: the value, in ``unit``.
+        unit: the unit, ``"1"`` for a pure number.
+        bounds: the smallest and the largest legal value, both inclusive.
+        neutral: the value at which the effect changes nothing.
+    """
+
+    value: float
+    unit: str
+    bounds: tuple[float, float]
+    neutral: float
+
+    def __str__(self) -> str:
+        return f"{self.value:g}" if self.unit == "1" else f"{self.value:g} {self.unit}"
+
+
+def parameter(*, unit: str, bounds: tuple[float, float], neutral: float) -> Any:
+    """A dataclass field that is a parameter of an effect; its default is the neutral value.
+
+    Args:
+        unit: the unit, ``"1"`` for a pure number.
+        bounds: the smallest and the largest legal value, both inclusive.
+        neutral: the value at which the effect changes nothing.
+
+    Returns:
+        The field, for the body of an :class:`Effect` subclass.
+    """
+    metadata = {"unit": unit, "bounds": bounds, "neutral": neutral}
+    return dataclasses.field(default=neutral, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Effect(ABC):
+    """Base of all effects. Subclass one of the four kinds below, not this class.
+
+    A subclass is a frozen dataclass: fields made by :func:`parameter` are its parameters, all other
+    fields say what it acts on (name patterns, indices). ``wording`` is what it does in words, with
+    the fields' names in braces.
+
+    Raises:
+        ValueError: if a parameter is not a number within its bounds.
+
+    Examples:
+        >>> from torchrl_h2o.effects import Gravity
+        >>> Gravity(2.0).parameters
+        {'scale': Parameter(value=2.0, unit='1', bounds=(0.0, 10.0), neutral=1.0)}
+        >>> Gravity(2.0).describe(), Gravity().is_neutral
+        ('gravity × 2', True)
+        >>> Gravity(-1.0)
+        Traceback (most recent call last):
+        ...
+        ValueError: Gravity: scale = -1 lies outside its bounds [0, 10]; choose a value within them
+    """
+
+    wording: ClassVar[str]
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if "unit" in field.metadata:
+                value = self._checked(field.name, value, *field.metadata["bounds"])
+            elif isinstance(value, Iterable) and not isinstance(value, str):
+                value = tuple(value)  # a list from a configuration file must stay hashable
+            object.__setattr__(self, field.name, value)
+
+    def _checked(self, name: str, value: float, low: float, high: float) -> float:
+        try:
+            value = float(value)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{type(self).__name__}: {name} = {value!r} is not a number; choose one in [{low:g}, {high:g}]"
+            ) from None
+        if not low <= value <= high:  # so written, a NaN is caught too
+            raise ValueError(
+                f"{type(self).__name__}: {name} = {value:g} lies outside its bounds "
+                f"[{low:g}, {high:g}]; choose a value within them"
+            )
+        return value
+
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """The parameters by name, in the order of the fields."""
+        return {
+            field.name: Parameter(getattr(self, field.name), **field.metadata)
+            for field in dataclasses.fields(self)
+            if "unit" in field.metadata
+        }
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether every parameter stands at its neutral value."""
+        return all(p.value == p.neutral for p in self.parameters.values())
+
+    def describe(self) -> str:
+        """What the effect does, in words with units."""
+        parameters = self.parameters
+        chosen = {
+            field.name: _in_words(field.name, getattr(self, field.name))
+            for field in dataclasses.fields(self)
+            if field.name not in parameters
+        }
+        return self.wording.format(**parameters, **chosen)
+
+
+def _in_words(field: str, chosen: str | tuple | None) -> str:
+    """``joints`` and ``"*"`` become "all joints", ``actuators`` and ``(0, 2)`` "actuators 0, 2"."""
+    if chosen is None or chosen == "*":
+        return f"all {field}"
+    chosen = (chosen,) if isinstance(chosen, str) else chosen
+    return f"{field} {', '.join(map(str, chosen))}"
+
+
+class ModelEffect(Effect):
+    """An effect that lies in the model: masses, geometry, joints, contacts, gravity."""
+
+    @abstractmethod
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        """Edits the model's specification in place.
+
+        Args:
+            spec: the specification, as parsed from the model's own file. It is compiled after the
+                last edit, so that masses and inertias follow from the geometry.
+
+        Raises:
+            ValueError: if the model has nothing that the effect could act on.
+        """
+
+
+class ActionEffect(Effect):
+    """An effect on the way in: what the simulator executes of the action asked for."""
+
+    @abstractmethod
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        """Returns the function that alters the actions of one episode.
+
+        Args:
+            dt: the control step, in seconds.
+            rng: the episode's random generator, shared by all of its effects.
+
+        Returns:
+            A function from the action asked for to the action executed, both (..., nu), called
+            once a control step. What it must remember, it keeps to itself: the effect stays frozen.
+        """
+
+
+class ForceEffect(Effect):
+    """An effect that is a generalised force, a function of state, action and time."""
+
+    @abstractmethod
+    def generalised_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """Returns the force on every degree of freedom, for one physics step.
+
+        Args:
+            model: the model in use.
+            data: the state before the step (``qpos``, ``qvel``, ``ctrl``, ``time``), with the
+                bodies' positions and velocities up to date. Read only.
+
+        Returns:
+            Forces in N and torques in N·m, (nv,).
+
+        Raises:
+            ValueError: if the model has nothing that the effect could act on.
+        """
+
+
+class ObservationEffect(Effect):
+    """An effect on the way out: what is observed of the simulator's state."""
+
+    @abstractmethod
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        """Returns the function that alters the observations of one episode.
+
+        Args:
+            dt: the control step, in seconds.
+            rng: the episode's random generator, shared by all of its effects.
+
+        Returns:
+            A function from the true observation to the one reported, both (..., n), called at the
+            reset and after every control step.
+        """
+
+
+def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco.MjModel:
+    """Edits a specification by the model effects in their order, then compiles it once.
+
+    Args:
+        spec: the specification, edited in place.
+        effects: effects of any kind; those that do not lie in the model are passed over.
+
+    Returns:
+        The compiled model.
+
+    Raises:
+        ValueError: if the model has nothing that one of the effects could act on.
+
+    Examples:
+        >>> import mujoco
+        >>> from torchrl_h2o.effects import Gravity
+        >>> compile_model(mujoco.MjSpec(), [Gravity(2.0)]).opt.gravity
+        array([  0.  ,   0.  , -19.62])
+    """
+    for effect in effects:
+        if isinstance(effect, ModelEffect):
+            try:
+                effect.edit(spec)
+            except ValueError as error:
+                raise ValueError(
+                    f"{type(effect).__name__} ({effect.describe()}) cannot be put into model "
+                    f"'{spec.modelname}': {error}"
+                ) from error
+    with warnings.catch_warnings():
+        # HalfCheetah's own file asks for it, which its user cannot change
+        warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")
+        return spec.compile()

@@ -1,0 +1,134 @@
+"""Effects on geoms: the shape of the limbs, and what they do when they touch."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects import selection
+from torchrl_h2o.effects.effect import ModelEffect, parameter
+from torchrl_h2o.effects.selection import Names
+
+
+@dataclass(frozen=True)
+class GeomFriction(ModelEffect):
+    """All three friction coefficients (sliding, torsional, rolling) of geoms, scaled.
+
+    A contact takes the larger coefficient of its two geoms, so that to scale one of them alone may
+    change nothing.
+
+    Args:
+        scale: factor on the coefficients.
+        geoms: name patterns of the geoms.
+
+    Raises:
+        ValueError: when put into a model that has no such geom.
+
+    Examples:
+        >>> GeomFriction(0.3).describe()
+        'friction of all geoms × 0.3'
+
+    Source: H2O+ (Niu et al., 2023), the gap ``friction``.
+    """
+
+    wording: ClassVar[str] = "friction of {geoms} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=1.0)
+    geoms: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        for geom in selection.geoms(spec, self.geoms):
+            geom.friction *= self.scale
+
+
+@dataclass(frozen=True)
+class GeomSize(ModelEffect):
+    """Every number of the size of geoms, scaled: a capsule's radius and its half length.
+
+    A geom given by its two ends (``fromto``) has no length in its size; see :class:`GeomLength`.
+    Masses and inertias follow where the model derives them from its geoms.
+
+    Args:
+        scale: factor on the sizes.
+        geoms: name patterns of the geoms.
+
+    Raises:
+        ValueError: when put into a model that has no such geom.
+
+    Examples:
+        >>> GeomSize(2.0, geoms="*thigh*").describe()
+        'size of geoms *thigh* × 2'
+
+    Source: H2O+ (Niu et al., 2023), the gaps ``big_thigh`` and ``small_thigh``.
+    """
+
+    wording: ClassVar[str] = "size of {geoms} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.01, 10.0), neutral=1.0)
+    geoms: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        for geom in selection.geoms(spec, self.geoms):
+            geom.size *= self.scale
+
+
+@dataclass(frozen=True)
+class GeomLength(ModelEffect):
+    """The two ends (``fromto``) of geoms, scaled about the origin of their body.
+
+    Args:
+        scale: factor on the coordinates of both ends.
+        geoms: name patterns of the geoms.
+
+    Raises:
+        ValueError: when put into a model that has no such geom, or gives it by position and size.
+
+    Examples:
+        >>> GeomLength(4.0, geoms="torso").describe()
+        'length of geoms torso × 4'
+
+    Source: H2O+ (Niu et al., 2023), the gap ``long_torso``.
+    """
+
+    wording: ClassVar[str] = "length of {geoms} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.01, 10.0), neutral=1.0)
+    geoms: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        chosen = selection.geoms(spec, self.geoms)
+        spanned = [geom for geom in chosen if not np.isnan(geom.fromto[0])]
+        if not spanned:
+            names = ", ".join(geom.name for geom in chosen)
+            raise ValueError(f"no geom of {names} is given by its two ends (fromto); use GeomSize")
+        for geom in spanned:
+            geom.fromto *= self.scale
+
+
+@dataclass(frozen=True)
+class RollingResistance(ModelEffect):
+    """Resistance to rolling, as of a soft wheel or a carpet: a torque of ``coefficient`` · load.
+
+    The geoms' contacts get the rolling friction of MuJoCo (``condim`` 6). Where they had none, the
+    torsional friction that the geom names begins to act as well.
+
+    Args:
+        coefficient: added to the rolling friction that acts already, in m.
+        geoms: name patterns of the geoms.
+
+    Raises:
+        ValueError: when put into a model that has no such geom.
+
+    Examples:
+        >>> RollingResistance(0.002, geoms="*wheel*").describe()
+        'rolling resistance of geoms *wheel* + 0.002 m'
+    """
+
+    wording: ClassVar[str] = "rolling resistance of {geoms} + {coefficient}"
+    coefficient: float = parameter(unit="m", bounds=(0.0, 1.0), neutral=0.0)
+    geoms: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        for geom in selection.geoms(spec, self.geoms):
+            if self.coefficient and geom.condim < 6:
+                geom.condim = 6
+                geom.friction[2] = 0.0  # stood in the model but did not act
+            geom.friction[2] += self.coefficient
