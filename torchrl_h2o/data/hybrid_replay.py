@@ -1,0 +1,251 @@
+"""Real and simulated transitions in one batch, with ``real`` saying which is which.
+
+Why not TorchRL's ``ReplayBufferEnsemble`` or ``OfflineToOnlineReplayBuffer``: the first stacks
+equal shares into [2, B/2], does not write to one member only, and dumps the real data with every
+checkpoint; the second marks nothing and saves nothing; and both need three to five times as long
+for a batch, which they gather as TensorDicts of views first. So this is a composition of two plain
+``ReplayBuffer`` objects, whose storages, writer and checkpoints are used as they are, with a
+``sample`` that gathers each entry once a stream, straight from the storage.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from torchrl.data import (
+    ImmutableDatasetWriter,
+    LazyMemmapStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    TensorStorage,
+)
+
+from torchrl_h2o.data.whole_folder import whole_folder
+
+TRANSITION_KEYS: tuple[NestedKey, ...] = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "done"),
+    ("next", "terminated"),
+)
+
+
+class HybridReplayBuffer:
+    """Real data that stay and simulated data that roll over, sampled side by side.
+
+    Draws come from torch's global generator (the one of ``device``), so ``torch.manual_seed``
+    repeats them and a restored generator state continues them.
+
+    Args:
+        real: flat TED transitions, batch size [T]; kept as they are (also memory-mapped), not
+            copied unless to another device.
+        sim_capacity: how many simulated transitions are kept; then the oldest go.
+        batch_size: (real, simulated) rows of a batch.
+        keys: the entries of a batch; both streams must have them, what else they have is left out.
+        device: where the data are kept and the batches are made.
+        scratch_dir: keep the simulated data in memory-mapped files there, for more than fits in
+            memory.
+
+    Raises:
+        ValueError: an entry that the real data lack, with what to do.
+
+    Example:
+        >>> import torch
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data import HybridReplayBuffer
+        >>> env = GymEnv("Pendulum-v1")
+        >>> buffer = HybridReplayBuffer(env.rollout(50), sim_capacity=1000, batch_size=(4, 4))
+        >>> buffer.extend(env.rollout(20))
+        >>> buffer.sample()["real"].tolist()
+        [True, True, True, True, False, False, False, False]
+
+    Source: Feng et al., "H2O+" (2023): 𝒟 and B of Eq. (8), 128 rows of each.
+    """
+
+    def __init__(
+        self,
+        real: TensorDictBase,
+        sim_capacity: int,
+        batch_size: tuple[int, int] = (128, 128),
+        *,
+        keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        device: torch.device | str = "cpu",
+        scratch_dir: str | Path | None = None,
+    ):
+        if sim_capacity < 1:
+            raise ValueError(f"sim_capacity is {sim_capacity}, it must be at least 1")
+        if real.ndim != 1 or not len(real):
+            raise ValueError(f"the real data have the batch size {list(real.batch_size)}, expected [T], T > 0")
+        self.batch_size = _require_sizes(batch_size)
+        self.keys = [unravel_key(key) for key in keys]
+        self.device = torch.device(device)
+        real = _select(real, self.keys, "real").to(self.device)
+        self.real = ReplayBuffer(storage=TensorStorage(real, device=self.device), writer=ImmutableDatasetWriter())
+        storage = (
+            LazyTensorStorage(sim_capacity, device=self.device)
+            if scratch_dir is None
+            else LazyMemmapStorage(sim_capacity, scratch_dir=scratch_dir, device=self.device)
+        )
+        self.sim = ReplayBuffer(storage=storage)
+        self._real_rows = [real.get(key) for key in self.keys]
+        self._sim_rows: list[torch.Tensor] = []
+
+    def __len__(self) -> int:
+        """The number of transitions of both streams."""
+        return len(self.real) + len(self.sim)
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}(real={len(self.real)}, sim={len(self.sim)} of "
+            f"{self.sim.storage.max_size}, batch_size={self.batch_size})"
+        )
+
+    def extend(self, transitions: TensorDictBase) -> None:
+        """Add simulated transitions.
+
+        Args:
+            transitions: any batch size that holds transitions, such as a collector's [N, T].
+
+        Raises:
+            ValueError: an entry that is missing or has another shape than the real data's.
+        """
+        rows = _select(transitions.reshape(-1), self.keys, "simulated")
+        for key, like in zip(self.keys, self._real_rows, strict=True):
+            value = rows.get(key)
+            if value.shape[1:] != like.shape[1:]:
+                raise ValueError(
+                    f"{key!r} has the shape {list(value.shape[1:])} in the simulated data and "
+                    f"{list(like.shape[1:])} in the real data; simulator and data must be of one "
+                    "task"
+                )
+            # the real data's dtype: Gymnasium observes in float64, a batch has one dtype
+            rows.set(key, value.detach().to(like))
+        self.sim.extend(rows)
+        self._find_sim_rows()
+
+    def sample(self, batch_size: tuple[int, int] | None = None) -> TensorDict:
+        """Draw real and simulated rows, each uniformly with replacement.
+
+        Args:
+            batch_size: (real, simulated) rows, instead of the buffer's own. (n, 0) draws real rows
+                alone, which works before there are simulated ones.
+
+        Returns:
+            TensorDict of batch size [real + simulated]: the buffer's entries, and ``real``, bool
+            of shape [real + simulated]; the real rows come first.
+
+        Raises:
+            RuntimeError: simulated rows are asked for and there are none.
+        """
+        n_real, n_sim = self.batch_size if batch_size is None else _require_sizes(batch_size)
+        if n_sim and not self._sim_rows:
+            raise RuntimeError(
+                "there are no simulated transitions yet; extend() the buffer first, or "
+                f"sample(({n_real + n_sim}, 0)) for real rows alone"
+            )
+        streams = []
+        if n_real:
+            streams.append((self._real_rows, self._draw(self._real_rows, n_real)))
+        if n_sim:
+            streams.append((self._sim_rows, self._draw(self._sim_rows, n_sim)))
+        batch = {
+            key: torch.cat([rows[i].index_select(0, index) for rows, index in streams])
+            for i, key in enumerate(self.keys)
+        }
+        batch["real"] = torch.arange(n_real + n_sim, device=self.device) < n_real
+        return TensorDict(batch, batch_size=[n_real + n_sim], device=self.device)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The simulated stream. The real data are not in it: read them again."""
+        return {"real": self._fingerprint(), "sim": self.sim.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the simulated stream of a buffer with the same real data and keys.
+
+        Raises:
+            ValueError: the state belongs to other real data.
+        """
+        self._require_same_real(state["real"])
+        self.sim.load_state_dict(state["sim"])
+        self._find_sim_rows()
+
+    def dumps(self, path: str | Path) -> None:
+        """Write the simulated stream to a folder, by TorchRL's own memory-mapped checkpoint.
+
+        A folder of that name is replaced once the new one is complete.
+
+        Args:
+            path: the folder.
+        """
+        with whole_folder(path, replace=True) as folder:
+            (folder / "real.json").write_text(json.dumps(self._fingerprint()), encoding="utf-8")
+            if self._sim_rows:
+                self.sim.dumps(folder / "sim")
+
+    def loads(self, path: str | Path) -> None:
+        """Read what :meth:`dumps` has written, into a buffer with the same real data and keys.
+
+        Args:
+            path: the folder.
+
+        Raises:
+            ValueError: the folder belongs to other real data.
+        """
+        folder = Path(path)
+        self._require_same_real(json.loads((folder / "real.json").read_text(encoding="utf-8")))
+        if (folder / "sim").is_dir():
+            self.sim.loads(folder / "sim")
+        else:
+            self.sim.empty()
+        self._find_sim_rows()
+
+    def _draw(self, rows: list[torch.Tensor], count: int) -> torch.Tensor:
+        return torch.randint(len(rows[0]), (count,), device=self.device)
+
+    def _find_sim_rows(self) -> None:
+        """Keep the filled part of each tensor at hand: looking it up costs more than gathering."""
+        stored = self.sim.storage[:] if len(self.sim) else None
+        self._sim_rows = [] if stored is None else [stored.get(key) for key in self.keys]
+
+    def _fingerprint(self) -> dict[str, Any]:
+        # the first and last rows tell two recordings apart without reading all of a mapped file
+        ends = torch.cat([rows[[0, -1]].double().flatten() for rows in self._real_rows])
+        return {
+            "transitions": len(self.real),
+            "ends": ends.tolist(),
+            "keys": [key if isinstance(key, str) else list(key) for key in self.keys],
+        }
+
+    def _require_same_real(self, saved: dict[str, Any]) -> None:
+        own = self._fingerprint()
+        if saved != own:
+            raise ValueError(
+                f"the checkpoint was made with {saved['transitions']} real transitions and the "
+                f"entries {saved['keys']}; this buffer holds {own['transitions']} and "
+                f"{own['keys']}, or other values: load the same real data first"
+            )
+
+
+def _select(td: TensorDictBase, keys: list[NestedKey], stream: str) -> TensorDictBase:
+    present = set(td.keys(True, True))
+    for key in keys:
+        if key not in present:
+            raise ValueError(
+                f"the {stream} data lack {key!r}, they have {sorted(present, key=str)}; record "
+                "it (a log needs reward= for its reward), or choose keys="
+            )
+    return td.select(*keys)
+
+
+def _require_sizes(sizes: tuple[int, int]) -> tuple[int, int]:
+    n_real, n_sim = sizes
+    if n_real < 0 or n_sim < 0 or n_real + n_sim < 1:
+        raise ValueError(f"batch_size is {sizes}, expected (real, simulated) rows, at least one in all")
+    return int(n_real), int(n_sim)

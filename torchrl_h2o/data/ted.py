@@ -1,0 +1,257 @@
+"""The one form that every reader returns, TorchRL's TED as a flat TensorDict, and its memory map.
+
+Row t is a transition; ``next`` of an episode's last row is that episode's own final observation.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_h2o.data.error import DataError, require_finite
+from torchrl_h2o.data.file_kind import is_pickle
+from torchrl_h2o.data.whole_folder import whole_folder
+
+_REQUIRED_KEYS = (
+    "observation",
+    "action",
+    ("next", "observation"),
+    ("next", "done"),
+    ("next", "terminated"),
+)
+_FLAGS = ("done", "terminated", "truncated")
+
+
+def to_ted(
+    *,
+    observation: np.ndarray,
+    action: np.ndarray,
+    next_observation: np.ndarray,
+    terminated: np.ndarray,
+    truncated: np.ndarray,
+    reward: np.ndarray | None = None,
+) -> TensorDict:
+    """Put arrays of T transitions into one flat TED TensorDict.
+
+    An episode that the end of the data cuts is marked truncated.
+
+    Args:
+        observation: shape (T, n), the state before the action.
+        action: shape (T, m).
+        next_observation: shape (T, n), the state after it.
+        terminated: shape (T,), bool: the task ended here, nothing follows.
+        truncated: shape (T,), bool: the recording ended here, more would have followed.
+        reward: shape (T,); without it the result has no ("next", "reward").
+
+    Returns:
+        TensorDict of batch size [T]: float32 ``observation``, ``action`` and their ``next``; bool
+        flags and float32 reward of shape [T, 1].
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_h2o.data.ted import to_ted
+        >>> states = np.arange(4.0)[:, None]
+        >>> td = to_ted(observation=states[:-1], action=np.zeros((3, 1)),
+        ...             next_observation=states[1:], terminated=np.zeros(3, bool),
+        ...             truncated=np.zeros(3, bool), reward=np.ones(3))
+        >>> td["next", "truncated"].flatten().tolist()
+        [False, False, True]
+    """
+
+    def floats(values: np.ndarray) -> torch.Tensor:
+        # a copy: the caller's array must not change with the result
+        return torch.from_numpy(np.array(values, dtype=np.float32))
+
+    ends = {"terminated": np.array(terminated, bool), "truncated": np.array(truncated, bool)}
+    ends["truncated"][-1] |= not ends["terminated"][-1]
+    ends["done"] = ends["terminated"] | ends["truncated"]
+    flags = {name: torch.from_numpy(ends[name])[:, None] for name in _FLAGS}
+    following = {"observation": floats(next_observation), **flags}
+    if reward is not None:
+        following["reward"] = floats(reward).reshape(-1, 1)
+    steps = len(observation)
+    return TensorDict(
+        {
+            "observation": floats(observation),
+            "action": floats(action),
+            # TED: no state from which a step is taken is itself an end
+            **{name: torch.zeros_like(flag) for name, flag in flags.items()},
+            "next": TensorDict(following, batch_size=[steps]),
+        },
+        batch_size=[steps],
+    )
+
+
+def episodes(td: TensorDictBase) -> Iterator[TensorDictBase]:
+    """Cut a flat TED TensorDict behind every ("next", "done"); the views share its memory.
+
+    Args:
+        td: batch size [T].
+
+    Yields:
+        one TensorDict an episode; a last one without an end is yielded too.
+    """
+    ends = (td["next", "done"].flatten().nonzero().flatten() + 1).tolist()
+    if not ends or ends[-1] != len(td):
+        ends.append(len(td))
+    start = 0
+    for stop in ends:
+        yield td[start:stop]
+        start = stop
+
+
+def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> None:
+    """Check keys, shapes, flags and finite values of a flat TED TensorDict.
+
+    Args:
+        td: what to check, batch size [T].
+        source: what to call it in errors.
+
+    Raises:
+        DataError: naming the key as column, and the row.
+    """
+    keys = set(td.keys(True, True))
+    for key in _REQUIRED_KEYS:
+        if key not in keys:
+            raise DataError("the entry is missing", "record it", source=source, column=_name(key))
+    if td.ndim != 1 or not len(td):
+        raise DataError(
+            f"the batch size is {list(td.batch_size)}, expected [T] with T of at least 1",
+            "reshape(-1) complete episodes that end in done, or record something",
+            source=source,
+        )
+    for key in [("next", "reward"), *_FLAGS, *(("next", flag) for flag in _FLAGS)]:
+        if key in keys and td.get(key).shape != (len(td), 1):
+            raise DataError(
+                f"the shape is {list(td.get(key).shape)}, expected {[len(td), 1]}",
+                "add the last dimension",
+                source=source,
+                column=_name(key),
+            )
+    if td["observation"].shape != td["next", "observation"].shape:
+        raise DataError(
+            f"shape {list(td['next', 'observation'].shape)}, observation has {list(td['observation'].shape)}",
+            "both must be of one kind",
+            source=source,
+            column="next.observation",
+        )
+    for key in sorted(keys, key=str):
+        if td.get(key).is_floating_point():
+            values = td.get(key).reshape(len(td), -1).numpy()
+            names = [f"{_name(key)}[{i}]" for i in range(values.shape[1])]
+            require_finite(values, names, source=source)
+
+
+def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
+    """Write a flat TED TensorDict as a memory map: one file an entry, no pickle, all or nothing.
+
+    Args:
+        td: batch size [T]; tensors only.
+        folder: a folder that does not exist yet.
+
+    Returns:
+        the folder.
+
+    Raises:
+        DataError: the folder exists, or the TensorDict is not what :func:`read_ted` would take.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data import read_ted, write_ted
+        >>> recorded = GymEnv("Pendulum-v1").rollout(10)
+        >>> folder = write_ted(recorded, tempfile.mkdtemp() + "/pendulum")
+        >>> td = read_ted(folder)
+        >>> bool((td["observation"] == recorded["observation"]).all())
+        True
+    """
+    require_ted(td, source=folder)
+    for key in td.keys(True, True, is_leaf=lambda kind: not issubclass(kind, TensorDictBase)):
+        if not isinstance(td.get(key), torch.Tensor):
+            raise DataError(
+                "the entry is not a tensor and would be pickled",
+                "drop it with td.exclude(...)",
+                source=folder,
+                column=_name(key),
+            )
+    with whole_folder(folder) as partial:
+        td.detach().contiguous().memmap(partial)
+    return Path(folder)
+
+
+def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
+    """Read a flat TED TensorDict that :func:`write_ted` or ``TensorDict.memmap`` has written.
+
+    Args:
+        folder: the folder that holds ``meta.json``.
+        in_memory: copy the data. Without it the tensors stay mapped to the files, for data larger
+            than the memory; writing to them then changes the files.
+
+    Returns:
+        TensorDict of batch size [T], with every entry that was written. A last episode without an
+        end is marked truncated.
+
+    Raises:
+        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity.
+    """
+    folder = Path(folder).expanduser()
+    if not (folder / "meta.json").is_file():
+        raise DataError("there is no meta.json here", "give a folder written by write_ted", source=folder)
+    for path in sorted(folder.rglob("*")):
+        # tensordict keeps objects in other.pickle; refuse by name before anything is opened
+        if path.is_file() and path.suffix != ".memmap" and is_pickle(path):
+            raise DataError(
+                "this is a pickle, and reading it could run any code",
+                "write the data again with write_ted, which keeps tensors only",
+                source=path,
+            )
+    _require_whole_files(folder)
+    try:
+        td = TensorDict.load_memmap(folder, allow_pickle=False)
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise DataError(f"unreadable: {error}", "write it again", source=folder) from error
+    require_ted(td, source=folder)
+    td = td.clone(recurse=in_memory)
+    ends = td["next", "done"].clone()
+    ends[-1] = True
+    td["next", "done"] = ends
+    td["next", "truncated"] = ends & ~td["next", "terminated"]
+    return td
+
+
+def _require_whole_files(folder: Path) -> None:
+    # torch maps a short file by growing it with zeros: the source changes and nobody is told
+    try:
+        meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+        sizes = {
+            folder / f"{key}.memmap": int(np.prod(entry["shape"], dtype=np.int64))
+            * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+            for key, entry in meta.items()
+            if isinstance(entry, dict) and "dtype" in entry
+        }
+        inner = [key for key, entry in meta.items() if isinstance(entry, dict) and "type" in entry]
+    except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
+        raise DataError(
+            f"the description cannot be read: {error}",
+            "copy or write the folder again",
+            source=folder / "meta.json",
+        ) from error
+    for path, size in sizes.items():
+        found = path.stat().st_size if path.is_file() else 0
+        if found != size:
+            raise DataError(
+                f"the file has {found} bytes, meta.json promises {size}",
+                "it is cut off or not its own: copy or write the folder again",
+                source=path,
+            )
+    for key in inner:
+        _require_whole_files(folder / key)
+
+
+def _name(key: str | tuple) -> str:
+    return key if isinstance(key, str) else ".".join(key)
