@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.objectives import SoftUpdate, ValueEstimators
+from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from tests.objectives import reference
 from tests.objectives.conftest import ACTION_DIM, make_batch
@@ -66,16 +66,22 @@ def test_mixing_one_is_the_in_sample_target_5(parts, batch):
     torch.testing.assert_close(loss.mixed_target(batch), expected.squeeze(-1))
 
 
+def test_mixing_zero_is_the_target_of_torchrl_s_sac_6(parts, batch):
+    loss = parts.bellman(mixing=0.0)
+    sac = SACLoss(parts.actor, parts.qvalues, alpha_init=1.0, loss_function="l2")
+    sac.target_qvalue_network_params.data.copy_(loss.target_qvalue_network_params.data)
+    sac.make_value_estimator(gamma=0.99)
+    # TorchRL keeps gamma in float32
+    torch.testing.assert_close(loss.mixed_target(batch), sac._compute_target_v2(batch), rtol=1e-6, atol=1e-6)
+
+
 def test_mixing_zero_never_reads_the_value_network(parts, batch):
-    before = parts.bellman(mixing=0.0).mixed_target(batch)
+    loss = parts.bellman(mixing=0.0)
+    before = loss.mixed_target(batch)
     with torch.no_grad():
         for parameter in parts.value.parameters():
             parameter.mul_(3.0)
-    loss = MixedBellmanLoss(parts.actor, parts.qvalues, parts.value, mixing=0.0)
-    loss.target_qvalue_network_params.data.copy_(loss.qvalue_network_params.data)
-    again = MixedBellmanLoss(parts.actor, parts.qvalues, parts.value, mixing=0.0)
-    torch.testing.assert_close(loss.mixed_target(batch), again.mixed_target(batch))
-    assert before.shape == batch.shape
+    assert torch.equal(loss.mixed_target(batch), before)
 
 
 def test_gamma_is_set_as_in_torchrl(parts, batch, noise):

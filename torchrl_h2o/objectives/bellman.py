@@ -28,7 +28,7 @@ class EntropyBonus(TensorDictModuleBase):
 
     Any TensorDict module that writes ``exploration_bonus`` (``[*B]`` or ``[*B, 1]``, in units of the reward) can
     stand in its place. It is called without gradients on the *next* states and finds there the observation, the
-    action that the policy takes, ``"_log_prob"`` ``[*B]`` (the actor's own log-probability key) and ``alpha`` ``[*B]``, β.
+    action that the policy takes, its log-probability ``"_log_prob"`` ``[*B]``, and β as ``alpha`` ``[*B]``.
 
     Args:
         log_prob_key (NestedKey, optional): where log π(a'|s') is. Defaults to ``"_log_prob"``.

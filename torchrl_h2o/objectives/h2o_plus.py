@@ -44,8 +44,8 @@ class H2OPlusLoss(MixedBellmanLoss):
     Raises:
         ValueError: if the target entropy is "auto" and the actor has no action spec.
 
-    Reads a transition and ``real`` ``[*B]``. Writes the losses above and, to be logged, ``alpha``, ``entropy``, and with a
-    ``ratio_loss`` ``accuracy_sa``, ``accuracy`` and ``dynamics_ratio`` (its mean over the simulated rows).
+    Reads a transition and ``real`` ``[*B]``. Writes the losses above and, to be logged, ``alpha``, ``entropy``, and
+    with a ``ratio_loss`` ``accuracy_sa``, ``accuracy`` and ``dynamics_ratio`` (its mean over the simulated rows).
 
     Source:
         H2O+, Eqs. (4) to (10); β as in SAC (https://arxiv.org/abs/1812.05905).

@@ -81,7 +81,8 @@ class ImportanceWeightedLoss(HybridLoss):
         weights = tensordict.get(self.key, None)
         if weights is None:
             raise KeyError(
-                f"the batch has no weights at {self.key!r}: call a DynamicsRatioEstimator on it first, or name their key."
+                f"the batch has no weights at {self.key!r}: call a DynamicsRatioEstimator on it first, or name "
+                "their key."
             )
         real = tensordict.get(self.tensor_keys.real, None)
         if real is not None:

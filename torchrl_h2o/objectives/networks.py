@@ -31,8 +31,8 @@ def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequenc
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
 
     Returns:
-        A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its standard deviation
-        starts at exp(-1) before the tanh, the authors' log-std offset.
+        A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its
+        standard deviation starts at exp(-1) before the tanh, the authors' log-std offset.
 
     Source:
         The authors' published code.

@@ -1,0 +1,159 @@
+"""H2O+ as a whole: Eq. (10), beta, who moves whom, and swapping its parts."""
+
+import pytest
+import torch
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import SoftUpdate
+
+from tests.objectives import reference
+from tests.objectives.conftest import ACTION_DIM, Parts
+from torchrl_h2o.objectives import (
+    ExpectileValueLoss,
+    ExponentialValueLoss,
+    H2OPlusLoss,
+    SparseValueLoss,
+)
+
+OWNERS = {
+    "loss_actor": "actor_network",
+    "loss_qvalue": "qvalue_network",
+    "loss_value": "value_loss.value_network",
+    "loss_alpha": "log_alpha",
+    "loss_ratio_sa": "ratio_loss.estimator_params.sa_network",
+    "loss_ratio_sas": "ratio_loss.estimator_params.sas_network",
+}
+
+
+@pytest.mark.parametrize("key", OWNERS)
+def test_each_network_is_moved_by_the_loss_that_is_for_it_alone(parts, batch, key):
+    loss = parts.h2o_plus()
+    loss(batch)[key].backward()
+    moved = {name for name, p in loss.named_parameters() if p.grad is not None and p.grad.any()}
+    assert moved
+    assert all(name.startswith(OWNERS[key]) for name in moved)
+
+
+def test_every_parameter_is_in_the_optimiser_once_and_gets_a_gradient(parts, batch):
+    loss = parts.h2o_plus()
+    parameters = list(loss.parameters())
+    assert len({p.data_ptr() for p in parameters}) == len(parameters)
+    sum(v for k, v in loss(batch).items() if k.startswith("loss_")).backward()
+    assert all(p.grad is not None for p in parameters)
+    stacked_q = sum(p.numel() for q in parts.qvalues for p in q.parameters())
+    others = sum(p.numel() for m in (parts.actor, parts.value, parts.estimator) for p in m.parameters())
+    assert sum(p.numel() for p in parameters) == stacked_q + others + 1  # log_alpha
+
+
+def test_no_tensor_stands_twice_in_the_state_dict(parts):
+    pointers = [v.data_ptr() for v in parts.h2o_plus().state_dict().values() if isinstance(v, torch.Tensor)]
+    assert len(set(pointers)) == len(pointers)
+
+
+def test_actor_and_alpha_losses_are_equation_10(parts, batch):
+    loss = parts.h2o_plus(alpha_init=0.3)
+    torch.manual_seed(4)
+    action, log_prob = loss._sample_action(batch)
+    actor = reference.layers(loss.actor_network_params)
+    qvalues = [reference.layers(loss.qvalue_network_params, member) for member in range(2)]
+    terms, entropies = {True: [], False: []}, {True: [], False: []}
+    for row, a, lp in zip(reference.rows(batch), action.tolist(), log_prob.tolist(), strict=True):
+        loc, log_std = (reference.mlp(actor, row["observation"])[i::] for i in (0, ACTION_DIM))
+        noise = [
+            (torch.atanh(torch.tensor(x, dtype=torch.float64)).item() - m) / torch.tensor(s).exp().item()
+            for x, m, s in zip(a, loc, log_std, strict=False)
+        ]
+        again, expected_log_prob = reference.policy(actor, row["observation"], noise)
+        assert lp == pytest.approx(expected_log_prob, rel=1e-5)
+        q = min(reference.mlp(net, row["observation"] + again)[0] for net in qvalues)
+        terms[row["real"]].append(0.3 * expected_log_prob - q)
+        entropies[row["real"]].append(expected_log_prob)
+    torch.manual_seed(4)
+    got, sampled = loss.actor_loss(batch)
+    expected = (reference.mean(terms[True]) + reference.mean(terms[False])) / 2
+    assert got.item() == pytest.approx(expected, rel=1e-5)
+    mean_log_prob = (reference.mean(entropies[True]) + reference.mean(entropies[False])) / 2
+    expected_alpha = -loss.log_alpha.item() * (mean_log_prob - ACTION_DIM)
+    assert loss.alpha_loss(sampled, batch).item() == pytest.approx(expected_alpha, rel=1e-5)
+
+
+def test_alpha_grows_while_the_entropy_is_below_its_target(parts, batch):
+    for target, sign in ((100.0, -1), (-100.0, 1)):
+        loss = parts.h2o_plus(target_entropy=target)
+        loss(batch)["loss_alpha"].backward()
+        assert loss.log_alpha.grad.sign() == sign
+
+
+def test_a_fixed_alpha_is_no_parameter(parts, batch):
+    loss = parts.h2o_plus(fixed_alpha=True, alpha_init=0.2)
+    assert "log_alpha" not in dict(loss.named_parameters())
+    assert loss(batch)["alpha"] == pytest.approx(0.2)
+
+
+def test_value_is_regressed_on_the_smaller_target_q_of_the_real_actions(parts, batch):
+    loss = parts.h2o_plus(lambda v: ExpectileValueLoss(v, 0.8))
+    value = reference.layers(loss.value_network_params)
+    targets = [reference.layers(loss.target_qvalue_network_params, member) for member in range(2)]
+    expected = reference.mean(
+        [
+            reference.value_penalty(
+                "expectile",
+                min(reference.mlp(q, row["observation"] + row["action"])[0] for q in targets)
+                - reference.mlp(value, row["observation"])[0],
+                0.8,
+            )
+            for row in reference.rows(batch)
+            if row["real"]
+        ]
+    )
+    assert loss(batch)["loss_value"].item() == pytest.approx(expected, rel=1e-10)
+
+
+def test_the_loss_s_own_ratio_weighs_the_simulated_rows(parts, batch):
+    parts.estimator.clamp = None
+    own, given = parts.h2o_plus(), Parts().h2o_plus(ratio=False)
+    given.load_state_dict({k: v for k, v in own.state_dict().items() if not k.startswith("ratio_loss")})
+    losses = own(batch)
+    assert "dynamics_ratio" not in batch.keys()  # a stale ratio would weigh the next call
+    ratio = parts.estimator(batch.copy())["dynamics_ratio"]
+    assert losses["dynamics_ratio"].item() == pytest.approx(ratio[~batch["real"]].mean().item())
+    torch.manual_seed(2)
+    unweighted = given(batch.copy())["loss_qvalue"]
+    torch.manual_seed(2)
+    weighted = given(batch.copy().set("dynamics_ratio", ratio))["loss_qvalue"]
+    assert weighted != unweighted
+    own.ratio_loss.eval()  # no input noise: the policy's samples are the same in both
+    torch.manual_seed(2)
+    torch.testing.assert_close(own(batch)["loss_qvalue"], weighted)
+
+
+@pytest.mark.parametrize("backbone", [ExpectileValueLoss, SparseValueLoss, ExponentialValueLoss])
+def test_swapping_the_backbone_is_one_argument(parts, batch, backbone):
+    loss = parts.h2o_plus(backbone)
+    before = loss(batch)["loss_value"]
+    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    before.backward()
+    optimiser.step()
+    assert loss(batch)["loss_value"] < before
+
+
+def test_an_update_moves_every_network_and_the_targets_follow(parts, batch):
+    loss = parts.h2o_plus()
+    targets = SoftUpdate(loss, tau=0.005)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    before = {k: v.clone() for k, v in loss.state_dict().items() if isinstance(v, torch.Tensor)}
+    sum(v for k, v in loss(batch).items() if k.startswith("loss_")).backward()
+    optimiser.step()
+    targets.step()
+    fixed = {"mixing", "gamma", "target_entropy"}
+    still = {k for k, v in loss.state_dict().items() if k in before and torch.equal(v, before[k])}
+    assert still <= fixed
+
+
+def test_the_automatic_target_entropy_is_minus_the_action_s_size(parts):
+    assert parts.h2o_plus().target_entropy == -float(ACTION_DIM)
+
+
+def test_an_automatic_target_entropy_needs_the_action_s_spec(parts):
+    actor = ProbabilisticActor(parts.actor[0], in_keys=["loc", "scale"], distribution_class=TanhNormal)
+    with pytest.raises(ValueError, match="spec"):
+        H2OPlusLoss(actor, parts.qvalues, ExpectileValueLoss(parts.value))

@@ -1,0 +1,223 @@
+"""What a TorchRL user expects of any loss: keys, dispatch, reductions, copies, dtypes and compilation."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.modules import ValueOperator
+
+from tests.objectives.conftest import ACTION_DIM, CELLS, OBSERVATION_DIM, Parts, make_batch
+from torchrl_h2o.objectives import (
+    DynamicsRatioLoss,
+    ExpectileValueLoss,
+    ExponentialValueLoss,
+    MixedBellmanLoss,
+    SparseValueLoss,
+    make_actor,
+    make_value,
+)
+
+LOSSES = {
+    "expectile": lambda parts: ExpectileValueLoss(parts.value),
+    "sparse": lambda parts: SparseValueLoss(parts.value),
+    "exponential": lambda parts: ExponentialValueLoss(parts.value),
+    "ratio": lambda parts: DynamicsRatioLoss(parts.estimator, input_noise=None),
+    "bellman": lambda parts: parts.bellman(),
+    "h2o_plus": lambda parts: parts.h2o_plus(),
+}
+losses = pytest.mark.parametrize("name", LOSSES)
+
+
+def make(name, dtype=torch.float64):
+    return LOSSES[name](Parts(dtype=dtype)).eval()
+
+
+def full_batch(dtype=torch.float64, **kwargs):
+    batch = make_batch(dtype=dtype, **kwargs)
+    return batch.set("state_action_value", torch.linspace(-1, 1, batch.shape[0], dtype=dtype)[:, None])
+
+
+def evaluate(loss, batch):
+    torch.manual_seed(11)
+    return loss(batch)
+
+
+@losses
+def test_dispatch_with_plain_tensors_gives_the_same(name):
+    loss, batch = make(name), full_batch()
+    expected = evaluate(loss, batch.copy())
+    tensors = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss.in_keys}
+    torch.manual_seed(11)
+    got = loss(**tensors)
+    got = got if isinstance(got, tuple) else (got,)
+    for key, value in zip(loss.out_keys, got, strict=True):
+        torch.testing.assert_close(value, expected[key])
+
+
+@losses
+def test_selected_out_keys_alone_are_returned_by_dispatch(name):
+    loss, batch = make(name), full_batch()
+    key = loss.out_keys[0]
+    loss.select_out_keys(key)
+    tensors = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss.in_keys}
+    assert isinstance(loss(**tensors), torch.Tensor)
+
+
+@losses
+def test_written_keys_are_the_out_keys(name):
+    loss = make(name)
+    assert set(loss(full_batch()).keys()) == set(loss.out_keys)
+
+
+@losses
+@pytest.mark.parametrize("reduction", ["sum", "none"])
+def test_reductions_agree(name, reduction):
+    batch = full_batch()
+    mean, other = make(name), make(name)
+    for module in other.modules():
+        if hasattr(module, "reduction"):
+            module.reduction = reduction
+    terms, expected = evaluate(other, batch.copy()), evaluate(mean, batch.copy())
+    for key in (k for k in expected.keys() if k.startswith("loss_")):
+        if reduction == "none":
+            assert terms[key].shape == batch.shape
+            real, sim = terms[key][batch["real"]], terms[key][~batch["real"]]
+            total = real.mean() + sim.mean()
+            both = total / 2 if key in ("loss_actor", "loss_alpha") else total
+            torch.testing.assert_close(both, expected[key])
+        else:
+            for module in other.modules():
+                if hasattr(module, "reduction"):
+                    module.reduction = "none"
+            torch.testing.assert_close(terms[key], evaluate(other, batch.copy())[key].sum())
+            break
+
+
+@losses
+def test_state_dict_round_trip_gives_the_same_numbers(name):
+    loss, batch = make(name), full_batch()
+    other = LOSSES[name](Parts(seed=1)).eval()
+    before = evaluate(other, batch.copy())
+    other.load_state_dict(loss.state_dict())
+    torch.testing.assert_close(evaluate(other, batch.copy()), evaluate(loss, batch.copy()))
+    key = next(iter(loss.out_keys))
+    assert before[key] != evaluate(loss, batch.copy())[key]
+
+
+@losses
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
+def test_copies_are_equal_and_independent(name, clone):
+    loss, batch = make(name), full_batch()
+    other = clone(loss)
+    expected = evaluate(loss, batch.copy())
+    torch.testing.assert_close(evaluate(other, batch.copy()), expected)
+    with torch.no_grad():
+        for parameter in loss.parameters():
+            parameter.add_(1.0)
+    torch.testing.assert_close(evaluate(other, batch.copy()), expected)
+    assert len(list(other.parameters())) == len(list(loss.parameters()))
+
+
+@losses
+def test_conversion_to_float64_converts_everything(name):
+    loss = make(name, dtype=torch.float32).double()
+    assert all(value.dtype == torch.float64 for value in loss(full_batch()).values())
+
+
+@losses
+def test_compiled_fullgraph_equals_eager(name):
+    loss, batch = make(name), full_batch()
+    torch._dynamo.reset()
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    expected, got = evaluate(loss, batch.copy()), evaluate(compiled, batch.copy())
+    torch.testing.assert_close(got, expected)
+    key = next(k for k in loss.out_keys if k.startswith("loss_"))
+    loss.zero_grad()
+    expected[key].backward()
+    gradients = [p.grad.clone() if p.grad is not None else None for p in loss.parameters()]
+    loss.zero_grad()
+    got[key].backward()
+    for parameter, gradient in zip(loss.parameters(), gradients, strict=True):
+        if gradient is not None:
+            torch.testing.assert_close(parameter.grad, gradient)
+
+
+RENAMED = {"real": ("marks", "real"), "state_action_value": ("critic", "q"), "value": ("critic", "v")}
+
+
+def test_renamed_and_nested_keys_of_the_value_loss():
+    batch = full_batch()
+    plain = ExpectileValueLoss(Parts().value)
+    network = ValueOperator(Parts().value.module, in_keys=[("agent", "obs")], out_keys=[("critic", "v")])
+    loss = ExpectileValueLoss(network)
+    loss.set_keys(**RENAMED)
+    renamed = TensorDict(
+        agent=TensorDict(obs=batch["observation"], batch_size=7),
+        critic=TensorDict(q=batch["state_action_value"], batch_size=7),
+        marks=TensorDict(real=batch["real"], batch_size=7),
+        batch_size=7,
+    )
+    torch.testing.assert_close(loss(renamed), plain(batch))
+    assert ("agent", "obs") in loss.in_keys
+    with pytest.raises(ValueError, match="not an accepted"):
+        loss.set_keys(reward="r")
+
+
+def test_renamed_and_nested_keys_of_h2o_plus_reach_its_parts():
+    batch = full_batch()
+    plain = Parts().h2o_plus().eval()
+    loss = Parts().h2o_plus().eval()
+    loss.set_keys(
+        real=("marks", "real"), reward=("pay", "r"), terminated="over", priority=("p", "td"), log_prob="entropy_term"
+    )
+    renamed = batch.exclude("real", ("next", "reward"), ("next", "terminated"))
+    renamed["marks", "real"] = batch["real"]
+    renamed["next", "pay", "r"] = batch["next", "reward"]
+    renamed["next", "over"] = batch["next", "terminated"]
+    loss.exploration.in_keys[0] = "entropy_term"
+    torch.testing.assert_close(evaluate(loss, renamed), evaluate(plain, batch))
+    assert ("p", "td") in renamed.keys(True)
+    assert loss.ratio_loss.tensor_keys.real == ("marks", "real")
+
+
+def test_more_batch_dimensions_give_the_same():
+    batch = full_batch(num_real=4, num_sim=4)
+    loss = ExponentialValueLoss(Parts().value)
+    torch.testing.assert_close(loss(batch.reshape(4, 2))["loss_value"], loss(batch)["loss_value"])
+    bellman = Parts().bellman(mixing=1.0)
+    torch.testing.assert_close(bellman(batch.reshape(4, 2))["loss_qvalue"], bellman(batch)["loss_qvalue"])
+
+
+def test_one_q_network_is_expanded_to_an_ensemble():
+    parts = Parts()
+    loss = MixedBellmanLoss(parts.actor, parts.qvalues[0], parts.value, num_qvalue_nets=5)
+    assert loss.qvalue_network_params.shape == (5,)
+
+
+def test_mixing_can_be_scheduled_in_place():
+    loss = make("h2o_plus")
+    loss.mixing = 0.7
+    assert loss.state_dict()["mixing"] == pytest.approx(0.7)
+
+
+def test_actions_follow_the_bounds_of_their_spec():
+    actor = make_actor(OBSERVATION_DIM, Bounded(-3, 3, (ACTION_DIM,)), CELLS)
+    with torch.no_grad():
+        _, _, action, _ = actor(observation=100 * torch.randn(1000, OBSERVATION_DIM))
+    assert action.abs().max() <= 3
+    assert make_value(OBSERVATION_DIM)(observation=torch.zeros(2, OBSERVATION_DIM)).shape == (2, 1)
+
+
+def test_objectives_import_without_mujoco():
+    code = (
+        "import sys\n"
+        "for name in ('mujoco', 'gymnasium', 'dm_control', 'minari', 'h5py', 'hydra', 'yaml'):\n"
+        "    sys.modules[name] = None\n"
+        "import torchrl_h2o, torchrl_h2o.objectives\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
