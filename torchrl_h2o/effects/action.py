@@ -27,7 +27,7 @@ class ActionNoise(ActionEffect):
         >>> noisy(np.zeros(2)).round(3)
         array([ 0.126, -0.132])
 
-    Source: H2O+ (Niu et al., 2023), the gap ``joint_noise``.
+    Source: H2O+ (arXiv 2309.12716), the gap ``joint_noise``.
     """
 
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"

@@ -29,7 +29,7 @@ class GeomFriction(ModelEffect):
         >>> GeomFriction(0.3).describe()
         'friction of all geoms × 0.3'
 
-    Source: H2O+ (Niu et al., 2023), the gap ``friction``.
+    Source: H2O+ (arXiv 2309.12716), the gap ``friction``.
     """
 
     wording: ClassVar[str] = "friction of {geoms} × {scale}"
@@ -59,7 +59,7 @@ class GeomSize(ModelEffect):
         >>> GeomSize(2.0, geoms="*thigh*").describe()
         'size of geoms *thigh* × 2'
 
-    Source: H2O+ (Niu et al., 2023), the gaps ``big_thigh`` and ``small_thigh``.
+    Source: H2O+ (arXiv 2309.12716), the gaps ``big_thigh`` and ``small_thigh``.
     """
 
     wording: ClassVar[str] = "size of {geoms} × {scale}"
@@ -86,7 +86,7 @@ class GeomLength(ModelEffect):
         >>> GeomLength(4.0, geoms="torso").describe()
         'length of geoms torso × 4'
 
-    Source: H2O+ (Niu et al., 2023), the gap ``long_torso``.
+    Source: H2O+ (arXiv 2309.12716), the gap ``long_torso``.
     """
 
     wording: ClassVar[str] = "length of {geoms} × {scale}"

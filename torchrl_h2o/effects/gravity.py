@@ -19,7 +19,7 @@ class Gravity(ModelEffect):
         >>> Gravity(2.0).describe()
         'gravity × 2'
 
-    Source: H2O+ (Niu et al., 2023), the gap ``gravity``.
+    Source: H2O+ (arXiv 2309.12716), the gap ``gravity``.
     """
 
     wording: ClassVar[str] = "gravity × {scale}"

@@ -28,7 +28,7 @@ class JointRange(ModelEffect):
         >>> JointRange(0.5, joints="*thigh*").describe()
         'range of joints *thigh* × 0.5'
 
-    Source: H2O+ (Niu et al., 2023), the gaps ``broken_thigh`` and ``flexible_thigh``.
+    Source: H2O+ (arXiv 2309.12716), the gaps ``broken_thigh`` and ``flexible_thigh``.
     """
 
     wording: ClassVar[str] = "range of {joints} × {scale}"
@@ -55,7 +55,7 @@ class JointStiffness(ModelEffect):
         >>> JointStiffness(0.0, joints="*foot*").describe()
         'stiffness of joints *foot* × 0'
 
-    Source: H2O+ (Niu et al., 2023), the gap ``soft_feet``.
+    Source: H2O+ (arXiv 2309.12716), the gap ``soft_feet``.
     """
 
     wording: ClassVar[str] = "stiffness of {joints} × {scale}"

@@ -1,6 +1,6 @@
 """The nine dynamics gaps of the H2O+ paper, by name: one table.
 
-Source: H2O+ (Niu et al., 2023), section 5, and the strengths of the authors' published code.
+Source: H2O+ (arXiv 2309.12716), simulation experiments, and the strengths of the authors' published code.
 """
 
 from collections.abc import Callable, Mapping

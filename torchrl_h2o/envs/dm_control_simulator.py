@@ -1,0 +1,64 @@
+"""The simulation inside a task of the dm_control suite, wrapped by TorchRL's DMControlEnv."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import mujoco
+from torchrl.envs import DMControlWrapper, EnvBase
+
+from torchrl_h2o.effects import ForceEffect
+from torchrl_h2o.envs.simulator import Simulator
+
+if TYPE_CHECKING:
+    from dm_control.mujoco import Physics
+
+
+class DMControlSimulator(Simulator):
+    """A dm_control ``Physics``, whose model comes from the module of the task."""
+
+    owner: Physics
+
+    @classmethod
+    def inside(cls, env: EnvBase) -> DMControlSimulator | None:
+        """The simulation inside an env without transforms, None if there is none of this kind."""
+        return cls(env._env.physics, env) if isinstance(env, DMControlWrapper) else None
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self.owner.model.ptr
+
+    @property
+    def data(self) -> mujoco.MjData:
+        return self.owner.data.ptr
+
+    @property
+    def control_step(self) -> float:
+        return self.env._env.control_timestep() * self.env.wrapper_frame_skip
+
+    def spec(self) -> mujoco.MjSpec:
+        module = sys.modules[type(self.env._env.task).__module__]
+        if not hasattr(module, "get_model_and_assets"):
+            raise ValueError(
+                f"{self.env}: {module.__name__} does not say where its model comes from "
+                "(get_model_and_assets), as the tasks of dm_control.suite do"
+            )
+        xml, assets = module.get_model_and_assets()
+        return mujoco.MjSpec.from_string(xml.decode(), include=assets)
+
+    def load(self, model: mujoco.MjModel) -> None:
+        from dm_control.mujoco.wrapper import MjModel
+
+        # What Physics.reload_from_xml_string does, which would round the numbers on their way
+        # through text. It renews the named views and the rendering contexts as well.
+        self.owner._reload_from_model(MjModel(model))
+
+    def push(self, forces: Sequence[ForceEffect]) -> None:
+        self.owner.step = partial(self._step, tuple(forces))
+
+    def _step(self, forces: tuple[ForceEffect, ...], nstep: int = 1) -> None:
+        step = type(self.owner).step
+        self._pushed_steps(lambda: step(self.owner, 1), forces, nstep)

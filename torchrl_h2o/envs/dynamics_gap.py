@@ -1,0 +1,215 @@
+"""DynamicsGap, the TorchRL transform that puts effects into a simulator."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+
+from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, paper_gap
+from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.simulator import Simulator
+
+Process = Callable[[np.ndarray], np.ndarray]
+_PROCESSES = (ActionEffect, ObservationEffect)
+
+
+class Episode(NamedTuple):
+    """The action and observation effects of one episode, with what they remember of it."""
+
+    actions: list[Process]
+    action_keys: list[NestedKey]
+    observations: list[Process]
+    observation_keys: list[NestedKey]
+
+
+class DynamicsGap(Transform):
+    """What a list of effects does to a simulator.
+
+    The model is changed when the transform is put on an env: its effects edit the task's own
+    MJCF, in memory, and the result is compiled and replaces the model in use. The env must be reset
+    after that. Actions are altered on their way to the simulator, while the tensordict keeps the
+    action asked for; observations are altered before any other transform reads them; forces act at
+    every physics step.
+
+    Effects compose in their order: model edits first to last before one compilation, action
+    effects first to last, forces summed, observation effects first to last. Of several gaps on one
+    env, the one put on first edits first; actions pass through the outermost first, as through any
+    transforms of TorchRL.
+
+    A gap is for one simulator and for its life: taking the transform off the env does not mend the
+    simulator. Put it directly on the env, before transforms that rename its keys, and within each
+    worker of a batched env.
+
+    All randomness of an episode is seeded at its reset from torch's global generator:
+    ``torch.manual_seed`` repeats it. In ``ParallelEnv`` each worker has a generator of its own;
+    the env's ``set_seed`` makes them differ.
+
+    An observation effect sees the env's floating-point observations as one vector, in the order of
+    the observation spec.
+
+    Args:
+        *effects: the effects.
+
+    Raises:
+        TypeError: if one of them is not an effect.
+        ValueError: when put on an env that is batched, does not run on MuJoCo, or whose model has
+            nothing that one of the effects could act on.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_h2o.effects import ActionNoise, Gravity
+        >>> from torchrl_h2o.envs import DynamicsGap, mujoco_model
+        >>> gap = DynamicsGap(Gravity(2.0), ActionNoise(0.1))
+        >>> gap
+        DynamicsGap(gravity × 2, noise of standard deviation 0.1 on all actuators)
+        >>> env = TransformedEnv(GymEnv("HalfCheetah-v5"), gap)
+        >>> float(mujoco_model(env).opt.gravity[2])
+        -19.62
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(self, *effects: Effect):
+        super().__init__()
+        for effect in effects:
+            if not isinstance(effect, Effect):
+                raise TypeError(
+                    f"DynamicsGap takes effects such as Gravity(2.0), got {effect!r}; for one of "
+                    "the paper's gaps by name, use dynamics_gap"
+                )
+        self.effects = effects
+        # TorchRL clones transforms freely, also onto the env that they are on already. Clones share
+        # this object, by which the simulator knows a gap that it has.
+        self._identity = object()
+        self._episode: Episode | None = None
+
+    def describe(self) -> str:
+        """What the gap does, in words with units."""
+        return ", ".join(effect.describe() for effect in self.effects)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.describe()})"
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        super().set_container(container)
+        if self.container is None:  # in a Compose that is not on an env yet
+            return
+        simulator = find_simulator(self.container)
+        # Before the model is changed: does every index that an effect names exist?
+        rehearsal = self._new_episode(simulator, np.random.default_rng(0))
+        example = simulator.env.fake_tensordict()
+        _alter(example, rehearsal.action_keys, rehearsal.actions)
+        _alter(example, rehearsal.observation_keys, rehearsal.observations)
+        simulator.apply(self._identity, self.effects)
+
+    def clone(self) -> "DynamicsGap":
+        clone = super().clone()
+        clone._episode = None  # a delay line is not shared
+        return clone
+
+    def __getstate__(self) -> dict:
+        return {**super().__getstate__(), "_episode": None}  # its functions cannot be pickled
+
+    def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
+        # A copied or unpickled env may have built its simulator anew, without the gaps.
+        gaps = _gaps_on(self.container)
+        if len({gap._identity for gap in gaps}) < len(gaps):
+            raise ValueError(
+                f"{self} and a clone of it are on one env, where they count as one gap; to have "
+                "its effects twice, make a second DynamicsGap"
+            )
+        simulator = find_simulator(self.container)
+        for gap in gaps:
+            simulator.apply(gap._identity, gap.effects)
+        return super()._reset_env_preprocess(tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        self._episode = None
+        return self._call(tensordict_reset)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        episode = self._current_episode()
+        return _alter(tensordict, episode.action_keys, episode.actions)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        episode = self._current_episode()
+        return _alter(next_tensordict, episode.observation_keys, episode.observations)
+
+    def _current_episode(self) -> Episode:
+        if self._episode is None:
+            if self.container is None:  # in a replay buffer there is no simulator to alter
+                return Episode([], [], [], [])
+            rng = None
+            if any(not e.is_neutral and isinstance(e, _PROCESSES) for e in self.effects):
+                rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
+            self._episode = self._new_episode(find_simulator(self.container), rng)
+        return self._episode
+
+    def _new_episode(self, simulator: Simulator, rng: np.random.Generator | None) -> Episode:
+        actions, observations = (
+            [
+                effect.process(simulator.control_step, rng)
+                for effect in self.effects
+                if isinstance(effect, kind) and not effect.is_neutral
+            ]
+            for kind in _PROCESSES
+        )
+        observation_spec = simulator.env.observation_spec
+        observation_keys = [key for key, spec in observation_spec.items(True, True) if spec.dtype.is_floating_point]
+        return Episode(actions, simulator.env.action_keys, observations, observation_keys)
+
+
+def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:
+    """One of the paper's dynamics gaps, by its name.
+
+    Args:
+        name: ``gravity``, ``friction``, ``joint_noise``, ``big_thigh``, ``small_thigh``,
+            ``broken_thigh``, ``flexible_thigh``, ``long_torso`` or ``soft_feet``; see
+            :func:`~torchrl_h2o.effects.paper_gap`.
+        strength: the factor, or for ``joint_noise`` the standard deviation. The paper's by default.
+
+    Returns:
+        The transform.
+
+    Raises:
+        ValueError: if there is no such gap, or the strength is out of bounds.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_h2o.envs import dynamics_gap, mujoco_model
+        >>> env = TransformedEnv(GymEnv("HalfCheetah-v5"), dynamics_gap("long_torso"))
+        >>> model = mujoco_model(env)
+        >>> print(model.geom("torso").size[1], "m,", model.body_mass.sum().round(6), "kg")
+        2.0 m, 14.0 kg
+
+    Source: H2O+ (arXiv 2309.12716), simulation experiments.
+    """
+    return DynamicsGap(paper_gap(name, strength))
+
+
+def _alter(tensordict: TensorDictBase, keys: Sequence[NestedKey], processes: Sequence[Process]) -> TensorDictBase:
+    """Passes the entries under the keys, as one vector, through the processes."""
+    if not processes:
+        return tensordict
+    tensors = [tensordict.get(key) for key in keys]
+    parts = [tensor.detach().cpu().double().flatten().numpy() for tensor in tensors]
+    vector = np.concatenate(parts)  # a copy: what an effect remembers must not change
+    for process in processes:
+        vector = process(vector)
+    ends = np.cumsum([part.size for part in parts])[:-1]
+    for key, tensor, part in zip(keys, tensors, np.split(vector, ends), strict=True):
+        altered = torch.as_tensor(part, dtype=tensor.dtype, device=tensor.device)
+        tensordict.set(key, altered.view(tensor.shape))
+    return tensordict
+
+
+def _gaps_on(env: EnvBase | None) -> list[DynamicsGap]:
+    """The gaps among an env's transforms, the innermost first."""
+    if not isinstance(env, TransformedEnv):
+        return []
+    transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
+    gaps = [transform for transform in transforms if isinstance(transform, DynamicsGap)]
+    return _gaps_on(env.base_env) + gaps

@@ -1,0 +1,58 @@
+"""Finds the MuJoCo simulation of a TorchRL env, and returns the model that it runs on."""
+
+import mujoco
+from torchrl.envs import EnvBase
+
+from torchrl_h2o.envs.dm_control_simulator import DMControlSimulator
+from torchrl_h2o.envs.gymnasium_simulator import GymnasiumSimulator
+from torchrl_h2o.envs.simulator import Simulator, base_env
+
+
+def mujoco_model(env: EnvBase) -> mujoco.MjModel:
+    """The MuJoCo model in use, with all of the env's dynamics gaps in it.
+
+    The model changes when a gap is put in: ask again rather than keep it.
+
+    Args:
+        env: a GymEnv or DMControlEnv of a MuJoCo task, with or without transforms.
+
+    Returns:
+        The model itself, not a copy.
+
+    Raises:
+        ValueError: if the env is batched or does not run on MuJoCo.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> float(mujoco_model(GymEnv("HalfCheetah-v5")).opt.gravity[2])
+        -9.81
+    """
+    return find_simulator(env).model
+
+
+def find_simulator(env: EnvBase) -> Simulator:
+    """The MuJoCo simulation inside an env.
+
+    Args:
+        env: a GymEnv or DMControlEnv of a MuJoCo task, with or without transforms.
+
+    Returns:
+        The simulation.
+
+    Raises:
+        ValueError: if the env is batched or does not run on MuJoCo.
+    """
+    base = base_env(env)
+    if base.batch_size:
+        raise ValueError(
+            f"{base} is batched, with batch size {tuple(base.batch_size)}: its simulations cannot "
+            "be reached from outside. Put the gap inside each worker, as in "
+            "ParallelEnv(2, lambda: TransformedEnv(GymEnv('HalfCheetah-v5'), DynamicsGap(...)))"
+        )
+    simulator = GymnasiumSimulator.inside(base) or DMControlSimulator.inside(base)
+    if simulator is None:
+        raise ValueError(
+            f"{base} does not run on MuJoCo; choose a MuJoCo task of Gymnasium, such as "
+            "GymEnv('HalfCheetah-v5'), or of dm_control, such as DMControlEnv('cheetah', 'run')"
+        )
+    return simulator

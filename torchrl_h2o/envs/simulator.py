@@ -1,0 +1,120 @@
+"""The MuJoCo simulation inside a TorchRL env, alike for Gymnasium and dm_control.
+
+What :class:`~torchrl_h2o.envs.DynamicsGap` needs of a simulation, and nothing that it does not.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_h2o.effects import Effect, ForceEffect, compile_model
+
+_SIZES = ("nq", "nv", "nu", "na", "nbody", "njnt", "ngeom", "nsite", "nsensor")
+
+
+class Simulator(ABC):
+    """The simulation inside one env: its model, and how to put another one in.
+
+    The gaps that are in a simulation are remembered on the object that owns the model. A copy that
+    is built anew, without the gaps' model, thus comes without the memory of them too.
+
+    Args:
+        owner: the object that owns model and data, and lives as long as they do.
+        env: the TorchRL env around it.
+    """
+
+    def __init__(self, owner: Any, env: EnvBase):
+        self.owner = owner
+        self.env = env
+
+    @property
+    @abstractmethod
+    def model(self) -> mujoco.MjModel:
+        """The model in use."""
+
+    @property
+    @abstractmethod
+    def data(self) -> mujoco.MjData:
+        """The state in use."""
+
+    @property
+    @abstractmethod
+    def control_step(self) -> float:
+        """The time between two actions, in s."""
+
+    @abstractmethod
+    def spec(self) -> mujoco.MjSpec:
+        """The specification of the model without any gap, parsed anew from its source."""
+
+    @abstractmethod
+    def load(self, model: mujoco.MjModel) -> None:
+        """Puts a model and fresh data in, where the simulation and its renderers will use them."""
+
+    @abstractmethod
+    def push(self, forces: Sequence[ForceEffect]) -> None:
+        """Makes every physics step from now on apply these forces, and no others."""
+
+    def apply(self, gap: object, effects: Sequence[Effect]) -> None:
+        """Puts a gap in, after those that are in already; does nothing if it is one of them.
+
+        Args:
+            gap: stands for the gap: the same object, the same gap.
+            effects: what the gap consists of. Action and observation effects are passed over.
+
+        Raises:
+            ValueError: if the model has nothing that an effect could act on. Nothing is changed.
+        """
+        applied = getattr(self.owner, "_dynamics_gaps", {})
+        if gap in applied:
+            return
+        if not applied:
+            self._check_source()
+        applied = {**applied, gap: tuple(effects)}
+        everything = [effect for effects in applied.values() for effect in effects]
+        model = compile_model(self.spec(), everything)
+        self._check_sizes(model)
+        model.vis.global_.offwidth = self.model.vis.global_.offwidth
+        model.vis.global_.offheight = self.model.vis.global_.offheight
+        forces = [e for e in everything if isinstance(e, ForceEffect) and not e.is_neutral]
+        for force in forces:
+            force.generalised_force(model, mujoco.MjData(model))  # complains now, not when stepping
+        self.load(model)
+        if forces:
+            self.push(forces)
+        self.owner._dynamics_gaps = applied
+
+    def _check_source(self) -> None:
+        self._check_sizes(compile_model(self.spec()))
+
+    def _check_sizes(self, model: mujoco.MjModel) -> None:
+        for size in _SIZES:
+            ours, theirs = getattr(self.model, size), getattr(model, size)
+            if ours != theirs:
+                raise ValueError(
+                    f"the model of {self.env} has {size} = {ours}, the one compiled for it has "
+                    f"{theirs}: a dynamics gap must keep joints, bodies and actuators, and the "
+                    "model must come from its file unchanged"
+                )
+
+    def _pushed_steps(self, step: Callable[[], None], forces: Sequence[ForceEffect], n_steps: int) -> None:
+        """Takes physics steps one by one, each under the forces of the state that it starts from."""
+        model, data = self.model, self.data
+        for _ in range(n_steps):
+            # after a step, MuJoCo leaves the bodies where they were before it
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            others = data.qfrc_applied.copy()
+            data.qfrc_applied += sum(force.generalised_force(model, data) for force in forces)
+            step()
+            data.qfrc_applied[:] = others
+
+
+def base_env(env: EnvBase) -> EnvBase:
+    """The env under all of an env's transforms."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
