@@ -1,0 +1,77 @@
+"""Recording measured data from an env: one function, a policy and a seed in, transitions out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm import tqdm
+
+DONE_KEYS = ("done", "terminated", "truncated")
+
+
+def record(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    num_transitions: int = 16_588,
+    seed: int = 0,
+    *,
+    progress: bool = True,
+) -> TensorDict:
+    """Records transitions in the order in which they happen, episode after episode.
+
+    The last one is marked as truncated, because the recording breaks off there. The policy
+    explores, and finds in ``is_init`` where episodes start. The same seed gives the same data;
+    torch's own random state is left as it was.
+
+    Args:
+        env: not batched; is reset first, and stays open.
+        policy: a TensorDict module or function that writes ``action``.
+        num_transitions: how many; the default is the size of the real robot's log.
+        seed: of env and policy.
+        progress: whether to show a progress bar.
+
+    Returns:
+        TensorDict of batch size ``(num_transitions,)`` in TED form: observation, action, done,
+        terminated, truncated, and under ``next`` observation, reward, done, terminated, truncated.
+
+    Raises:
+        ValueError: for fewer than one transition, or for a batched env.
+
+    Example:
+        >>> from torchrl_h2o.envs.balance_controller import BalanceController
+        >>> from torchrl_h2o.envs.wheel_legged import WheelLeggedEnv
+        >>> data = record(WheelLeggedEnv(), BalanceController(), 50, seed=0, progress=False)
+        >>> data["next", "observation"].shape, int(data["next", "done"].sum())
+        (torch.Size([50, 4]), 1)
+    """
+    if num_transitions < 1:
+        raise ValueError(f"num_transitions is {num_transitions}; record at least one")
+    if env.batch_size:
+        raise ValueError(
+            f"record takes one env, not a batch of {tuple(env.batch_size)}; record from each of "
+            "its envs and concatenate"
+        )
+    # nested on purpose: unwrapped, the caller's env would lose its transforms to this one
+    tracked = TransformedEnv(env, InitTracker(), auto_unwrap=False)
+    keys = ["observation", "action", *DONE_KEYS, ("next", "observation"), ("next", "reward")]
+    keys += [("next", key) for key in DONE_KEYS]
+    transitions = []
+    with (
+        torch.random.fork_rng(devices=[]),
+        torch.no_grad(),
+        set_exploration_type(ExplorationType.RANDOM),
+    ):
+        torch.manual_seed(seed)
+        tracked.set_seed(seed)
+        state = tracked.reset()
+        for _ in tqdm(range(num_transitions), "recording", unit="step", disable=not progress):
+            transition, state = tracked.step_and_maybe_reset(policy(state))
+            transitions.append(transition.select(*keys))
+    recording = torch.stack(transitions)
+    recording["next", "truncated"][-1] |= ~recording["next", "terminated"][-1]
+    recording["next", "done"][-1] = True
+    return recording
