@@ -4,12 +4,13 @@ Why not TorchRL's ``ReplayBufferEnsemble`` or ``OfflineToOnlineReplayBuffer``: t
 equal shares into [2, B/2], does not write to one member only, and dumps the real data with every
 checkpoint; the second marks nothing and saves nothing; and both need three to five times as long
 for a batch, which they gather as TensorDicts of views first. So this is a composition of two plain
-``ReplayBuffer`` objects, whose storages, writer and checkpoints are used as they are, with a
-``sample`` that gathers each entry once a stream, straight from the storage.
+``ReplayBuffer`` objects, whose storages and writers are used as they are, with a ``sample`` that
+gathers each entry once a stream, straight from the storage.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ from torchrl.data import (
     TensorStorage,
 )
 
+from torchrl_h2o.data.memory_map import load_memory_map
 from torchrl_h2o.data.whole_folder import whole_folder
 
 TRANSITION_KEYS: tuple[NestedKey, ...] = (
@@ -163,31 +165,48 @@ class HybridReplayBuffer:
         return TensorDict(batch, batch_size=[n_real + n_sim], device=self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """The simulated stream. The real data are not in it: read them again."""
-        return {"real": self._fingerprint(), "sim": self.sim.state_dict()}
+        """The simulated stream: tensors, numbers and names. The real data are read again."""
+        return {
+            "real": self._fingerprint(),
+            "cursor": self.sim.writer.state_dict(),
+            # clones: a view would be saved with all of the capacity behind it
+            "rows": [rows.clone() for rows in self._sim_rows],
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the simulated stream of a buffer with the same real data and keys.
+        """Restore the simulated stream of a buffer with the same real data, keys and capacity.
 
         Raises:
-            ValueError: the state belongs to other real data.
+            ValueError: the state belongs to other real data, keys or a larger buffer.
         """
         self._require_same_real(state["real"])
-        self.sim.load_state_dict(state["sim"])
+        self.sim.empty()
+        if state["rows"]:
+            count = len(state["rows"][0])
+            if count > self.sim.storage.max_size:
+                raise ValueError(
+                    f"the checkpoint holds {count} simulated transitions, this buffer has room "
+                    f"for {self.sim.storage.max_size}: give it the capacity it had"
+                )
+            self.sim.extend(TensorDict(dict(zip(self.keys, state["rows"], strict=True)), [count]))
+        # rows go back to their places, so that a restored generator draws the same ones
+        self.sim.writer.load_state_dict(state["cursor"])
         self._find_sim_rows()
 
     def dumps(self, path: str | Path) -> None:
-        """Write the simulated stream to a folder, by TorchRL's own memory-mapped checkpoint.
+        """Write the simulated stream to a folder: memory-mapped rows, as many as there are.
 
         A folder of that name is replaced once the new one is complete.
 
         Args:
             path: the folder.
         """
+        state = {"real": self._fingerprint(), "cursor": self.sim.writer.state_dict()}
         with whole_folder(path, replace=True) as folder:
-            (folder / "real.json").write_text(json.dumps(self._fingerprint()), encoding="utf-8")
+            (folder / "stream.json").write_text(json.dumps(state), encoding="utf-8")
             if self._sim_rows:
-                self.sim.dumps(folder / "sim")
+                rows = TensorDict(dict(zip(self.keys, self._sim_rows, strict=True)), [len(self.sim)])
+                rows.cpu().memmap(folder / "rows", copy_existing=True)
 
     def loads(self, path: str | Path) -> None:
         """Read what :meth:`dumps` has written, into a buffer with the same real data and keys.
@@ -196,15 +215,16 @@ class HybridReplayBuffer:
             path: the folder.
 
         Raises:
-            ValueError: the folder belongs to other real data.
+            ValueError: as :meth:`load_state_dict`; also a cut-off file.
         """
         folder = Path(path)
-        self._require_same_real(json.loads((folder / "real.json").read_text(encoding="utf-8")))
-        if (folder / "sim").is_dir():
-            self.sim.loads(folder / "sim")
-        else:
-            self.sim.empty()
-        self._find_sim_rows()
+        state = json.loads((folder / "stream.json").read_text(encoding="utf-8"))
+        self._require_same_real(state["real"])
+        state["rows"] = []
+        if (folder / "rows").is_dir():
+            rows = load_memory_map(folder / "rows")
+            state["rows"] = [rows.get(key) for key in self.keys]
+        self.load_state_dict(state)
 
     def _draw(self, rows: list[torch.Tensor], count: int) -> torch.Tensor:
         return torch.randint(len(rows[0]), (count,), device=self.device)
@@ -215,11 +235,14 @@ class HybridReplayBuffer:
         self._sim_rows = [] if stored is None else [stored.get(key) for key in self.keys]
 
     def _fingerprint(self) -> dict[str, Any]:
-        # the first and last rows tell two recordings apart without reading all of a mapped file
-        ends = torch.cat([rows[[0, -1]].double().flatten() for rows in self._real_rows])
+        # 64 rows tell two recordings apart without reading all of a mapped file
+        some = torch.linspace(0, len(self.real) - 1, 64, dtype=torch.double).long()
+        digest = hashlib.sha256()
+        for rows in self._real_rows:
+            digest.update(rows[some.to(rows.device)].cpu().numpy().tobytes())
         return {
             "transitions": len(self.real),
-            "ends": ends.tolist(),
+            "sha256_of_64": digest.hexdigest(),
             "keys": [key if isinstance(key, str) else list(key) for key in self.keys],
         }
 

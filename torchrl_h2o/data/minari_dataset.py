@@ -121,8 +121,12 @@ def write_minari(
 
     try:
         parse_dataset_id(dataset_id)
-    except (ValueError, TypeError) as error:
-        raise DataError(f"{dataset_id!r} is not a Minari name", "take (namespace/)name-v0") from error
+    except (ValueError, TypeError) as error:  # without a version minari takes int(None)
+        raise DataError(
+            "this is not a name that Minari takes",
+            "take name-v0 or namespace/name-v0, of letters, digits, _ and -, two at least each",
+            source=dataset_id,
+        ) from error
     folder = (get_dataset_path() if root is None else Path(root)) / dataset_id
     _require_recordable(td, source=dataset_id)
     if env is not None:

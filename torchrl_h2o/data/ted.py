@@ -5,7 +5,6 @@ Row t is a transition; ``next`` of an episode's last row is that episode's own f
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_h2o.data.error import DataError, require_finite
-from torchrl_h2o.data.file_kind import is_pickle
+from torchrl_h2o.data.memory_map import load_memory_map
 from torchrl_h2o.data.whole_folder import whole_folder
 
 _REQUIRED_KEYS = (
@@ -199,22 +198,7 @@ def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
     Raises:
         DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity.
     """
-    folder = Path(folder).expanduser()
-    if not (folder / "meta.json").is_file():
-        raise DataError("there is no meta.json here", "give a folder written by write_ted", source=folder)
-    for path in sorted(folder.rglob("*")):
-        # tensordict keeps objects in other.pickle; refuse by name before anything is opened
-        if path.is_file() and path.suffix != ".memmap" and is_pickle(path):
-            raise DataError(
-                "this is a pickle, and reading it could run any code",
-                "write the data again with write_ted, which keeps tensors only",
-                source=path,
-            )
-    _require_whole_files(folder)
-    try:
-        td = TensorDict.load_memmap(folder, allow_pickle=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DataError(f"unreadable: {error}", "write it again", source=folder) from error
+    td = load_memory_map(folder)
     require_ted(td, source=folder)
     td = td.clone(recurse=in_memory)
     ends = td["next", "done"].clone()
@@ -222,35 +206,6 @@ def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
     td["next", "done"] = ends
     td["next", "truncated"] = ends & ~td["next", "terminated"]
     return td
-
-
-def _require_whole_files(folder: Path) -> None:
-    # torch maps a short file by growing it with zeros: the source changes and nobody is told
-    try:
-        meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
-        sizes = {
-            folder / f"{key}.memmap": int(np.prod(entry["shape"], dtype=np.int64))
-            * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
-            for key, entry in meta.items()
-            if isinstance(entry, dict) and "dtype" in entry
-        }
-        inner = [key for key, entry in meta.items() if isinstance(entry, dict) and "type" in entry]
-    except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
-        raise DataError(
-            f"the description cannot be read: {error}",
-            "copy or write the folder again",
-            source=folder / "meta.json",
-        ) from error
-    for path, size in sizes.items():
-        found = path.stat().st_size if path.is_file() else 0
-        if found != size:
-            raise DataError(
-                f"the file has {found} bytes, meta.json promises {size}",
-                "it is cut off or not its own: copy or write the folder again",
-                source=path,
-            )
-    for key in inner:
-        _require_whole_files(folder / key)
 
 
 def _name(key: str | tuple) -> str:

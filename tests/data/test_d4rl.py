@@ -1,0 +1,130 @@
+"""D4RL's layout, with and without next_observations."""
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.data.recordings import assert_same, make_arrays, make_recording
+from torchrl_h2o.data import DataError, episodes, load, read_d4rl
+
+ENDINGS = (True, False, False)
+LENGTHS = (4, 1, 3)
+
+
+def write(path, **changes):
+    """A file in D4RL's layout; ``changes`` replaces arrays, None leaves one out."""
+    made = make_arrays(LENGTHS, ENDINGS)
+    arrays = {
+        "observations": made["observation"],
+        "next_observations": made["next_observation"],
+        "actions": made["action"],
+        "rewards": made["reward"],
+        "terminals": made["terminated"],
+        "timeouts": made["truncated"],
+        **changes,
+    }
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            if values is not None:
+                file[name] = values
+        file["metadata/algorithm"] = "made up"
+        file["infos/qpos"] = np.zeros((8, 2))
+    return path
+
+
+def test_file_with_next_observations_is_read_whole(tmp_path):
+    assert_same(load(write(tmp_path / "a.hdf5")), make_recording(LENGTHS, ENDINGS))
+
+
+def test_without_next_observations_no_row_links_two_episodes(tmp_path, log_messages):
+    td = read_d4rl(write(tmp_path / "a.hdf5", next_observations=None))
+    rows = torch.tensor([0, 1, 2, 5, 6])  # 3, 4 and 7 are the last of their episodes
+    whole = make_recording(LENGTHS, ENDINGS)
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
+        assert torch.equal(td[key], whole[key][rows])
+    assert td["next", "truncated"].flatten().tolist() == [False, False, True, False, True]
+    assert not td["next", "terminated"].any()
+    assert "3 of 8 rows dropped" in log_messages[-1]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.integers(2, 5), st.booleans()), min_size=1, max_size=6))
+def test_observations_chain_inside_episodes_only(tmp_path_factory, drawn):
+    lengths, endings = zip(*drawn, strict=True)
+    made = make_arrays(lengths, endings)
+    path = write(
+        tmp_path_factory.mktemp("d4rl") / "a.hdf5",
+        next_observations=None,
+        observations=made["observation"],
+        actions=made["action"],
+        rewards=made["reward"],
+        terminals=made["terminated"],
+        timeouts=made["truncated"],
+    )
+    found = list(episodes(read_d4rl(path)))
+    assert [len(episode) for episode in found] == [length - 1 for length in lengths]
+    for episode in found:
+        assert torch.equal(episode["next", "observation"][:-1], episode["observation"][1:])
+
+
+def test_episode_cut_by_the_end_of_the_file_is_truncated(tmp_path):
+    td = read_d4rl(write(tmp_path / "a.hdf5", timeouts=np.zeros(8)))
+    assert td["next", "truncated"].flatten().tolist() == [False] * 7 + [True]
+
+
+@pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminals", "timeouts"])
+def test_missing_array_is_named(tmp_path, name):
+    with pytest.raises(DataError, match=f"has no {name}; it has ") as caught:
+        read_d4rl(write(tmp_path / "a.hdf5", **{name: None}))
+    assert caught.value.column == name
+
+
+def test_arrays_of_different_lengths_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"'actions'.*7 rows, observations has 8"):
+        read_d4rl(write(tmp_path / "a.hdf5", actions=np.zeros((7, 2))))
+
+
+def test_array_of_the_wrong_kind_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"'actions'.*1 dimensions"):
+        read_d4rl(write(tmp_path / "a.hdf5", actions=np.zeros(8)))
+    with pytest.raises(DataError, match=r"'rewards'.*object"):
+        read_d4rl(write(tmp_path / "b.hdf5", rewards=["one"] * 8))
+    with pytest.raises(DataError, match=r"'next_observations'.*\[8, 2\]"):
+        read_d4rl(write(tmp_path / "c.hdf5", next_observations=np.zeros((8, 2))))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.integers(0, 7),
+    st.sampled_from([("observations", 2), ("actions", 1), ("rewards", None)]),
+    st.sampled_from([np.nan, np.inf, -np.inf]),
+)
+def test_any_value_that_is_not_finite_is_named(tmp_path_factory, row, place, bad):
+    name, column = place
+    path = write(tmp_path_factory.mktemp("d4rl") / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        file[name][row if column is None else (row, column)] = bad
+    with pytest.raises(DataError) as caught:
+        read_d4rl(path)
+    assert caught.value.source == str(path)
+    assert caught.value.column == (name if column is None else f"{name}[{column}]")
+    assert caught.value.row == row + 1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.95])
+def test_cut_off_file_is_refused(tmp_path, share):
+    path = write(tmp_path / "a.hdf5")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DataError, match=r"a.hdf5: .*(cut off|empty)"):
+        load(path)
+
+
+def test_text_with_an_hdf5_name_is_refused(tmp_path):
+    path = tmp_path / "a.hdf5"
+    path.write_text("1 2 3")
+    with pytest.raises(DataError, match="cannot be read as HDF5"):
+        load(path)
