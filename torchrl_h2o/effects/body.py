@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import mujoco
-import numpy as np
 
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import ModelEffect, compile_model, parameter
@@ -34,14 +33,8 @@ class BodyMass(ModelEffect):
     bodies: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        chosen = selection.bodies(spec, self.bodies)
-        if spec.compiler.settotalmass > 0.0:
-            # The compiler scales all bodies to the total, so the total has to grow with the chosen.
-            mass = compile_model(spec.copy()).body_mass
-            factors = np.ones_like(mass)
-            factors[[body.id for body in chosen]] = self.scale
-            spec.compiler.settotalmass *= (factors @ mass) / mass.sum()
-        for body in chosen:
+        before = _total_mass(spec)
+        for body in selection.bodies(spec, self.bodies):
             # Given explicitly or derived from the geoms: the compiler reads one of the two.
             body.mass *= self.scale
             body.inertia *= self.scale
@@ -49,3 +42,13 @@ class BodyMass(ModelEffect):
             for geom in body.geoms:
                 geom.density *= self.scale
                 geom.mass *= self.scale
+        if spec.compiler.settotalmass > 0.0:
+            # The compiler scales all bodies to the total, so that has to change with the chosen.
+            spec.compiler.settotalmass *= _total_mass(spec) / before
+
+
+def _total_mass(spec: mujoco.MjSpec) -> float:
+    """The mass of all bodies before the compiler scales them to a total."""
+    copy = spec.copy()
+    copy.compiler.settotalmass = -1.0
+    return compile_model(copy).body_mass.sum()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 
 from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, paper_gap
 from torchrl_h2o.envs.mujoco_model import find_simulator
@@ -41,7 +41,7 @@ class DynamicsGap(Transform):
 
     A gap is for one simulator and for its life: taking the transform off the env does not mend the
     simulator. Put it directly on the env, before transforms that rename its keys, and within each
-    worker of a batched env.
+    worker of a batched env. A copy of the env has its gaps again from its first reset on.
 
     All randomness of an episode is seeded at its reset from torch's global generator:
     ``torch.manual_seed`` repeats it. In ``ParallelEnv`` each worker has a generator of its own;
@@ -95,9 +95,10 @@ class DynamicsGap(Transform):
 
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
-        if self.container is None:  # in a Compose that is not on an env yet
+        env = _env_of(self)
+        if env is None:  # in a Compose that is not on an env yet
             return
-        simulator = find_simulator(self.container)
+        simulator = find_simulator(env)
         # Before the model is changed: does every index that an effect names exist?
         rehearsal = self._new_episode(simulator, np.random.default_rng(0))
         example = simulator.env.fake_tensordict()
@@ -115,13 +116,14 @@ class DynamicsGap(Transform):
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # A copied or unpickled env may have built its simulator anew, without the gaps.
-        gaps = _gaps_on(self.container)
+        env = _env_of(self)
+        gaps = _gaps_on(env)
         if len({gap._identity for gap in gaps}) < len(gaps):
             raise ValueError(
                 f"{self} and a clone of it are on one env, where they count as one gap; to have "
                 "its effects twice, make a second DynamicsGap"
             )
-        simulator = find_simulator(self.container)
+        simulator = find_simulator(env)
         for gap in gaps:
             simulator.apply(gap._identity, gap.effects)
         return super()._reset_env_preprocess(tensordict)
@@ -140,12 +142,13 @@ class DynamicsGap(Transform):
 
     def _current_episode(self) -> Episode:
         if self._episode is None:
-            if self.container is None:  # in a replay buffer there is no simulator to alter
+            env = _env_of(self)
+            if env is None:  # in a replay buffer there is no simulator to alter
                 return Episode([], [], [], [])
             rng = None
             if any(not e.is_neutral and isinstance(e, _PROCESSES) for e in self.effects):
                 rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
-            self._episode = self._new_episode(find_simulator(self.container), rng)
+            self._episode = self._new_episode(find_simulator(env), rng)
         return self._episode
 
     def _new_episode(self, simulator: Simulator, rng: np.random.Generator | None) -> Episode:
@@ -206,10 +209,18 @@ def _alter(tensordict: TensorDictBase, keys: Sequence[NestedKey], processes: Seq
     return tensordict
 
 
-def _gaps_on(env: EnvBase | None) -> list[DynamicsGap]:
+def _env_of(transform: Transform) -> EnvBase | None:
+    """The env that a transform is on; Transform.container fails where there is none yet."""
+    container = transform
+    while isinstance(container, Transform):
+        reference = container.__dict__["_container"]
+        container = None if reference is None else reference()
+    return container
+
+
+def _gaps_on(env: EnvBase) -> list[DynamicsGap]:
     """The gaps among an env's transforms, the innermost first."""
     if not isinstance(env, TransformedEnv):
         return []
-    transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
-    gaps = [transform for transform in transforms if isinstance(transform, DynamicsGap)]
-    return _gaps_on(env.base_env) + gaps
+    outer = [module for module in env.transform.modules() if isinstance(module, DynamicsGap)]
+    return _gaps_on(env.base_env) + outer

@@ -1,0 +1,84 @@
+"""Every effect: checked parameters, a neutral value, words."""
+
+import dataclasses
+import math
+import pickle
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchrl_h2o import effects
+from torchrl_h2o.effects import Effect, GeomSize, Gravity, JointDamping, ObservationBias, paper_gap
+
+KINDS = {
+    effects.ModelEffect,
+    effects.ActionEffect,
+    effects.ForceEffect,
+    effects.ObservationEffect,
+}
+EFFECTS = [
+    member
+    for member in vars(effects).values()
+    if isinstance(member, type) and issubclass(member, Effect) and member not in KINDS | {Effect}
+]
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_an_effect_without_arguments_is_neutral_and_of_one_kind(effect):
+    assert effect().is_neutral
+    assert sum(issubclass(effect, kind) for kind in KINDS) == 1
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_an_effect_off_its_neutral_value_says_so_in_words_with_units(effect):
+    for name, parameter in effect().parameters.items():
+        changed = effect(**{name: parameter.bounds[1]})
+        assert not changed.is_neutral
+        assert str(changed.parameters[name]) in changed.describe()
+        assert changed.describe() != effect().describe()
+
+
+@given(effect=st.sampled_from(EFFECTS), data=st.data())
+def test_every_value_within_the_bounds_is_taken_and_none_outside(effect, data):
+    name, parameter = next(iter(effect().parameters.items()))
+    low, high = parameter.bounds
+    inside = data.draw(st.floats(low, high))
+    assert getattr(effect(**{name: inside}), name) == inside
+    outside = data.draw(
+        st.floats(max_value=low, exclude_max=True) | st.floats(min_value=high, exclude_min=True) | st.just(math.nan)
+    )
+    with pytest.raises(ValueError, match=f"{effect.__name__}: {name} = .*choose"):
+        effect(**{name: outside})
+
+
+def test_a_value_that_is_no_number_is_refused():
+    with pytest.raises(ValueError, match=r"Gravity: scale = 'twice' is not a number"):
+        Gravity("twice")
+
+
+def test_an_effect_is_a_frozen_value():
+    effect = GeomSize(2, geoms=["a", "b"])  # as a configuration file gives it
+    assert effect == GeomSize(2.0, geoms=("a", "b"))
+    assert hash(effect) == hash(GeomSize(2.0, geoms=("a", "b")))
+    assert pickle.loads(pickle.dumps(effect)) == effect
+    assert dataclasses.replace(effect, scale=3.0) == GeomSize(3.0, geoms=("a", "b"))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        effect.scale = 1.0
+
+
+def test_words_name_what_the_effect_acts_on():
+    assert JointDamping(0.5).describe() == "damping of all joints + 0.5 N·m·s/rad"
+    assert GeomSize(2.0, geoms=("a*", "b")).describe() == "size of geoms a*, b × 2"
+    assert ObservationBias(1, entries=(0, 2)).describe() == "bias of 1 on entries 0, 2 of the observation"
+
+
+def test_an_unknown_gap_is_answered_with_the_nine_names():
+    with pytest.raises(ValueError, match=r"no gap named 'graviti'.*gravity, friction, joint_noise"):
+        paper_gap("graviti")
+
+
+def test_a_gap_of_strength_zero_is_not_one_of_the_default_strength():
+    assert paper_gap("gravity", 0.0).scale == 0.0
+    with pytest.raises(ValueError, match=r"Gravity: scale = -1 lies outside"):
+        paper_gap("gravity", -1.0)

@@ -1,0 +1,152 @@
+"""Effects that edit the model."""
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.effects.models import CART, FILES, as_bytes, spec
+from torchrl_h2o.effects import (
+    Armature,
+    BodyMass,
+    GeomFriction,
+    GeomLength,
+    GeomSize,
+    Gravity,
+    JointDamping,
+    JointFrictionLoss,
+    JointRange,
+    JointStiffness,
+    RollingResistance,
+    compile_model,
+)
+
+EVERYWHERE = [
+    Gravity(),
+    GeomFriction(),
+    GeomSize(),
+    RollingResistance(),
+    JointDamping(),
+    JointFrictionLoss(),
+    Armature(),
+    BodyMass(),
+]
+CHEETAH_ONLY = [GeomLength(), JointStiffness(), JointRange()]
+
+
+@given(
+    task=st.sampled_from([*FILES, CART]),
+    neutral=st.lists(st.sampled_from(EVERYWHERE), max_size=4),
+)
+def test_neutral_effects_leave_the_model_bit_identical(task, neutral):
+    assert as_bytes(compile_model(spec(task), neutral)) == as_bytes(compile_model(spec(task)))
+
+
+def test_all_neutral_effects_together_leave_halfcheetah_bit_identical():
+    model = compile_model(spec("HalfCheetah"), EVERYWHERE + CHEETAH_ONLY)
+    assert as_bytes(model) == as_bytes(compile_model(spec("HalfCheetah")))
+
+
+@pytest.mark.parametrize("task", [*FILES, CART])
+def test_body_mass_scales_mass_and_inertia_of_the_named_body_alone(task):
+    before = compile_model(spec(task))
+    name = before.body(1).name
+    after = compile_model(spec(task), [BodyMass(1.5, bodies=name)])
+    factors = np.ones(before.nbody)
+    factors[1] = 1.5
+    np.testing.assert_allclose(after.body_mass, factors * before.body_mass, rtol=1e-12)
+    inertia = factors[:, None] * before.body_inertia
+    np.testing.assert_allclose(after.body_inertia, inertia, rtol=1e-12)
+
+
+def test_body_masses_compose_with_a_fixed_total():
+    torso_then_foot = [BodyMass(2.0, bodies="torso"), BodyMass(3.0, bodies="bfoot")]
+    before = compile_model(spec("HalfCheetah")).body_mass
+    after = compile_model(spec("HalfCheetah"), torso_then_foot).body_mass
+    factors = np.array([1, 2, 1, 1, 3, 1, 1, 1])
+    np.testing.assert_allclose(after, factors * before, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect", "field"),
+    [
+        (JointDamping(0.25, joints="hinge"), "dof_damping"),
+        (JointFrictionLoss(0.25, joints="hinge"), "dof_frictionloss"),
+        (Armature(0.25, joints="hinge"), "dof_armature"),
+    ],
+)
+def test_what_is_added_to_a_joint_adds_up_on_that_joint(effect, field):
+    model = compile_model(spec(CART), [effect, effect])
+    np.testing.assert_array_equal(getattr(model, field), [0.0, 0.5])
+
+
+def test_more_damping_than_there_is_cannot_be_taken_away():
+    less = compile_model(spec("HalfCheetah"), [JointDamping(-2.0, joints="bthigh")])
+    assert less.dof_damping[3] == 4.0
+    with pytest.raises(ValueError, match=r"joint 'bthigh' has a damping of 6, 7 cannot be taken"):
+        compile_model(spec("HalfCheetah"), [JointDamping(-7.0, joints="bthigh")])
+
+
+def test_rolling_resistance_slows_a_rolling_wheel_by_its_coefficient():
+    wheel = """
+    <mujoco><option timestep=".0005" cone="elliptic"/><worldbody>
+      <geom name="floor" type="plane" size="5 5 1" friction="1 0 0"/>
+      <body pos="0 0 .1"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/>
+        <joint type="hinge" axis="0 1 0"/>
+        <geom name="wheel" type="sphere" size=".1" mass="1" friction="1 0 .5"/></body>
+    </worldbody></mujoco>"""
+
+    def deceleration(coefficient: float) -> float:
+        effects = [RollingResistance(coefficient, geoms="wheel")]
+        model = compile_model(mujoco.MjSpec.from_string(wheel), effects)
+        data = mujoco.MjData(model)
+        data.qvel[:] = 1.0, 0.0, 10.0
+        mujoco.mj_step(model, data, nstep=400)  # contact settles
+        start = data.qvel[0]
+        mujoco.mj_step(model, data, nstep=400)
+        return (start - data.qvel[0]) / 0.2
+
+    # torque c·m·g against the inertia about the contact point, 7/5·m·r²
+    expected = 0.002 * 9.81 / (7 / 5 * 0.1)
+    assert deceleration(0.0) == pytest.approx(0.0, abs=0.02 * expected)
+    assert deceleration(0.002) == pytest.approx(expected, rel=0.02)
+
+
+def test_rolling_resistance_adds_to_the_rolling_friction_that_acts_already():
+    effects = [RollingResistance(0.01, geoms="rod"), RollingResistance(0.02, geoms="rod")]
+    geom = compile_model(spec(CART), effects).geom("rod")
+    assert geom.condim[0] == 6
+    assert geom.friction[2] == pytest.approx(0.03)
+
+
+def test_a_pattern_with_a_slash_names_the_body_too():
+    model = compile_model(spec("HalfCheetah"), [JointRange(2.0, joints="b*/*foot")])
+    unchanged = compile_model(spec("HalfCheetah"))
+    np.testing.assert_array_equal(model.joint("bfoot").range, 2 * unchanged.joint("bfoot").range)
+    np.testing.assert_array_equal(model.joint("ffoot").range, unchanged.joint("ffoot").range)
+    np.testing.assert_array_equal(model.joint("bshin").range, unchanged.joint("bshin").range)
+
+
+@pytest.mark.parametrize(
+    ("effect", "complaint"),
+    [
+        (GeomSize(2.0, geoms="wing*"), r"no geom named 'wing\*'; it has world/floor, cart/box"),
+        (JointDamping(1.0, joints=("hinge", "knee")), "no joint named 'knee'; it has cart/slider"),
+        (BodyMass(2.0, bodies="world"), "no body named 'world'; it has world/cart, cart/pole"),
+        (JointStiffness(2.0), "no joint of slider, hinge has a stiffness that could be scaled"),
+        (JointRange(2.0), "no joint of slider, hinge has a range that could be scaled"),
+        (GeomLength(2.0, geoms="box"), "no geom of box is given by its two ends"),
+    ],
+)
+def test_what_the_model_does_not_have_is_named_with_what_it_has(effect, complaint):
+    with pytest.raises(ValueError, match=f"cannot be put into model 'cart': .*{complaint}"):
+        compile_model(spec(CART), [effect])
+
+
+def test_edits_are_made_in_their_order():
+    doubled = compile_model(spec("HalfCheetah"), [BodyMass(2.0), GeomSize(2.0, geoms="bfoot")])
+    # BodyMass doubles the total that the compiler then shares out over the larger foot
+    assert doubled.body_mass.sum() == pytest.approx(28.0)
+    model = compile_model(spec(CART), [GeomFriction(0.5), GeomFriction(0.5)])
+    np.testing.assert_array_equal(model.geom("rod").friction, [0.25, 0.00125, 0.000025])
