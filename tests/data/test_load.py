@@ -1,0 +1,119 @@
+"""One call for every source, and one error for every source that cannot be used."""
+
+import io
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import GymEnv
+
+from tests.data.recordings import assert_same, make_recording
+from torchrl_h2o.data import DataError, check_specs, load, write_minari, write_ted
+
+
+def test_each_source_finds_its_reader(tmp_path):
+    td = make_recording()
+    assert_same(load(write_ted(td, tmp_path / "ted")), td)
+    assert_same(load(write_minari(td, "test-v0", root=tmp_path)), td)
+    assert_same(load(str(tmp_path / "test-v0" / "data")), td)
+    (tmp_path / "log.txt").write_text("0 0 0 0 1 0\n" * 3)
+    read = load(tmp_path / "log.txt", columns="wheel_legged_moving_forward")
+    assert read["observation"].shape == (2, 3)
+
+
+def test_log_without_columns_says_what_is_missing(tmp_path):
+    (tmp_path / "log.txt").write_text("0 0 0\n" * 3)
+    with pytest.raises(DataError, match=r"log.txt.*give columns="):
+        load(tmp_path / "log.txt")
+
+
+@pytest.mark.parametrize("source", ["no/such/file.csv", "./halfcheetah-v0", "~nobody/x", "plain"])
+def test_missing_file_is_not_looked_for_on_the_net(source, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError, match="no such file"):
+        load(source)
+
+
+def test_folder_that_holds_nothing_known_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"neither a Minari dataset.*nor"):
+        load(tmp_path)
+
+
+def _zip():
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as file:
+        file.writestr("data.pkl", b"\x80\x04N.")
+    return content.getvalue()
+
+
+def _objects():
+    content = io.BytesIO()
+    np.save(content, np.array([object], dtype=object), allow_pickle=True)
+    return content.getvalue()
+
+
+def _checkpoint():
+    content = io.BytesIO()
+    torch.save({"a": torch.zeros(1)}, content)
+    return content.getvalue()
+
+
+@pytest.mark.parametrize("name", ["data.csv", "data.hdf5", "data", "data.txt"])
+@pytest.mark.parametrize(
+    "content",
+    [pickle.dumps([1], protocol) for protocol in (2, 3, 4, 5)] + [_zip(), _objects(), _checkpoint()],
+)
+def test_pickle_under_any_name_is_refused(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=f"{name}: this is a pickle"):
+        load(path, columns="simple_pendulum")
+
+
+@pytest.mark.parametrize("suffix", ["pkl", "pickle", "pt", "pth", "npy", "npz", "joblib"])
+def test_pickle_is_refused_by_its_name(tmp_path, suffix):
+    path = tmp_path / f"data.{suffix}"
+    path.write_bytes(pickle.dumps([1], 0))  # protocol 0 is plain text
+    with pytest.raises(DataError, match="this is a pickle"):
+        load(path, columns="simple_pendulum")
+
+
+def test_data_are_checked_against_the_environment(tmp_path):
+    folder = write_ted(make_recording(observations=3, actions=1), tmp_path / "ted")
+    assert len(load(folder, env=GymEnv("Pendulum-v1"))) == 8
+    with pytest.raises(DataError, match=r"ted, column 'observation'.*\[3\].*\[4\]"):
+        load(folder, env=GymEnv("InvertedPendulum-v5"))
+
+
+def test_wrong_action_dimensions_are_refused():
+    with pytest.raises(DataError, match=r"'action'.*\[2\] dimensions, the environment has \[1\]"):
+        check_specs(make_recording(observations=3, actions=2), GymEnv("Pendulum-v1"))
+
+
+def test_integer_actions_do_not_fit_a_continuous_environment():
+    td = make_recording(observations=3, actions=1)
+    td["action"] = td["action"].long()
+    with pytest.raises(DataError, match=r"int64, the environment takes torch.float32"):
+        check_specs(td, GymEnv("Pendulum-v1"))
+
+
+def test_actions_on_the_bound_and_rounded_are_inside():
+    td = make_recording(observations=3, actions=1)
+    td["action"][0], td["action"][1] = 2.0, -2.0000002
+    check_specs(td, GymEnv("Pendulum-v1"))
+    td["action"][5] = -2.001
+    with pytest.raises(DataError, match="lies outside") as caught:
+        check_specs(td, GymEnv("Pendulum-v1"))
+    assert (caught.value.column, caught.value.row) == ("action[0]", 6)
+
+
+def test_environment_without_an_observation_entry_is_refused():
+    class Dictionary:
+        def __init__(self, env):
+            self.observation_spec_unbatched = env.full_action_spec_unbatched
+            self.full_action_spec_unbatched = env.full_action_spec_unbatched
+
+    with pytest.raises(DataError, match=r"no entry 'observation', it has \['action'\].*CatTensors"):
+        check_specs(make_recording(), Dictionary(GymEnv("Pendulum-v1")))
