@@ -175,11 +175,25 @@ def test_recording_is_a_chain_of_transitions_broken_only_where_episodes_end():
 
 def test_recording_is_repeated_by_its_seed_and_leaves_torchs_random_state():
     env, policy = make("reality"), noisy_balance_controller()
-    before = torch.random.get_rng_state()
-    first, again, other = (record(env, policy, 60, seed, progress=False) for seed in (3, 3, 4))
-    assert torch.equal(before, torch.random.get_rng_state())
+    recordings = []
+    for state, seed in ((10, 3), (11, 3), (11, 4)):
+        torch.manual_seed(state)
+        before = torch.random.get_rng_state()
+        recordings.append(record(env, policy, 60, seed, progress=False))
+        assert torch.equal(before, torch.random.get_rng_state())
+    first, again, other = recordings
     assert (first == again).all()
     assert not torch.equal(first["action"], other["action"])
+
+
+def test_recording_that_ends_as_the_robot_falls_is_not_truncated():
+    limp = BalanceController(gains=dict.fromkeys(OBSERVATIONS["standing_still"], 0.0))
+    falls = record(WheelLeggedEnv(), limp, 300, 0, progress=False)["next", "terminated"]
+    until_lost = int(falls.nonzero()[0, 0]) + 1
+    last = record(WheelLeggedEnv(), limp, until_lost, 0, progress=False)["next"][-1]
+    assert last["done"]
+    assert last["terminated"]
+    assert not last["truncated"]
 
 
 def test_recording_leaves_the_callers_env_as_it_was():

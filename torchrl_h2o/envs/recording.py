@@ -55,7 +55,7 @@ def record(
             f"record takes one env, not a batch of {tuple(env.batch_size)}; record from each of "
             "its envs and concatenate"
         )
-    # nested on purpose: unwrapped, the caller's env would lose its transforms to this one
+    # nested on purpose: TorchRL would unwrap the env, warn of it, and work on clones of its transforms
     tracked = TransformedEnv(env, InitTracker(), auto_unwrap=False)
     keys = ["observation", "action", *DONE_KEYS, ("next", "observation"), ("next", "reward")]
     keys += [("next", key) for key in DONE_KEYS]
