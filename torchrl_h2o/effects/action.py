@@ -31,6 +31,7 @@ class ActionNoise(ActionEffect):
     """
 
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"
+    random: ClassVar[bool] = True
     std: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=0.0)
     actuators: Indices = None
 

@@ -58,7 +58,7 @@ class Effect(ABC):
 
     A subclass is a frozen dataclass: fields made by :func:`parameter` are its parameters, all other
     fields say what it acts on (name patterns, indices). ``wording`` is what it does in words, with
-    the fields' names in braces.
+    the fields' names in braces. ``random`` is whether it draws from the generator that it is given.
 
     Raises:
         ValueError: if a parameter is not a number within its bounds.
@@ -76,6 +76,7 @@ class Effect(ABC):
     """
 
     wording: ClassVar[str]
+    random: ClassVar[bool] = False
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
@@ -158,7 +159,7 @@ class ActionEffect(Effect):
 
         Args:
             dt: the control step, in seconds.
-            rng: the episode's random generator, shared by all of its effects.
+            rng: the episode's random generator, shared by its random effects.
 
         Returns:
             A function from the action asked for to the action executed, both (..., nu), called
@@ -195,7 +196,7 @@ class ObservationEffect(Effect):
 
         Args:
             dt: the control step, in seconds.
-            rng: the episode's random generator, shared by all of its effects.
+            rng: the episode's random generator, shared by its random effects.
 
         Returns:
             A function from the true observation to the one reported, both (..., n), called at the

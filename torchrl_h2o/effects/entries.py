@@ -23,8 +23,7 @@ def entry_mask(vector: np.ndarray, indices: Indices) -> np.ndarray:
         return np.ones(size, dtype=bool)
     if not all(0 <= index < size for index in indices):
         raise ValueError(
-            f"{indices} are not all indices of an action or observation of {size} entries; "
-            f"choose from 0 to {size - 1}"
+            f"{indices} are not all indices of an action or observation of {size} entries; choose from 0 to {size - 1}"
         )
     mask = np.zeros(size, dtype=bool)
     mask[list(indices)] = True

@@ -25,6 +25,7 @@ class ObservationNoise(ObservationEffect):
     """
 
     wording: ClassVar[str] = "noise of standard deviation {std} on {entries} of the observation"
+    random: ClassVar[bool] = True
     std: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
     entries: Indices = None
 

@@ -13,7 +13,6 @@ from torchrl_h2o.envs.mujoco_model import find_simulator
 from torchrl_h2o.envs.simulator import Simulator
 
 Process = Callable[[np.ndarray], np.ndarray]
-_PROCESSES = (ActionEffect, ObservationEffect)
 
 
 class Episode(NamedTuple):
@@ -145,8 +144,10 @@ class DynamicsGap(Transform):
             env = _env_of(self)
             if env is None:  # in a replay buffer there is no simulator to alter
                 return Episode([], [], [], [])
+            # Without random effects torch's generator is left alone: runs with and without the gap
+            # then sample the same actions.
             rng = None
-            if any(not e.is_neutral and isinstance(e, _PROCESSES) for e in self.effects):
+            if any(effect.random and not effect.is_neutral for effect in self.effects):
                 rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
             self._episode = self._new_episode(find_simulator(env), rng)
         return self._episode
@@ -158,7 +159,7 @@ class DynamicsGap(Transform):
                 for effect in self.effects
                 if isinstance(effect, kind) and not effect.is_neutral
             ]
-            for kind in _PROCESSES
+            for kind in (ActionEffect, ObservationEffect)
         )
         observation_spec = simulator.env.observation_spec
         observation_keys = [key for key, spec in observation_spec.items(True, True) if spec.dtype.is_floating_point]

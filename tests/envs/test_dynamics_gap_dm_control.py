@@ -1,0 +1,109 @@
+"""DynamicsGap on tasks of dm_control."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import DMControlEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.effects.models import as_bytes
+from torchrl_h2o.effects import (
+    PAPER_GAPS,
+    ActionDelay,
+    BodyMass,
+    JointForce,
+    LinearDrag,
+    ObservationBias,
+    paper_gap,
+)
+from torchrl_h2o.envs import DynamicsGap, dynamics_gap, mujoco_model
+
+TASKS = [("cheetah", "run"), ("walker", "walk")]
+MISSING = {("walker", "long_torso"), ("walker", "soft_feet")}
+CASES = [(task, name) for task in TASKS for name in PAPER_GAPS if (task[0], name) not in MISSING]
+
+
+def rollout(env, steps=10, seed=0):
+    torch.manual_seed(seed)
+    env.set_seed(seed)
+    return env.rollout(steps)
+
+
+@pytest.mark.parametrize(("task", "name"), CASES)
+def test_a_gap_of_the_paper_holds_the_specs_and_changes_the_model(task, name):
+    env = TransformedEnv(DMControlEnv(*task), dynamics_gap(name))
+    check_env_specs(env)
+    same = as_bytes(mujoco_model(env)) == as_bytes(mujoco_model(DMControlEnv(*task)))
+    assert same == (name == "joint_noise")
+
+
+@pytest.mark.parametrize(("domain", "name"), MISSING)
+def test_a_gap_that_walker_does_not_have_is_refused(domain, name):
+    with pytest.raises(ValueError, match="cannot be put into model 'planar walker'"):
+        TransformedEnv(DMControlEnv(domain, "walk"), dynamics_gap(name))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_neutral_effects_leave_every_bit_of_a_rollout(task):
+    expected = rollout(DMControlEnv(*task))
+    gap = DynamicsGap(BodyMass(), LinearDrag(), ActionDelay())
+    actual = rollout(TransformedEnv(DMControlEnv(*task), gap))
+    assert (actual == expected).all()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_force_of_nothing_leaves_every_bit_of_a_rollout(task):
+    # 1e-320 is not neutral, so the physics steps are taken one by one; the force is lost in rounding
+    env = TransformedEnv(DMControlEnv(*task), DynamicsGap(LinearDrag(1e-320)))
+    assert (rollout(env) == rollout(DMControlEnv(*task))).all()
+
+
+def test_task_and_named_views_see_the_changed_simulation():
+    env = TransformedEnv(DMControlEnv("cheetah", "run"), dynamics_gap("big_thigh"))
+    data = rollout(env)
+    physics = env.base_env._env.physics
+    assert physics.named.model.geom_size["bthigh", 0] == pytest.approx(2 * 0.046)
+    assert physics.model.ptr is mujoco_model(env)
+    # the reward is made of the speed, read through a named view of the new data
+    assert physics.named.data.sensordata["torso_subtreelinvel"][0] == physics.speed()
+    assert data["next", "reward"][-1].item() == pytest.approx(max(0.0, physics.speed() / 10))
+    assert mujoco_model(env).body_mass.sum() == pytest.approx(14.0)
+
+
+def test_forces_act_at_every_physics_step():
+    env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(JointForce(50.0, "rootx")))
+    env.set_seed(0)
+    reset = env.reset()
+    physics, model = env.base_env._env.physics, mujoco_model(env)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = physics.data.qpos, physics.data.qvel
+    data.qacc_warmstart[:] = physics.data.qacc_warmstart
+    data.qfrc_applied[1] = 50.0
+    mujoco.mj_step(model, data, nstep=10)
+    env.step(reset.set("action", torch.zeros(6, dtype=torch.float64)))
+    np.testing.assert_allclose(physics.data.qvel, data.qvel, rtol=1e-9)
+
+
+def test_the_observation_entries_are_counted_over_all_keys():
+    # position has 8 entries, so that entry 9 is the second velocity
+    env = TransformedEnv(DMControlEnv("cheetah", "run"), DynamicsGap(ObservationBias(0.5, entries=(9,))))
+    expected, actual = rollout(DMControlEnv("cheetah", "run")), rollout(env)
+    offset = torch.zeros(9, dtype=torch.float64)
+    offset[1] = 0.5
+    torch.testing.assert_close(actual["velocity"], expected["velocity"] + offset)
+    torch.testing.assert_close(actual["position"], expected["position"])
+
+
+def test_two_envs_do_not_touch_each_other():
+    untouched = DMControlEnv("cheetah", "run")
+    model = as_bytes(mujoco_model(untouched))
+    gap = DynamicsGap(paper_gap("gravity"), JointForce(5.0, "rootx"))
+    rollout(TransformedEnv(DMControlEnv("cheetah", "run"), gap))
+    assert as_bytes(mujoco_model(untouched)) == model
+    assert (rollout(untouched) == rollout(DMControlEnv("cheetah", "run"))).all()
+
+
+def test_a_model_built_in_code_is_not_mistaken_for_the_one_in_the_file():
+    with pytest.raises(ValueError, match="the model must come from its file"):
+        TransformedEnv(DMControlEnv("cartpole", "two_poles"), dynamics_gap("gravity"))
