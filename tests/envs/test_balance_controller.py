@@ -23,7 +23,7 @@ TASKS = sorted(OBSERVATIONS)
 
 def make(world, task="standing_still", **kwargs):
     """The robot with the effects that the recipes' configuration lists for a world."""
-    config = OmegaConf.load(CONFIG)
+    config = OmegaConf.load(CONFIG).env
     env = instantiate(config.make, task=task, **kwargs)
     return TransformedEnv(env, DynamicsGap(*(instantiate(effect) for effect in config[world])))
 

@@ -1,0 +1,59 @@
+"""The two environments of a run, from its configuration: reality, and the simulator with its dynamics gap."""
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, ObservationNorm, TransformedEnv
+
+from torchrl_h2o.effects import paper_gap
+from torchrl_h2o.envs import DynamicsGap
+
+
+def make_reality(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
+    """The target dynamics P: the task with the effects of ``env.reality``.
+
+    Args:
+        cfg: the run's configuration.
+        raw: leave observations in their own units, whatever the run does.
+        **kwargs: further arguments of the task, such as ``render_mode``.
+    """
+    return _make(cfg, [instantiate(effect) for effect in cfg.env.reality], raw, kwargs)
+
+
+def make_simulator(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
+    """The imperfect simulator: the effects of ``env.simulator`` and the paper's gap, if one is named."""
+    effects = [instantiate(effect) for effect in cfg.env.simulator]
+    if cfg.gap is not None:
+        effects.append(paper_gap(cfg.gap, cfg.gap_strength))
+    return _make(cfg, effects, raw, kwargs)
+
+
+def _make(cfg: DictConfig, effects: list, raw: bool, kwargs: dict) -> EnvBase:
+    transforms = [DynamicsGap(*effects), DoubleToFloat()]
+    if cfg.observation_norm is not None and not raw:
+        transforms.append(ObservationNorm(**_norm(cfg), in_keys=["observation"], standard_normal=True))
+    return TransformedEnv(instantiate(cfg.env.make, **kwargs), Compose(*transforms))
+
+
+def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:
+    """Writes the real data's mean and standard deviation into the configuration, if the run normalises with them."""
+    if cfg.normalise_observation and cfg.observation_norm is None:
+        observation = real["observation"]
+        scale = observation.std(0).clamp_min(1e-6)
+        cfg.observation_norm = {"loc": observation.mean(0).tolist(), "scale": scale.tolist()}
+
+
+def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
+    """The real transitions as this run's environments would have shown them: normalised, the reward scaled."""
+    real = real.copy()
+    real["next"] = real["next"].copy().set("reward", cfg.reward_scale * real["next", "reward"])
+    if cfg.observation_norm is not None:
+        norm = _norm(cfg)
+        for part in (real, real["next"]):
+            part["observation"] = (part["observation"] - norm["loc"]) / norm["scale"]
+    return real
+
+
+def _norm(cfg: DictConfig) -> dict[str, torch.Tensor]:
+    return {key: torch.tensor(list(value)) for key, value in cfg.observation_norm.items()}

@@ -1,0 +1,167 @@
+"""Trains H2O+ from real data and an imperfect simulator, and shows what its policy does in reality.
+
+python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
+python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
+python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
+python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # anything in config/ can be overridden
+python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # go on after an interruption
+"""
+
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+import time
+from pathlib import Path
+
+import hydra
+import torch
+from environments import as_observed, make_reality, make_simulator, measure_observation_norm
+from evaluation import evaluate
+from hydra.core.hydra_config import HydraConfig
+from learning_curve import draw_learning_curve
+from omegaconf import DictConfig
+from real_data import episode_returns, read_real_data
+from rendering import try_to_film
+from results import print_table
+from run import Training, open_run, save_config, write_metrics, write_summary
+from sac import train_sac
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.objectives import SoftUpdate
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import (
+    DynamicsRatioLoss,
+    ExpectileValueLoss,
+    ExponentialValueLoss,
+    H2OPlusLoss,
+    InSampleValueLoss,
+    SparseValueLoss,
+    make_actor,
+    make_dynamics_ratio_estimator,
+    make_qvalue,
+    make_value,
+)
+
+
+def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
+    """The method: real and simulated batches, one loss, one optimiser."""
+    simulator, reality = make_simulator(cfg), make_reality(cfg)
+    observation_dim, action_dim = simulator.observation_spec["observation"].shape[-1], simulator.action_spec.shape[-1]
+
+    # Networks. Each is held by the loss that trains it.
+    torch.manual_seed(cfg.seed)
+    actor = make_actor(observation_dim, simulator.action_spec_unbatched, cfg.num_cells)
+    qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
+    value_loss = make_value_loss(cfg, observation_dim)
+    estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
+
+    # Losses. The discriminators have batches of their own, so their loss stands beside H2O+'s.
+    loss = H2OPlusLoss(actor, qvalues, value_loss, mixing=cfg.mixing, target_entropy=cfg.target_entropy)
+    loss.make_value_estimator(gamma=cfg.gamma)
+    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    optimiser = torch.optim.Adam([*loss.parameters(), *ratio_loss.parameters()], lr=cfg.lr)
+    targets = SoftUpdate(loss, tau=cfg.tau)
+
+    # Data. Both streams show observations and rewards in the same way.
+    real = as_observed(cfg, real)
+    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
+    rollouts = iter(collector)
+
+    training = Training(
+        "H2O+", cfg, directory, actor=actor, loss=loss, ratio_loss=ratio_loss, optimiser=optimiser, replay=replay
+    )
+    for epoch, evaluating in training.epochs(simulator):
+        simulated = next(rollouts)
+        simulated["next", "reward"] *= cfg.reward_scale
+        replay.extend(simulated)
+        for _ in range(cfg.updates_per_epoch):
+            batch = replay.sample()
+            ratio_losses = ratio_loss(replay.sample(cfg.discriminator_batch_size))
+            if cfg.ratio:
+                estimator(batch)  # Eq. (9): writes the dynamics ratio
+            losses = loss(batch)
+            total = sum(term for name, term in (*losses.items(), *ratio_losses.items()) if name.startswith("loss_"))
+            optimiser.zero_grad()
+            total.backward()
+            optimiser.step()
+            targets.step()
+            training.updated()
+        if evaluating:
+            evaluation = evaluate(reality, actor, cfg.eval_episodes)
+            sim = ~batch["real"]
+            training.log(
+                epoch,
+                return_real=evaluation.mean,
+                return_real_std=evaluation.std,
+                length_real=sum(evaluation.lengths) / len(evaluation.lengths),
+                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][sim].mean()),
+                accuracy_sa=float(ratio_losses["accuracy_sa"]),
+                accuracy=float(ratio_losses["accuracy"]),
+                **{name: float(value) for name, value in losses.items()},
+                **{name: float(value) for name, value in ratio_losses.items() if name.startswith("loss_")},
+            )
+    collector.shutdown()
+    return actor, training
+
+
+def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
+    """The backbone: swapping it is one argument."""
+    value_network = make_value(observation_dim, cfg.num_cells)
+    backbones = {
+        "expectile": lambda: ExpectileValueLoss(value_network, cfg.expectile),
+        "sparse": lambda: SparseValueLoss(value_network, cfg.value_alpha),
+        "exponential": lambda: ExponentialValueLoss(value_network, cfg.value_alpha),
+    }
+    if cfg.backbone not in backbones:
+        raise ValueError(f"backbone={cfg.backbone}: choose one of {', '.join(backbones)}")
+    return backbones[cfg.backbone]()
+
+
+@hydra.main(config_path="config", config_name="h2o_plus", version_base=None)
+def main(cfg: DictConfig) -> None:
+    start = time.perf_counter()
+    cfg, directory = open_run(cfg, HydraConfig.get().run.dir)
+    real = read_real_data(cfg)
+    measure_observation_norm(cfg, real)
+    save_config(cfg, directory)
+    policies, trainings = {}, {}
+    policies["H2O+"], trainings["H2O+"] = train_h2o_plus(cfg, real, directory)
+    if cfg.baseline:
+        policies["SAC in the simulator"], trainings["SAC in the simulator"] = train_sac(cfg, real, directory)
+    write_metrics(directory, [row for training in trainings.values() for row in training.rows])
+
+    # What the policies do in reality, and in the simulator that they were trained in.
+    reality, simulator = make_reality(cfg), make_simulator(cfg)
+    in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
+    in_simulator = {name: evaluate(simulator, policy, 1) for name, policy in policies.items()}
+    behaviour = episode_returns(real)
+    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, cfg)
+    film = try_to_film(cfg, policies["H2O+"], directory) if cfg.render else None
+
+    h2o_plus = trainings["H2O+"]
+    write_summary(
+        directory,
+        {
+            "env": cfg.env.name,
+            "gap": cfg.gap,
+            "data": cfg.data,
+            "transitions": len(real),
+            "backbone": cfg.backbone,
+            "mixing": cfg.mixing,
+            "ratio": cfg.ratio,
+            "seed": cfg.seed,
+            "updates": h2o_plus.updates,
+            "return_real": in_reality["H2O+"].summary(),
+            "return_sim": in_simulator["H2O+"].summary(),
+            "return_data": {"mean": sum(behaviour) / len(behaviour), "episodes": len(behaviour)},
+            "baselines": {name: in_reality[name].summary() for name in policies if name != "H2O+"},
+            "updates_per_second": h2o_plus.updates / h2o_plus.progress["seconds"],
+            "wall_s": time.perf_counter() - start,
+        },
+    )
+    print_table(cfg, in_reality, real, behaviour, directory, film)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""The picture of a run: returns in reality over the updates, and what the discriminators see."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from omegaconf import DictConfig
+from run import Training
+
+COLOURS = {"H2O+": "#0b6e4f", "SAC in the simulator": "#c8553d"}
+
+
+def draw_learning_curve(path: Path, trainings: dict[str, Training], behaviour: list[float], cfg: DictConfig) -> None:
+    """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(3, 2))
+    for name, training in trainings.items():
+        updates, mean, std = (
+            [row[key] for row in training.rows] for key in ("updates", "return_real", "return_real_std")
+        )
+        colour = COLOURS.get(name)
+        left.plot(updates, mean, "o-", ms=3, color=colour, label=name)
+        left.fill_between(
+            updates,
+            *([m + s * d for m, d in zip(mean, std, strict=True)] for s in (-1, 1)),
+            color=colour,
+            alpha=0.2,
+            lw=0,
+        )
+    left.axhline(sum(behaviour) / len(behaviour), color="0.4", ls="--", lw=1, label="the data's behaviour")
+    gap = f", simulator with {cfg.gap}" if cfg.gap else ""
+    left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
+    left.legend(frameon=False)
+
+    rows = trainings["H2O+"].rows
+    updates = [row["updates"] for row in rows]
+    for key, label in (("accuracy_sa", "accuracy on (s, a)"), ("accuracy", "accuracy on (s, a, s')")):
+        right.plot(updates, [row[key] for row in rows], "o-", ms=3, label=label)
+    right.plot(
+        updates, [row["ratio_of_sim"] for row in rows], "s--", ms=3, color="0.4", label="mean ratio of simulated rows"
+    )
+    right.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (0.5: cannot be told)")
+    right.legend(frameon=False, loc="lower right")
+    for axis in (left, right):
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,61 @@
+"""SAC in the simulator alone: TorchRL's own loss, on the same budget. What zero-shot transfer comes to."""
+
+from pathlib import Path
+
+import torch
+from environments import make_reality, make_simulator
+from evaluation import evaluate
+from omegaconf import DictConfig
+from run import Training
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS
+from torchrl_h2o.objectives import make_actor, make_qvalue
+
+
+def train_sac(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
+    """SAC on simulated batches; of the real data it sees nothing but the scale of the observations."""
+    simulator, reality = make_simulator(cfg), make_reality(cfg)
+    observation_dim, action_dim = simulator.observation_spec["observation"].shape[-1], simulator.action_spec.shape[-1]
+
+    torch.manual_seed(cfg.seed)
+    actor = make_actor(observation_dim, simulator.action_spec_unbatched, cfg.num_cells)
+    qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
+    loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
+    loss.make_value_estimator(gamma=cfg.gamma)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=cfg.lr)
+    targets = SoftUpdate(loss, tau=cfg.tau)
+
+    capacity = int(cfg.sim_capacity * len(real))
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=sum(cfg.batch_size))
+    collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
+    rollouts = iter(collector)
+
+    training = Training(
+        "SAC in the simulator", cfg, directory, actor=actor, loss=loss, optimiser=optimiser, replay=replay
+    )
+    for epoch, evaluating in training.epochs(simulator):
+        simulated = next(rollouts).select(*TRANSITION_KEYS)
+        simulated["next", "reward"] *= cfg.reward_scale
+        replay.extend(simulated)
+        for _ in range(cfg.updates_per_epoch):
+            losses = loss(replay.sample())
+            optimiser.zero_grad()
+            sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
+            optimiser.step()
+            targets.step()
+            training.updated()
+        if evaluating:
+            evaluation = evaluate(reality, actor, cfg.eval_episodes)
+            training.log(
+                epoch,
+                return_real=evaluation.mean,
+                return_real_std=evaluation.std,
+                length_real=sum(evaluation.lengths) / len(evaluation.lengths),
+                **{name: float(value) for name, value in losses.items()},
+            )
+    collector.shutdown()
+    return actor, training
