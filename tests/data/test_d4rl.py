@@ -73,6 +73,8 @@ def test_observations_chain_inside_episodes_only(tmp_path_factory, drawn):
 def test_episode_cut_by_the_end_of_the_file_is_truncated(tmp_path):
     td = read_d4rl(write(tmp_path / "a.hdf5", timeouts=np.zeros(8)))
     assert td["next", "truncated"].flatten().tolist() == [False] * 7 + [True]
+    td = read_d4rl(write(tmp_path / "b.hdf5", timeouts=np.zeros(8), next_observations=None))
+    assert td["next", "truncated"].flatten().tolist() == [False, False, True, False, False, True]
 
 
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminals", "timeouts"])

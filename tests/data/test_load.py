@@ -103,10 +103,11 @@ def test_actions_on_the_bound_and_rounded_are_inside():
     td = make_recording(observations=3, actions=1)
     td["action"][0], td["action"][1] = 2.0, -2.0000002
     check_specs(td, GymEnv("Pendulum-v1"))
-    td["action"][5] = -2.001
-    with pytest.raises(DataError, match="lies outside") as caught:
-        check_specs(td, GymEnv("Pendulum-v1"))
-    assert (caught.value.column, caught.value.row) == ("action[0]", 6)
+    for row, action in ((5, -2.001), (4, 2.001)):
+        td["action"][row] = action
+        with pytest.raises(DataError, match="lies outside") as caught:
+            check_specs(td, GymEnv("Pendulum-v1"))
+        assert (caught.value.column, caught.value.row) == ("action[0]", row + 1)
 
 
 def test_environment_without_an_observation_entry_is_refused():

@@ -111,15 +111,22 @@ def test_minari_itself_reads_what_was_written(tmp_path, monkeypatch):
     np.testing.assert_array_equal(episode.observations[-1], recorded["next", "observation"][-1])
 
 
-def test_episode_without_an_end_is_truncated(tmp_path):
+def test_episodes_without_an_end_are_truncated(tmp_path):
+    folder = write_minari(make_recording((3, 2), (False, False)), "test-v0", root=tmp_path)
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        for number in range(2):
+            file[f"episode_{number}/truncations"][-1] = False
+    read = read_minari(folder)
+    assert read["next", "truncated"].flatten().tolist() == [False, False, True, False, True]
+    assert_same(read, make_recording((3, 2), (False, False)))
+
+
+def test_recording_that_stops_midway_is_written_as_truncated(tmp_path):
     td = make_recording((3,), (False,))
     td["next", "done"][-1] = td["next", "truncated"][-1] = False
     folder = write_minari(td, "test-v0", root=tmp_path)
-    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
-        assert file["episode_0/truncations"][-1]
-        file["episode_0/truncations"][-1] = False
-    read = read_minari(folder)
-    assert read["next", "truncated"].flatten().tolist() == [False, False, True]
+    with h5py.File(folder / "data" / "main_data.hdf5") as file:
+        assert file["episode_0/truncations"][:].tolist() == [False, False, True]
 
 
 def test_jump_inside_an_episode_is_not_written(tmp_path):

@@ -134,6 +134,10 @@ def test_action_outside_its_bounds_is_an_error_or_clipped(tmp_path, log_messages
     with pytest.raises(DataError, match=r"action -4 lies outside \[-3, 3\]") as caught:
         read_robot_log(path, WHEELS)
     assert (caught.value.column, caught.value.row) == ("tau", 2)
+    later = write(tmp_path, "0 0 0\n1 0 1\n2 0 1\n3 0 0\n4 5 0\n5 0 0\n", "later.txt")
+    with pytest.raises(DataError, match="action 5 lies outside") as caught:
+        read_robot_log(later, changed(WHEELS, after_done="new_episode"))
+    assert caught.value.row == 5
     td = read_robot_log(path, changed(WHEELS, outside_bounds="clip"))
     assert td["action"].flatten().tolist() == [0, -3, 3]
     assert "2 actions clipped" in log_messages[-1]
@@ -155,6 +159,13 @@ def test_time_that_jumps_is_an_error_or_splits_the_run(tmp_path):
     found = list(episodes(read_robot_log(path, changed(TIMED, on_time_jump="split"))))
     assert [len(episode) for episode in found] == [2, 1]
     assert found[0]["next", "truncated"][-1]
+
+
+def test_time_that_hardly_moves_is_irregular_too(tmp_path):
+    path = timed(tmp_path, [(0, 1, 0), (10, 2, 0), (20, 3, 0), (21, 4, 0), (31, 5, 0)])
+    with pytest.raises(DataError, match=r"step is 0.001 s, dt is 0.01 s") as caught:
+        read_robot_log(path, TIMED)
+    assert caught.value.row == 5
 
 
 def test_stated_dt_is_held_against_the_time_column(tmp_path):
