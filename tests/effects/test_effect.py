@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import pickle
+import subprocess
+import sys
 
 import pytest
 from hypothesis import given
@@ -82,3 +84,8 @@ def test_a_gap_of_strength_zero_is_not_one_of_the_default_strength():
     assert paper_gap("gravity", 0.0).scale == 0.0
     with pytest.raises(ValueError, match=r"Gravity: scale = -1 lies outside"):
         paper_gap("gravity", -1.0)
+
+
+def test_effects_need_no_torch():
+    code = "import sys, torchrl_h2o.effects; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -68,6 +68,13 @@ def test_every_process_starts_with_an_empty_delay_line():
     assert effect.process(DT, rng())(np.ones(1)) == 0.0
 
 
+def test_a_delay_line_holds_what_was_asked_for_even_if_the_caller_reuses_the_array():
+    late, command = ActionDelay(DT).process(DT, rng()), np.ones(1)
+    late(command)
+    command[:] = 9.0
+    assert late(command) == 1.0
+
+
 @pytest.mark.parametrize("effect", [ActionNoise(0.5), ObservationNoise(0.5)])
 def test_noise_has_its_standard_deviation_and_repeats_with_its_seed(effect):
     noisy, again = effect.process(DT, rng()), effect.process(DT, rng())

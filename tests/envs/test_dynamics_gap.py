@@ -10,7 +10,7 @@ import pytest
 import torch
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -74,6 +74,13 @@ def test_the_model_is_changed_when_the_gap_is_put_on():
     assert mujoco_model(appended).opt.gravity[2] == pytest.approx(-29.43)
 
 
+def test_a_reset_does_not_compile_the_model_again():
+    env = gapped(Gravity(2.0))
+    model = mujoco_model(env)
+    env.reset()
+    assert mujoco_model(env) is model
+
+
 def test_the_simulator_steps_with_the_changed_model():
     heavy, light = rollout(gapped(Gravity(2.0))), rollout(GymEnv(CHEETAH))
     torch.testing.assert_close(heavy["observation"][0], light["observation"][0])
@@ -82,6 +89,7 @@ def test_the_simulator_steps_with_the_changed_model():
 
 
 @settings(max_examples=10, deadline=None)
+@example(effects=NEUTRAL, seed=0)
 @given(effects=st.lists(st.sampled_from(NEUTRAL), max_size=5), seed=st.integers(0, 2**16))
 def test_neutral_effects_leave_every_bit_of_a_rollout(effects, seed):
     expected, actual = rollout(GymEnv(CHEETAH), seed=seed), rollout(gapped(*effects), seed=seed)
@@ -220,6 +228,16 @@ def test_a_delay_line_is_empty_again_after_a_reset():
         for expected in (0.0, 1.0):
             env.step(reset.set("action", torch.ones(6)))
             torch.testing.assert_close(base.executed[-1], torch.full((6,), expected))
+
+
+def test_a_clone_has_a_delay_line_of_its_own():
+    env = gapped(gap := ActionDelay(0.05))
+    env.step(env.reset().set("action", torch.ones(6)))
+    base = Executed(CHEETAH)
+    twin = TransformedEnv(base, env.transform.clone())
+    twin.step(base.reset().set("action", torch.ones(6)))  # no reset that would empty the line
+    torch.testing.assert_close(base.executed[-1], torch.zeros(6))
+    assert twin.transform.effects == (gap,)
 
 
 def test_the_delay_knows_frames_that_torchrl_skips():

@@ -71,18 +71,24 @@ def test_task_and_named_views_see_the_changed_simulation():
     assert mujoco_model(env).body_mass.sum() == pytest.approx(14.0)
 
 
-def test_forces_act_at_every_physics_step():
-    env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(JointForce(50.0, "rootx")))
+def test_forces_act_anew_at_every_physics_step():
+    drag = LinearDrag(50.0, "torso")
+    env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(drag))
     env.set_seed(0)
     reset = env.reset()
     physics, model = env.base_env._env.physics, mujoco_model(env)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = physics.data.qpos, physics.data.qvel
-    data.qacc_warmstart[:] = physics.data.qacc_warmstart
-    data.qfrc_applied[1] = 50.0
-    mujoco.mj_step(model, data, nstep=10)
+    physics.data.qvel[0] = 5.0
+    data, current = mujoco.MjData(model), mujoco.MjData(model)
+    for field in ("qpos", "qvel", "qacc_warmstart"):
+        getattr(data, field)[:] = getattr(physics.data, field)
+    physics.forward()
+    for _ in range(10):
+        current.qpos[:], current.qvel[:] = data.qpos, data.qvel
+        mujoco.mj_forward(model, current)
+        data.qfrc_applied[:] = drag.generalised_force(model, current)
+        mujoco.mj_step(model, data)
     env.step(reset.set("action", torch.zeros(6, dtype=torch.float64)))
-    np.testing.assert_allclose(physics.data.qvel, data.qvel, rtol=1e-9)
+    np.testing.assert_allclose(physics.data.qvel, data.qvel, rtol=1e-6)
 
 
 def test_the_observation_entries_are_counted_over_all_keys():
