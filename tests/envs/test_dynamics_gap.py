@@ -2,22 +2,18 @@
 
 import copy
 import pickle
-from collections.abc import Callable
 
-import mujoco
-import numpy as np
 import pytest
 import torch
-from gymnasium.envs.mujoco import MujocoEnv
-from gymnasium.spaces import Box
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, EnvBase, GymEnv, GymWrapper, StepCounter, TransformedEnv
+from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.effects.models import CART, as_bytes
+from tests.effects.models import as_bytes
+from tests.envs.rollouts import CHEETAH, gapped, rollout
 from torchrl_h2o.effects import (
     PAPER_GAPS,
     ActionDelay,
@@ -25,7 +21,6 @@ from torchrl_h2o.effects import (
     ActionNoise,
     Armature,
     BodyMass,
-    Effect,
     GeomSize,
     Gravity,
     JointDamping,
@@ -37,7 +32,6 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, dynamics_gap, mujoco_model
 
-CHEETAH = "HalfCheetah-v5"
 NEUTRAL = [
     Gravity(),
     GeomSize(),
@@ -53,17 +47,6 @@ NEUTRAL = [
     ObservationNoise(),
     ObservationBias(),
 ]
-
-
-def gapped(*effects: Effect, task: str = CHEETAH) -> TransformedEnv:
-    return TransformedEnv(GymEnv(task), DynamicsGap(*effects))
-
-
-def rollout(env: EnvBase, steps: int = 10, seed: int = 0) -> TensorDict:
-    torch.manual_seed(seed)
-    env.set_seed(seed)
-    env.set_seed(seed)  # Gymnasium tasks draw their first state from the seed of the last reset
-    return env.rollout(steps, break_when_any_done=False)
 
 
 def test_the_model_is_changed_when_the_gap_is_put_on():
@@ -166,182 +149,6 @@ def test_a_gap_in_a_replay_buffer_alters_nothing():
     data = TensorDict({"action": torch.ones(4, 2), "observation": torch.ones(4, 3)}, [4])
     buffer.extend(data)
     assert (buffer.sample().select("action", "observation") == 1).all()
-
-
-# ------------------------------------------------------------- actions and observations
-class Executed(GymEnv):
-    """Remembers the actions that reach the simulator."""
-
-    def read_action(self, action):
-        self.executed = [*getattr(self, "executed", []), action.clone()]
-        return super().read_action(action)
-
-
-def test_the_simulator_executes_the_altered_action_and_the_data_keep_the_one_asked_for():
-    base = Executed(CHEETAH)
-    env = TransformedEnv(base, DynamicsGap(ActionGain(3.0), ActionDelay(0.5 * 0.05)))
-    asked = rollout(env, 5)["action"]
-    assert env.action_spec.is_in(asked[0])
-    previous = torch.cat([torch.zeros_like(asked[:1]), asked[:-1]])
-    torch.testing.assert_close(torch.stack(base.executed[-5:]), 1.5 * asked + 1.5 * previous)
-
-
-def test_noise_may_leave_the_bounds_and_mujoco_clamps():
-    base = Executed(CHEETAH)
-    env = TransformedEnv(base, dynamics_gap("joint_noise"))
-    data = rollout(env, 50)
-    executed = torch.stack(base.executed[-50:])
-    assert (executed.abs() > 1).any()
-    assert data["action"].abs().max() <= 1
-    noise = executed - data["action"]
-    assert noise.std() == pytest.approx(1.0, abs=0.1)
-    assert noise.mean() == pytest.approx(0.0, abs=0.1)
-
-
-def test_randomness_repeats_with_torchs_generator():
-    env = gapped(ActionNoise(1.0), ObservationNoise(0.1))
-    first = rollout(env)
-    assert (rollout(env) == first).all()
-    env.set_seed(0)
-    state = torch.get_rng_state()
-    env.set_seed(0)
-    second = env.rollout(5)
-    env.set_seed(0)
-    torch.set_rng_state(state)
-    assert (env.rollout(5) == second).all()
-    assert not (second == first[:5]).all()
-
-
-def test_a_gap_without_randomness_draws_no_random_numbers():
-    torch.manual_seed(0)
-    env = gapped(Gravity(2.0), JointForce(1.0), ActionDelay(0.02), ObservationBias(1.0))
-    state = torch.get_rng_state()
-    env.reset()
-    assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_a_delay_line_is_empty_again_after_a_reset():
-    base = Executed(CHEETAH)
-    env = TransformedEnv(base, DynamicsGap(ActionDelay(0.05)))
-    for _ in range(2):
-        reset = env.reset()
-        for expected in (0.0, 1.0):
-            env.step(reset.set("action", torch.ones(6)))
-            torch.testing.assert_close(base.executed[-1], torch.full((6,), expected))
-
-
-def test_a_clone_has_a_delay_line_of_its_own():
-    env = gapped(gap := ActionDelay(0.05))
-    env.step(env.reset().set("action", torch.ones(6)))
-    base = Executed(CHEETAH)
-    twin = TransformedEnv(base, env.transform.clone())
-    twin.step(base.reset().set("action", torch.ones(6)))  # no reset that would empty the line
-    torch.testing.assert_close(base.executed[-1], torch.zeros(6))
-    assert twin.transform.effects == (gap,)
-
-
-def test_the_delay_knows_frames_that_torchrl_skips():
-    base = Executed(CHEETAH, frame_skip=2)
-    env = TransformedEnv(base, DynamicsGap(ActionDelay(0.05)))  # half a step of 0.1 s
-    env.step(env.reset().set("action", torch.ones(6)))
-    torch.testing.assert_close(base.executed[-1], torch.full((6,), 0.5))
-
-
-def test_the_first_and_the_next_observations_are_altered():
-    true, biased = rollout(GymEnv(CHEETAH)), rollout(gapped(ObservationBias(0.5, entries=(3,))))
-    offset = torch.zeros(17, dtype=torch.float64)
-    offset[3] = 0.5
-    for key in ("observation", ("next", "observation")):
-        torch.testing.assert_close(biased[key], true[key] + offset)
-
-
-# ------------------------------------------------------------------------------------ forces
-class Cart(MujocoEnv):
-    """A task of one's own, from its own file; x and its velocity."""
-
-    metadata = {"render_modes": [], "render_fps": 100}  # noqa: RUF012
-
-    def __init__(self, path: str):
-        super().__init__(path, 5, Box(-np.inf, np.inf, (4,), np.float64))
-        self.init_qpos[:] = (0.25, 0.0)
-
-    def step(self, action):
-        self.do_simulation(action, self.frame_skip)
-        return self.state_vector(), 0.0, False, False, {}
-
-    def reset_model(self):
-        self.set_state(self.init_qpos, self.init_qvel)
-        return self.state_vector()
-
-
-CART_XML = CART.replace("<worldbody>", '<option timestep=".002" gravity="0 0 0"/><worldbody>')
-CART_XML = CART_XML.replace(
-    "</mujoco>",
-    '<actuator><motor joint="slider" ctrlrange="-1 1"/></actuator></mujoco>',
-)
-
-
-@pytest.fixture
-def cart(tmp_path) -> GymWrapper:
-    path = tmp_path / "cart.xml"
-    path.write_text(CART_XML)
-    return GymWrapper(Cart(str(path)))
-
-
-def stepped_cart(force: Callable[[float], float], start: float) -> tuple[float, float]:
-    """x and v after one action of zero, with the force on the slider set every physics step."""
-    model = mujoco.MjModel.from_xml_string(CART_XML)
-    data = mujoco.MjData(model)
-    data.qpos[0], data.qvel[0] = 0.25, start
-    for _ in range(5):
-        data.qfrc_applied[0] = force(data.qvel[0])
-        mujoco.mj_step(model, data)
-    return data.qpos[0], data.qvel[0]
-
-
-@pytest.mark.parametrize(
-    ("effects", "force"),
-    [
-        ([JointForce(2.0, "slider"), JointForce(1.0, "slider")], lambda v: 3.0),
-        ([LinearDrag(60.0, "cart")], lambda v: -60.0 * v),
-        ([LinearDrag(60.0, "cart"), JointForce(2.0, "slider")], lambda v: 2.0 - 60.0 * v),
-    ],
-)
-def test_forces_are_summed_anew_at_every_physics_step(cart, effects, force):
-    env = TransformedEnv(cart, Compose(*map(DynamicsGap, effects)))
-    reset = env.reset()
-    cart._env.unwrapped.data.qvel[0] = 1.0
-    state = env.step(reset.set("action", torch.zeros(1)))["next", "observation"]
-    assert (state[0].item(), state[2].item()) == pytest.approx(stepped_cart(force, 1.0), rel=1e-12)
-
-
-def test_a_force_sees_the_bodies_where_they_are(cart):
-    effect = LinearDrag(20.0, "pole")
-    env = TransformedEnv(cart, DynamicsGap(effect))
-    reset = env.reset()
-    cart._env.unwrapped.data.qvel[:] = 1.0, 20.0  # the pole turns by 0.2 rad an action
-    state = env.step(reset.set("action", torch.zeros(1)))["next", "observation"]
-    model = mujoco.MjModel.from_xml_string(CART_XML)
-    data, current = mujoco.MjData(model), mujoco.MjData(model)
-    data.qpos[0], data.qvel[:] = 0.25, (1.0, 20.0)
-    for _ in range(5):
-        current.qpos[:], current.qvel[:] = data.qpos, data.qvel
-        mujoco.mj_forward(model, current)
-        data.qfrc_applied[:] = effect.generalised_force(model, current)
-        mujoco.mj_step(model, data)
-    np.testing.assert_allclose(state, [*data.qpos, *data.qvel], rtol=1e-12)
-
-
-def test_a_task_of_ones_own_keeps_its_start(cart):
-    env = TransformedEnv(cart, DynamicsGap(BodyMass(2.0, bodies="pole")))
-    assert env.reset()["observation"][0] == 0.25
-    assert mujoco_model(env).body("pole").mass == pytest.approx(1.0)
-
-
-def test_the_file_of_the_model_is_not_written(cart, tmp_path):
-    TransformedEnv(cart, DynamicsGap(BodyMass(2.0))).rollout(2)
-    assert (tmp_path / "cart.xml").read_text() == CART_XML
-    assert [path.name for path in tmp_path.iterdir()] == ["cart.xml"]
 
 
 # ------------------------------------------------------------------------------------ errors

@@ -1,0 +1,21 @@
+"""Envs with a gap and rollouts that can be repeated, for the tests."""
+
+import torch
+from tensordict import TensorDict
+from torchrl.envs import EnvBase, GymEnv, TransformedEnv
+
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.envs import DynamicsGap
+
+CHEETAH = "HalfCheetah-v5"
+
+
+def gapped(*effects: Effect, task: str = CHEETAH) -> TransformedEnv:
+    return TransformedEnv(GymEnv(task), DynamicsGap(*effects))
+
+
+def rollout(env: EnvBase, steps: int = 10, seed: int = 0) -> TensorDict:
+    torch.manual_seed(seed)
+    env.set_seed(seed)
+    env.set_seed(seed)  # Gymnasium tasks draw their first state from the seed of the last reset
+    return env.rollout(steps, break_when_any_done=False)

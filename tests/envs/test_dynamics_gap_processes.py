@@ -1,0 +1,103 @@
+"""DynamicsGap's actions and observations: what is executed, what is reported, what is repeated."""
+
+import pytest
+import torch
+from torchrl.envs import GymEnv, TransformedEnv
+
+from tests.envs.rollouts import CHEETAH, gapped, rollout
+from torchrl_h2o.effects import (
+    ActionDelay,
+    ActionGain,
+    ActionNoise,
+    Gravity,
+    JointForce,
+    ObservationBias,
+    ObservationNoise,
+)
+from torchrl_h2o.envs import DynamicsGap, dynamics_gap
+
+
+class Executed(GymEnv):
+    """Remembers the actions that reach the simulator."""
+
+    def read_action(self, action):
+        self.executed = [*getattr(self, "executed", []), action.clone()]
+        return super().read_action(action)
+
+
+def test_the_simulator_executes_the_altered_action_and_the_data_keep_the_one_asked_for():
+    base = Executed(CHEETAH)
+    env = TransformedEnv(base, DynamicsGap(ActionGain(3.0), ActionDelay(0.5 * 0.05)))
+    asked = rollout(env, 5)["action"]
+    assert env.action_spec.is_in(asked[0])
+    previous = torch.cat([torch.zeros_like(asked[:1]), asked[:-1]])
+    torch.testing.assert_close(torch.stack(base.executed[-5:]), 1.5 * asked + 1.5 * previous)
+
+
+def test_noise_may_leave_the_bounds_and_mujoco_clamps():
+    base = Executed(CHEETAH)
+    env = TransformedEnv(base, dynamics_gap("joint_noise"))
+    data = rollout(env, 50)
+    executed = torch.stack(base.executed[-50:])
+    assert (executed.abs() > 1).any()
+    assert data["action"].abs().max() <= 1
+    noise = executed - data["action"]
+    assert noise.std() == pytest.approx(1.0, abs=0.1)
+    assert noise.mean() == pytest.approx(0.0, abs=0.1)
+
+
+def test_randomness_repeats_with_torchs_generator():
+    env = gapped(ActionNoise(1.0), ObservationNoise(0.1))
+    first = rollout(env)
+    assert (rollout(env) == first).all()
+    env.set_seed(0)
+    state = torch.get_rng_state()
+    env.set_seed(0)
+    second = env.rollout(5)
+    env.set_seed(0)
+    torch.set_rng_state(state)
+    assert (env.rollout(5) == second).all()
+    assert not (second == first[:5]).all()
+
+
+def test_a_gap_without_randomness_draws_no_random_numbers():
+    torch.manual_seed(0)
+    env = gapped(Gravity(2.0), JointForce(1.0), ActionDelay(0.02), ObservationBias(1.0))
+    state = torch.get_rng_state()
+    env.reset()
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_a_delay_line_is_empty_again_after_a_reset():
+    base = Executed(CHEETAH)
+    env = TransformedEnv(base, DynamicsGap(ActionDelay(0.05)))
+    for _ in range(2):
+        reset = env.reset()
+        for expected in (0.0, 1.0):
+            env.step(reset.set("action", torch.ones(6)))
+            torch.testing.assert_close(base.executed[-1], torch.full((6,), expected))
+
+
+def test_a_clone_has_a_delay_line_of_its_own():
+    env = gapped(gap := ActionDelay(0.05))
+    env.step(env.reset().set("action", torch.ones(6)))
+    base = Executed(CHEETAH)
+    twin = TransformedEnv(base, env.transform.clone())
+    twin.step(base.reset().set("action", torch.ones(6)))  # no reset that would empty the line
+    torch.testing.assert_close(base.executed[-1], torch.zeros(6))
+    assert twin.transform.effects == (gap,)
+
+
+def test_the_delay_knows_frames_that_torchrl_skips():
+    base = Executed(CHEETAH, frame_skip=2)
+    env = TransformedEnv(base, DynamicsGap(ActionDelay(0.05)))  # half a step of 0.1 s
+    env.step(env.reset().set("action", torch.ones(6)))
+    torch.testing.assert_close(base.executed[-1], torch.full((6,), 0.5))
+
+
+def test_the_first_and_the_next_observations_are_altered():
+    true, biased = rollout(GymEnv(CHEETAH)), rollout(gapped(ObservationBias(0.5, entries=(3,))))
+    offset = torch.zeros(17, dtype=torch.float64)
+    offset[3] = 0.5
+    for key in ("observation", ("next", "observation")):
+        torch.testing.assert_close(biased[key], true[key] + offset)
