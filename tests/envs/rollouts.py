@@ -10,12 +10,11 @@ from torchrl_h2o.envs import DynamicsGap
 CHEETAH = "HalfCheetah-v5"
 
 
-def gapped(*effects: Effect, task: str = CHEETAH) -> TransformedEnv:
-    return TransformedEnv(GymEnv(task), DynamicsGap(*effects))
+def gapped(*effects: Effect) -> TransformedEnv:
+    return TransformedEnv(GymEnv(CHEETAH), DynamicsGap(*effects))
 
 
 def rollout(env: EnvBase, steps: int = 10, seed: int = 0) -> TensorDict:
     torch.manual_seed(seed)
     env.set_seed(seed)
-    env.set_seed(seed)  # Gymnasium tasks draw their first state from the seed of the last reset
     return env.rollout(steps, break_when_any_done=False)
