@@ -45,14 +45,19 @@ def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:
 
 
 def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
-    """The real transitions as this run's environments would have shown them: normalised, the reward scaled."""
+    """The real transitions as the learner sees them: observations normalised, rewards shifted and scaled."""
     real = real.copy()
-    real["next"] = real["next"].copy().set("reward", cfg.reward_scale * real["next", "reward"])
+    real["next"] = real["next"].copy().set("reward", learning_reward(cfg, real["next", "reward"]))
     if cfg.observation_norm is not None:
         norm = _norm(cfg)
         for part in (real, real["next"]):
             part["observation"] = (part["observation"] - norm["loc"]) / norm["scale"]
     return real
+
+
+def learning_reward(cfg: DictConfig, reward: torch.Tensor) -> torch.Tensor:
+    """The reward that the losses see; what is reported is the task's own."""
+    return cfg.reward_scale * (reward + cfg.reward_offset)
 
 
 def _norm(cfg: DictConfig) -> dict[str, torch.Tensor]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import hydra
 import torch
-from environments import as_observed, make_reality, make_simulator, measure_observation_norm
+from environments import as_observed, learning_reward, make_reality, make_simulator, measure_observation_norm
 from evaluation import evaluate
 from hydra.core.hydra_config import HydraConfig
 from learning_curve import draw_learning_curve
@@ -73,7 +73,7 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
     )
     for epoch, evaluating in training.epochs(simulator):
         simulated = next(rollouts)
-        simulated["next", "reward"] *= cfg.reward_scale
+        simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
         replay.extend(simulated)
         for _ in range(cfg.updates_per_epoch):
             batch = replay.sample()

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import torch
-from environments import make_reality, make_simulator
+from environments import learning_reward, make_reality, make_simulator
 from evaluation import evaluate
 from omegaconf import DictConfig
 from run import Training
@@ -39,7 +39,7 @@ def train_sac(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[t
     )
     for epoch, evaluating in training.epochs(simulator):
         simulated = next(rollouts).select(*TRANSITION_KEYS)
-        simulated["next", "reward"] *= cfg.reward_scale
+        simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
         replay.extend(simulated)
         for _ in range(cfg.updates_per_epoch):
             losses = loss(replay.sample())

@@ -73,9 +73,17 @@ def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
     assert summary["updates"] == 60
     assert summary["env"] == "wheel_legged"
     assert summary["return_real"].keys() >= {"mean", "std", "episodes"}
-    assert {"gap", "data", "backbone", "mixing", "seed", "return_sim", "updates_per_second", "wall_s", "versions"} <= set(
-        summary
-    )
+    assert {
+        "gap",
+        "data",
+        "backbone",
+        "mixing",
+        "seed",
+        "return_sim",
+        "updates_per_second",
+        "wall_s",
+        "versions",
+    } <= set(summary)
     assert {row["method"] for row in rows(out)} == {"H2O+", "SAC in the simulator"}
     assert (out / "learning_curve.png").stat().st_size > 10_000
     assert "warn" not in printed.lower()
