@@ -173,6 +173,13 @@ def test_td_error_is_written_for_prioritised_replay(parts, batch):
     torch.testing.assert_close(batch["td_error"], error.detach().abs().amax(0))
 
 
+def test_priority_weights_multiply_the_terms(parts, batch):
+    loss = parts.bellman()
+    plain = loss(batch.copy())["loss_qvalue"]
+    batch["priority_weight"] = torch.full(batch.shape, 0.1, dtype=torch.float64)
+    torch.testing.assert_close(loss(batch)["loss_qvalue"], 0.1 * plain)
+
+
 def test_targets_move_only_through_softupdate(parts, batch):
     loss = MixedBellmanLoss(parts.actor, parts.qvalues, parts.value)
     targets = SoftUpdate(loss, tau=0.25)

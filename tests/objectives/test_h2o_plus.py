@@ -83,6 +83,16 @@ def test_alpha_grows_while_the_entropy_is_below_its_target(parts, batch):
         assert loss.log_alpha.grad.sign() == sign
 
 
+def test_the_logged_entropy_is_minus_the_mean_log_probability(parts, batch):
+    loss = parts.h2o_plus(ratio=False)
+    torch.manual_seed(3)
+    loss.mixed_target(batch)
+    _, log_prob = loss.actor_loss(batch)
+    torch.manual_seed(3)
+    expected = -(log_prob[batch["real"]].mean() + log_prob[~batch["real"]].mean()) / 2
+    torch.testing.assert_close(loss(batch)["entropy"], expected)
+
+
 def test_a_fixed_alpha_is_no_parameter(parts, batch):
     loss = parts.h2o_plus(fixed_alpha=True, alpha_init=0.2)
     assert "log_alpha" not in dict(loss.named_parameters())

@@ -32,10 +32,33 @@ def test_the_estimator_s_weights_drive_a_gradient_step_of(build):
     targets = SoftUpdate(loss, tau=0.01)
     optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
     before = [p.clone() for p in loss.parameters()]
+    still = loss.loss.target_qvalue_network_params.clone()
     sum(loss(batch).values()).backward()
     optimiser.step()
     targets.step()
     assert all((p != q).any() for p, q in zip(before, loss.parameters(), strict=True))
+    assert (loss.loss.target_qvalue_network_params != still).any()
+
+
+def test_weights_are_constants_and_keys_and_discount_are_those_of_the_loss_inside(batch):
+    loss = ImportanceWeightedLoss(iql(Parts()))
+    batch["dynamics_ratio"] = torch.rand(batch.shape, dtype=torch.float64).requires_grad_()
+    loss.make_value_estimator(gamma=0.5)
+    loss.set_keys(reward="pay", real="measured")
+    batch["next"].rename_key_("reward", "pay")
+    batch.rename_key_("real", "measured")
+    loss(batch)["loss_qvalue"].backward()
+    assert batch["dynamics_ratio"].grad is None
+    assert loss.loss.value_estimator.gamma == 0.5
+
+
+def test_dispatch_keeps_the_weight_of_real_rows(batch):
+    loss = ImportanceWeightedLoss(iql(Parts()))
+    batch["dynamics_ratio"] = torch.zeros(batch.shape, dtype=torch.float64)
+    expected = loss(batch)
+    loss.select_out_keys("loss_value")
+    tensors = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss._dispatch_keys}
+    torch.testing.assert_close(loss(**tensors), expected["loss_value"])
 
 
 def test_each_row_s_terms_are_multiplied_by_its_weight(batch):

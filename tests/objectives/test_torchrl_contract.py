@@ -8,14 +8,16 @@ import sys
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded
-from torchrl.modules import ValueOperator
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from tests.objectives.conftest import ACTION_DIM, CELLS, OBSERVATION_DIM, Parts, make_batch
 from torchrl_h2o.objectives import (
     DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
+    H2OPlusLoss,
     MixedBellmanLoss,
     SparseValueLoss,
     make_actor,
@@ -94,7 +96,9 @@ def test_reductions_agree(name, reduction):
                 if hasattr(module, "reduction"):
                     module.reduction = "none"
             torch.testing.assert_close(terms[key], evaluate(other, batch.copy())[key].sum())
-            break
+            for module in other.modules():
+                if hasattr(module, "reduction"):
+                    module.reduction = "sum"
 
 
 @losses
@@ -135,15 +139,12 @@ def test_compiled_fullgraph_equals_eager(name):
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     expected, got = evaluate(loss, batch.copy()), evaluate(compiled, batch.copy())
     torch.testing.assert_close(got, expected)
-    key = next(k for k in loss.out_keys if k.startswith("loss_"))
-    loss.zero_grad()
-    expected[key].backward()
-    gradients = [p.grad.clone() if p.grad is not None else None for p in loss.parameters()]
-    loss.zero_grad()
-    got[key].backward()
-    for parameter, gradient in zip(loss.parameters(), gradients, strict=True):
-        if gradient is not None:
-            torch.testing.assert_close(parameter.grad, gradient)
+    gradients = []
+    for losses in (expected, got):
+        loss.zero_grad()
+        sum(losses[k] for k in loss.out_keys if k.startswith("loss_")).backward()
+        gradients.append([p.grad.clone() for p in loss.parameters() if p.grad is not None])
+    torch.testing.assert_close(*gradients)
 
 
 RENAMED = {"real": ("marks", "real"), "state_action_value": ("critic", "q"), "value": ("critic", "v")}
@@ -171,25 +172,74 @@ def test_renamed_and_nested_keys_of_h2o_plus_reach_its_parts():
     batch = full_batch()
     plain = Parts().h2o_plus().eval()
     loss = Parts().h2o_plus().eval()
-    loss.set_keys(
-        real=("marks", "real"), reward=("pay", "r"), terminated="over", priority=("p", "td"), log_prob="entropy_term"
-    )
+    loss.set_keys(real=("marks", "real"), reward=("pay", "r"), terminated="over", priority=("p", "td"))
     renamed = batch.exclude("real", ("next", "reward"), ("next", "terminated"))
     renamed["marks", "real"] = batch["real"]
     renamed["next", "pay", "r"] = batch["next", "reward"]
     renamed["next", "over"] = batch["next", "terminated"]
-    loss.exploration.in_keys[0] = "entropy_term"
     torch.testing.assert_close(evaluate(loss, renamed), evaluate(plain, batch))
     assert ("p", "td") in renamed.keys(True)
     assert loss.ratio_loss.tensor_keys.real == ("marks", "real")
+
+
+def test_nested_action_and_observation_keys_are_taken_from_the_networks():
+    parts, batch = Parts(), full_batch()
+    agent = {"in_keys": [("agent", "obs")]}
+    action_spec = Composite(agent=Composite(act=parts.actor.spec["action"]))
+    actor = ProbabilisticActor(
+        TensorDictModule(parts.actor[0].module, out_keys=["loc", "scale"], **agent),
+        in_keys=["loc", "scale"],
+        out_keys=[("agent", "act")],
+        spec=action_spec,
+        distribution_class=TanhNormal,
+    )
+    keys = {"in_keys": [("agent", "obs"), ("agent", "act")], "out_keys": ["state_action_value"]}
+    qvalues = [ValueOperator(q.module, **keys) for q in parts.qvalues]
+    value_loss = ExpectileValueLoss(ValueOperator(parts.value.module, **agent))
+    loss = H2OPlusLoss(actor, qvalues, value_loss, fixed_alpha=True)
+    assert loss.target_entropy == -ACTION_DIM
+    plain = H2OPlusLoss(Parts().actor, Parts().qvalues, ExpectileValueLoss(Parts().value), fixed_alpha=True)
+    renamed = batch.exclude("observation", "action", ("next", "observation"))
+    renamed["agent", "obs"], renamed["agent", "act"] = batch["observation"], batch["action"]
+    renamed["next", "agent", "obs"] = batch["next", "observation"]
+    torch.testing.assert_close(evaluate(loss, renamed), evaluate(plain, batch))
+
+
+def test_what_may_be_there_is_dispatched_too():
+    loss, batch = make("bellman"), full_batch()
+    batch["dynamics_ratio"] = torch.linspace(0.1, 1.0, 7, dtype=torch.float64)
+    batch["priority_weight"] = torch.linspace(1.0, 0.2, 7, dtype=torch.float64)
+    tensors = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss._dispatch_keys}
+    torch.manual_seed(11)
+    torch.testing.assert_close(loss(**tensors), evaluate(loss, batch)["loss_qvalue"])
+
+
+def test_a_mask_of_the_whole_reaches_its_parts():
+    loss, batch = make("h2o_plus"), full_batch()
+    loss.loss_mask_key = "valid"
+    kept = torch.arange(7) != 5
+    masked = evaluate(loss, batch.copy().set("valid", kept))
+    alone = evaluate(loss, batch[kept])
+    for key in ("loss_value", "loss_ratio_sa", "loss_ratio_sas"):
+        torch.testing.assert_close(masked[key], alone[key])
+
+
+def test_parts_that_reduce_differently_are_refused():
+    with pytest.raises(ValueError, match="build both alike"):
+        Parts().h2o_plus(reduction="none")
+
+
+def test_an_entry_that_is_missing_is_named():
+    with pytest.raises(KeyError, match=r"reads 'reward'.*set_keys"):
+        make("bellman")(full_batch().exclude(("next", "reward")))
 
 
 def test_more_batch_dimensions_give_the_same():
     batch = full_batch(num_real=4, num_sim=4)
     loss = ExponentialValueLoss(Parts().value)
     torch.testing.assert_close(loss(batch.reshape(4, 2))["loss_value"], loss(batch)["loss_value"])
-    bellman = Parts().bellman(mixing=1.0)
-    torch.testing.assert_close(bellman(batch.reshape(4, 2))["loss_qvalue"], bellman(batch)["loss_qvalue"])
+    bellman = make("bellman")  # the policy's noise is drawn in the same order in both
+    torch.testing.assert_close(evaluate(bellman, batch.reshape(4, 2)), evaluate(bellman, batch))
 
 
 def test_one_q_network_is_expanded_to_an_ensemble():
@@ -210,6 +260,19 @@ def test_actions_fill_the_bounds_of_their_spec_and_no_more():
         actor.module[0].module[0][-1].weight.mul_(1e6)
         _, _, action, _ = actor(observation=torch.randn(1000, OBSERVATION_DIM))
     assert 2.99 < action.abs().max() <= 3
+
+
+def test_the_policy_starts_as_the_authors_and_stays_finite():
+    torch.manual_seed(0)
+    actor = make_actor(OBSERVATION_DIM, Bounded(-1, 1, (ACTION_DIM,)))
+    loc, scale, _, _ = actor(observation=torch.randn(100, OBSERVATION_DIM))
+    assert loc.abs().max() < 0.1
+    torch.testing.assert_close(scale, torch.full_like(scale, -1.0).exp(), rtol=0.1, atol=0.0)
+    with torch.no_grad():
+        actor.module[0].module[0][-1].bias.fill_(1e6)
+    assert actor(observation=torch.randn(2, OBSERVATION_DIM))[1].max().item() == pytest.approx(2.718281828**2)
+    with pytest.raises(ValueError, match="bounded"):
+        make_actor(OBSERVATION_DIM, Unbounded((ACTION_DIM,)))
 
 
 def test_objectives_import_without_mujoco():

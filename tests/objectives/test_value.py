@@ -95,10 +95,14 @@ def test_exponential_gradient_is_exact_where_it_is_not_clipped(z, alpha):
     torch.testing.assert_close(y.grad, expected, rtol=1e-12, atol=1e-12)
 
 
-def test_exponential_loss_still_pulls_the_value_up_beyond_its_clip():
-    y = torch.tensor(1e6, requires_grad=True)
-    ExponentialValueLoss(Parts(dtype=torch.float32).value).penalty(y).backward()
-    assert y.grad > 0
+def test_exponential_loss_is_its_tangent_beyond_its_clip():
+    loss = ExponentialValueLoss(Parts().value, alpha=2.0, clip=3.0)
+    y = torch.tensor([6.0, 7.0, 1e6], dtype=torch.float64, requires_grad=True)
+    out = loss.penalty(y)
+    out.sum().backward()
+    slope = (torch.tensor(3.0, dtype=torch.float64).exp() - 1) / 2
+    torch.testing.assert_close(y.grad, slope.expand(3))
+    torch.testing.assert_close(out[1] - out[0], slope)
 
 
 def test_a_backbone_of_one_s_own_is_one_method():

@@ -30,9 +30,6 @@ class EntropyBonus(TensorDictModuleBase):
     stand in its place. It is called without gradients on the *next* states and finds there the observation, the
     action that the policy takes, its log-probability ``"_log_prob"`` ``[*B]``, and β as ``alpha`` ``[*B]``.
 
-    Args:
-        log_prob_key (NestedKey, optional): where log π(a'|s') is. Defaults to ``"_log_prob"``.
-
     Source:
         H2O+, Eq. (7).
 
@@ -44,9 +41,9 @@ class EntropyBonus(TensorDictModuleBase):
         tensor([ 1.0000, -0.5000])
     """
 
-    def __init__(self, log_prob_key: NestedKey = "_log_prob") -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.in_keys = [log_prob_key, "alpha"]
+        self.in_keys = ["_log_prob", "alpha"]
         self.out_keys = ["exploration_bonus"]
 
     @dispatch
@@ -116,21 +113,22 @@ class MixedBellmanLoss(HybridLoss):
             action: Defaults to ``"action"``.
             value: V(s), as the value network writes it. Defaults to ``"state_value"``.
             state_action_value: Q(s, a), as the Q network writes it. Defaults to ``"state_action_value"``.
-            log_prob: log π(a'|s') for the exploration term. Defaults to ``"_log_prob"``.
             reward: below ``"next"``. Defaults to ``"reward"``.
             terminated: below ``"next"``. Defaults to ``"terminated"``.
             dynamics_ratio: P / P̂ of the simulated rows. Defaults to ``"dynamics_ratio"``.
             priority: where the td error goes. Defaults to ``"td_error"``.
+            priority_weight: of a prioritised replay buffer; multiplies the terms if it is there. Defaults to
+                ``"priority_weight"``.
         """
 
         action: NestedKey = "action"
         value: NestedKey = "state_value"
         state_action_value: NestedKey = "state_action_value"
-        log_prob: NestedKey = "_log_prob"
         reward: NestedKey = "reward"
         terminated: NestedKey = "terminated"
         dynamics_ratio: NestedKey = "dynamics_ratio"
         priority: NestedKey = "td_error"
+        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
@@ -164,6 +162,7 @@ class MixedBellmanLoss(HybridLoss):
         if not alpha_init > 0:
             raise ValueError(f"alpha_init must be positive, not {alpha_init}.")
         self.convert_to_functional(actor_network, "actor_network")
+        self.tensor_keys.action = _action_key(actor_network)
         if isinstance(qvalue_network, Sequence):
             num_qvalue_nets = len(qvalue_network)
         self.convert_to_functional(qvalue_network, "qvalue_network", num_qvalue_nets, create_target_params=True)
@@ -201,6 +200,9 @@ class MixedBellmanLoss(HybridLoss):
             keys.real,
         )
 
+    def _optional_keys(self) -> Iterable[NestedKey]:
+        return self.tensor_keys.dynamics_ratio, self.tensor_keys.priority_weight
+
     def _written_keys(self) -> Iterable[NestedKey]:
         return ("loss_qvalue",)
 
@@ -209,7 +211,7 @@ class MixedBellmanLoss(HybridLoss):
         """β, the weight of the entropy, as a constant."""
         return self.log_alpha.detach().exp()
 
-    @dispatch
+    @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._output({"loss_qvalue": self.qvalue_loss(tensordict)}, tensordict)
 
@@ -228,8 +230,8 @@ class MixedBellmanLoss(HybridLoss):
         next_states = tensordict.get("next")
         exploit = self._next_value(next_states)
         explore = self._next_policy_value(next_states)
-        reward = like_rows(next_states.get(keys.reward), exploit)
-        terminated = like_rows(next_states.get(keys.terminated), exploit)
+        reward = like_rows(self._entry(next_states, keys.reward), exploit)
+        terminated = like_rows(self._entry(next_states, keys.terminated).bool(), exploit)
         next_value = self.mixing * exploit + (1 - self.mixing) * explore
         return reward + self.gamma * torch.where(terminated, 0.0, next_value)  # Eq. (7)
 
@@ -237,15 +239,15 @@ class MixedBellmanLoss(HybridLoss):
         """V(s') of the online value network."""
         states = next_states.select(*self.value_network.in_keys)
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            return self.value_network(states).get(self.tensor_keys.value).squeeze(-1)
+            return self._entry(self.value_network(states), self.tensor_keys.value).squeeze(-1)
 
     def _next_policy_value(self, next_states: TensorDictBase) -> Tensor:
         """Q̂(s', a') of the target networks' minimum plus the exploration term, a' from the policy."""
         states = next_states.copy()
         action, log_prob = self._sample_action(states)
-        states.set(self.tensor_keys.action, action).set(self.tensor_keys.log_prob, log_prob)
+        states.set(self.tensor_keys.action, action)
         qvalue = self._qvalues(states, self.target_qvalue_network_params).amin(0)
-        states.set("alpha", self.alpha.expand(log_prob.shape))
+        states.set("_log_prob", log_prob).set("alpha", self.alpha.expand(log_prob.shape))
         bonus = self.exploration(states).get("exploration_bonus")
         return qvalue + like_rows(bonus, qvalue)
 
@@ -262,12 +264,21 @@ class MixedBellmanLoss(HybridLoss):
         """Q(s, a) of every member of the ensemble, ``[num_qvalue_nets, *B]``."""
         inputs = tensordict.select(*self.qvalue_network.in_keys)
         qvalue = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
-        return qvalue(inputs, params).get(self.tensor_keys.state_action_value).squeeze(-1)
+        return self._entry(qvalue(inputs, params), self.tensor_keys.state_action_value).squeeze(-1)
 
     def _weight(self, terms: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Terms of simulated rows times P / P̂; real rows as they are."""
+        """Terms of simulated rows times P / P̂, real rows as they are; both times the priority's weight."""
+        priority_weight = self._maybe_get_priority_weight(tensordict)
+        if priority_weight is not None:
+            terms = terms * like_rows(priority_weight, terms)
         ratio = tensordict.get(self.tensor_keys.dynamics_ratio, None)
         if ratio is None:
             return terms
         real, _ = self._rows(terms, tensordict)
         return torch.where(real, terms, like_rows(ratio.detach(), terms) * terms)
+
+
+def _action_key(actor_network: ProbabilisticTensorDictSequential) -> NestedKey:
+    """Where the actor writes its action, as it says itself."""
+    keys = getattr(actor_network, "dist_sample_keys", None)
+    return keys[0] if keys else "action"

@@ -59,6 +59,10 @@ class HybridLoss(LossModule):
     def _read_keys(self) -> Iterable[NestedKey]:
         raise NotImplementedError
 
+    def _optional_keys(self) -> Iterable[NestedKey]:
+        """What the loss reads if it is there: not in ``in_keys``, but dispatched like them, after them."""
+        return ()
+
     def _written_keys(self) -> Iterable[NestedKey]:
         raise NotImplementedError
 
@@ -76,12 +80,26 @@ class HybridLoss(LossModule):
         self._in_keys = keys
 
     @property
+    def _dispatch_keys(self) -> list[NestedKey]:
+        return list(dict.fromkeys((*self.in_keys, *self._optional_keys())))
+
+    @property
     def out_keys(self) -> list[NestedKey]:
         return list(self._written_keys()) if self._out_keys is None else self._out_keys
 
     @out_keys.setter
     def out_keys(self, keys: list[NestedKey]) -> None:
         self._out_keys = keys
+
+    def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        """An entry that the loss cannot do without."""
+        value = tensordict.get(key, None)
+        if value is None:
+            raise KeyError(
+                f"{type(self).__name__} reads {key!r} and finds {sorted(tensordict.keys(True, True), key=str)}. "
+                "Add it, or name the entry that holds it with set_keys."
+            )
+        return value
 
     def _rows(self, terms: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Real and simulated rows as two masks of the shape of ``terms``."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite
 
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
+from torchrl_h2o.objectives.common import HybridLoss
 from torchrl_h2o.objectives.ratio import DynamicsRatioLoss
 from torchrl_h2o.objectives.value import InSampleValueLoss
 
@@ -39,10 +40,10 @@ class H2OPlusLoss(MixedBellmanLoss):
         fixed_alpha (bool, optional): whether β stays as it is. Defaults to ``False``.
         target_entropy (float or "auto", optional): in nats; ``"auto"`` is -dim(A), from the actor's spec.
         num_qvalue_nets (int, optional): see :class:`MixedBellmanLoss`.
-        reduction (str, optional): see :class:`~torchrl_h2o.objectives.common.HybridLoss`.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.common.HybridLoss`; that of its parts too.
 
     Raises:
-        ValueError: if the target entropy is "auto" and the actor has no action spec.
+        ValueError: if the target entropy is "auto" and the actor has no action spec, or a part reduces differently.
 
     Reads a transition and ``real`` ``[*B]``. Writes the losses above and, to be logged, ``alpha``, ``entropy``, and
     with a ``ratio_loss`` ``accuracy_sa``, ``accuracy`` and ``dynamics_ratio`` (its mean over the simulated rows).
@@ -102,8 +103,12 @@ class H2OPlusLoss(MixedBellmanLoss):
             reduction=reduction,
         )
         self.ratio_loss = ratio_loss
-        for part in filter(None, (value_loss, ratio_loss)):
-            part.reduction = reduction
+        for part in self._parts:
+            if part.reduction != reduction:
+                raise ValueError(
+                    f"{type(part).__name__} has reduction={part.reduction!r} and H2OPlusLoss {reduction!r}: "
+                    "build both alike."
+                )
         if not fixed_alpha:
             log_alpha = self.log_alpha
             del self.log_alpha
@@ -115,6 +120,11 @@ class H2OPlusLoss(MixedBellmanLoss):
     def _hold_value_network(self, value_loss: InSampleValueLoss) -> None:
         # V belongs to the loss that trains it; Eq. (7) reads it there, through the two properties below.
         self.value_loss = value_loss
+        self.tensor_keys.value = value_loss.tensor_keys.value
+
+    @property
+    def _parts(self) -> list[HybridLoss]:
+        return [self.value_loss] + ([] if self.ratio_loss is None else [self.ratio_loss])
 
     @property
     def value_network(self) -> TensorDictModule:
@@ -126,8 +136,17 @@ class H2OPlusLoss(MixedBellmanLoss):
 
     def set_keys(self, **kwargs) -> None:
         super().set_keys(**kwargs)
-        for part in filter(None, (self.value_loss, self.ratio_loss)):
+        for part in self._parts:
             part.set_keys(**{k: v for k, v in kwargs.items() if hasattr(part.tensor_keys, k)})
+
+    @property
+    def loss_mask_key(self) -> NestedKey | str | None:
+        return self._loss_mask_key
+
+    @loss_mask_key.setter
+    def loss_mask_key(self, key: NestedKey | str | None) -> None:
+        for loss in (self, *self._parts):
+            HybridLoss.loss_mask_key.fset(loss, key)
 
     def _read_keys(self) -> Iterable[NestedKey]:
         ratio_keys = () if self.ratio_loss is None else self.ratio_loss.estimator.in_keys
@@ -137,6 +156,10 @@ class H2OPlusLoss(MixedBellmanLoss):
             *self.value_network.in_keys,
             *ratio_keys,
         )
+
+    def _optional_keys(self) -> Iterable[NestedKey]:
+        keys = self.tensor_keys
+        return (keys.priority_weight,) if self.ratio_loss else (keys.dynamics_ratio, keys.priority_weight)
 
     def _written_keys(self) -> Iterable[NestedKey]:
         yield from ("loss_actor", "loss_qvalue", "loss_value", "loss_alpha")
@@ -151,7 +174,7 @@ class H2OPlusLoss(MixedBellmanLoss):
         if self.reduction != "none":
             yield from ("alpha", "entropy")
 
-    @dispatch
+    @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         batch = tensordict.copy()
         ratio_terms = {} if self.ratio_loss is None else self._ratio_terms(batch)
@@ -203,11 +226,11 @@ class H2OPlusLoss(MixedBellmanLoss):
 
 def _action_dim(actor_network: ProbabilisticTensorDictSequential, action_key: NestedKey) -> int:
     spec = getattr(actor_network, "spec", None)
-    if isinstance(spec, Composite):
-        spec = spec.get(action_key, None)
-    if spec is None:
+    leaf = spec.get(action_key, None) if isinstance(spec, Composite) else spec
+    if leaf is None:
         raise ValueError(
             "target_entropy='auto' needs the action's spec: give it to the actor "
             "(ProbabilisticActor(..., spec=env.action_spec)), or pass target_entropy=-action_dim."
         )
-    return spec.shape[-1]
+    batch_dims = spec.ndim if isinstance(spec, Composite) else 0
+    return leaf.shape[batch_dims:].numel()

@@ -65,10 +65,24 @@ class ImportanceWeightedLoss(HybridLoss):
     def _read_keys(self) -> Iterable[NestedKey]:
         return *self.loss.in_keys, self.key
 
+    def _optional_keys(self) -> Iterable[NestedKey]:
+        return (self.tensor_keys.real,)
+
+    def set_keys(self, **kwargs) -> None:
+        """Renames ``real`` here, and every other key in the loss inside."""
+        if "real" in kwargs:
+            super().set_keys(real=kwargs.pop("real"))
+        if kwargs:
+            self.loss.set_keys(**kwargs)
+
+    def make_value_estimator(self, *args, **kwargs) -> None:
+        """That of the loss inside."""
+        self.loss.make_value_estimator(*args, **kwargs)
+
     def _written_keys(self) -> Iterable[NestedKey]:
         return tuple(key for key in self.loss.out_keys if str(key).startswith("loss_"))
 
-    @dispatch
+    @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         terms = self.loss(tensordict)
         weights = self._weights(tensordict)

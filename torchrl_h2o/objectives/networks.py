@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule
-from torch import nn
-from torchrl.data import TensorSpec
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
@@ -22,6 +22,17 @@ def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
     return network
 
 
+class GaussianParameters(nn.Module):
+    """Splits a network's output ``[*B, 2 n]`` into the mean and the standard deviation of a Gaussian, ``[*B, n]`` each.
+
+    The log standard deviation is clamped to [-20, 2], as in the authors' code: it can neither vanish nor overflow.
+    """
+
+    def forward(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        loc, log_std = output.chunk(2, -1)
+        return loc, log_std.clamp(-20.0, 2.0).exp()
+
+
 def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequence[int] = HIDDEN) -> ProbabilisticActor:
     """Tanh-Gaussian policy within the action's bounds.
 
@@ -34,6 +45,9 @@ def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequenc
         A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its
         standard deviation starts at exp(-1) before the tanh, the authors' log-std offset.
 
+    Raises:
+        ValueError: if the action is not bounded.
+
     Source:
         The authors' published code.
 
@@ -45,13 +59,15 @@ def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequenc
         >>> action.shape
         torch.Size([5, 1])
     """
+    if not isinstance(action_spec, Bounded):
+        raise ValueError(f"a tanh-Gaussian policy needs a bounded action, not {type(action_spec).__name__}.")
     action_dim = action_spec.shape[-1]
     network = _mlp(observation_dim, 2 * action_dim, num_cells)
     with torch.no_grad():
         network[-1].bias[action_dim:].fill_(-1.0)
     return ProbabilisticActor(
         TensorDictModule(
-            nn.Sequential(network, NormalParamExtractor(scale_mapping="exp")),
+            nn.Sequential(network, GaussianParameters()),
             in_keys=["observation"],
             out_keys=["loc", "scale"],
         ),

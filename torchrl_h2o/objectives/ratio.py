@@ -37,7 +37,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
             the batch's shape ``[*B]``.
 
     Raises:
-        ValueError: if the bound is not positive or the clamp not an interval of positive numbers.
+        ValueError: if the bound is not positive or the clamp not an interval of non-negative numbers.
 
     Source:
         H2O+, Eq. (9); the defaults are those of the authors' published code.
@@ -176,7 +176,7 @@ class DynamicsRatioLoss(HybridLoss):
         with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
             return self.estimator(tensordict.select(*self.estimator.in_keys))
 
-    @dispatch
+    @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = tensordict.select(*self.estimator.in_keys)
         if self.training and self.input_noise:

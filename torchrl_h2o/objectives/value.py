@@ -85,7 +85,7 @@ class InSampleValueLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return ("loss_value",)
 
-    @dispatch
+    @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._output({"loss_value": self.value_loss(tensordict)}, tensordict)
 
@@ -93,8 +93,8 @@ class InSampleValueLoss(HybridLoss):
         """Eq. (4), reduced."""
         states = tensordict.select(*self.value_network.in_keys)
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            value = self.value_network(states).get(self.tensor_keys.value).squeeze(-1)
-        qvalue = tensordict.get(self.tensor_keys.state_action_value).detach().reshape(value.shape)
+            value = self._entry(self.value_network(states), self.tensor_keys.value).squeeze(-1)
+        qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
         return self._real_mean(self.penalty(qvalue - value), tensordict)  # Eq. (4)
 
 
