@@ -42,7 +42,10 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
 def main(options: DictConfig) -> None:
     directory = Path(options.checkpoint)
     cfg = load_config(directory)
-    make_env = {"reality": make_reality, "simulator": make_simulator}[options["in"]]
+    worlds = {"reality": make_reality, "simulator": make_simulator}
+    if options["in"] not in worlds:
+        raise ValueError(f"in={options['in']}: choose reality or simulator")
+    make_env = worlds[options["in"]]
     policy = load_policy(cfg, directory, options.method)
     result = evaluate(make_env(cfg), policy, options.episodes, options.seed)
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]

@@ -24,9 +24,12 @@ class Evaluation:
     def std(self) -> float:
         return float(torch.tensor(self.returns).std(correction=0))
 
+    @property
+    def mean_length(self) -> float:
+        return sum(self.lengths) / len(self.lengths)
+
     def summary(self) -> dict:
-        steps = sum(self.lengths) / len(self.lengths)
-        return {"mean": self.mean, "std": self.std, "episodes": len(self.returns), "mean_length": steps}
+        return {"mean": self.mean, "std": self.std, "episodes": len(self.returns), "mean_length": self.mean_length}
 
 
 def evaluate(

@@ -9,6 +9,8 @@ python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # go on a
 
 import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
+import os
+import sys
 import time
 from pathlib import Path
 
@@ -16,15 +18,15 @@ import hydra
 import torch
 from environments import as_observed, learning_reward, make_reality, make_simulator, measure_observation_norm
 from evaluation import evaluate
-from hydra.core.hydra_config import HydraConfig
 from learning_curve import draw_learning_curve
 from omegaconf import DictConfig
-from real_data import episode_returns, read_real_data
+from real_data import behaviour_in, read_real_data
 from rendering import try_to_film
 from results import print_table
-from run import Training, open_run, save_config, write_metrics, write_summary
+from run import Training, num_epochs, open_run, save_config, write_summary
 from sac import train_sac
 from tensordict import TensorDictBase
+from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import Collector
 from torchrl.objectives import SoftUpdate
 
@@ -60,6 +62,7 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
     optimiser = torch.optim.Adam([*loss.parameters(), *ratio_loss.parameters()], lr=cfg.lr)
+    schedule = LinearLR(optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     targets = SoftUpdate(loss, tau=cfg.tau)
 
     # Data. Both streams show observations and rewards in the same way.
@@ -69,13 +72,21 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
     rollouts = iter(collector)
 
     training = Training(
-        "H2O+", cfg, directory, actor=actor, loss=loss, ratio_loss=ratio_loss, optimiser=optimiser, replay=replay
+        "H2O+",
+        cfg,
+        directory,
+        actor=actor,
+        loss=loss,
+        ratio_loss=ratio_loss,
+        optimiser=optimiser,
+        schedule=schedule,
+        replay=replay,
     )
     for epoch, evaluating in training.epochs(simulator):
         simulated = next(rollouts)
         simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
         replay.extend(simulated)
-        for _ in range(cfg.updates_per_epoch):
+        for _ in training.epoch_updates():
             batch = replay.sample()
             ratio_losses = ratio_loss(replay.sample(cfg.discriminator_batch_size))
             if cfg.ratio:
@@ -86,7 +97,7 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
             total.backward()
             optimiser.step()
             targets.step()
-            training.updated()
+        schedule.step()
         if evaluating:
             evaluation = evaluate(reality, actor, cfg.eval_episodes)
             sim = ~batch["real"]
@@ -94,7 +105,7 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
                 epoch,
                 return_real=evaluation.mean,
                 return_real_std=evaluation.std,
-                length_real=sum(evaluation.lengths) / len(evaluation.lengths),
+                length_real=evaluation.mean_length,
                 ratio_of_sim=float(estimator(batch)["dynamics_ratio"][sim].mean()),
                 accuracy_sa=float(ratio_losses["accuracy_sa"]),
                 accuracy=float(ratio_losses["accuracy"]),
@@ -108,38 +119,46 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
     """The backbone: swapping it is one argument."""
     value_network = make_value(observation_dim, cfg.num_cells)
-    backbones = {
-        "expectile": lambda: ExpectileValueLoss(value_network, cfg.expectile),
-        "sparse": lambda: SparseValueLoss(value_network, cfg.value_alpha),
-        "exponential": lambda: ExponentialValueLoss(value_network, cfg.value_alpha),
-    }
-    if cfg.backbone not in backbones:
-        raise ValueError(f"backbone={cfg.backbone}: choose one of {', '.join(backbones)}")
-    return backbones[cfg.backbone]()
+    if cfg.backbone == "expectile":
+        return ExpectileValueLoss(value_network, cfg.expectile)
+    if cfg.backbone == "sparse":
+        return SparseValueLoss(value_network, cfg.value_alpha)
+    if cfg.backbone == "exponential":
+        return ExponentialValueLoss(value_network, cfg.value_alpha)
+    raise ValueError(f"backbone={cfg.backbone}: choose expectile, sparse or exponential")
 
 
 @hydra.main(config_path="config", config_name="h2o_plus", version_base=None)
 def main(cfg: DictConfig) -> None:
+    cfg, directory = open_run(cfg)
+    try:
+        run(cfg, directory)
+    except KeyboardInterrupt:
+        sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}")
+
+
+def run(cfg: DictConfig, directory: Path) -> None:
+    """Trains, evaluates in reality, and leaves summary.json, metrics.csv, learning_curve.png and a film."""
     start = time.perf_counter()
-    cfg, directory = open_run(cfg, HydraConfig.get().run.dir)
+    make_value_loss(cfg, observation_dim=1)  # a backbone that there is not: said before the data are read
     real = read_real_data(cfg)
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)
+    wall_s = time.perf_counter() - start
+
     policies, trainings = {}, {}
     policies["H2O+"], trainings["H2O+"] = train_h2o_plus(cfg, real, directory)
     if cfg.baseline:
         policies["SAC in the simulator"], trainings["SAC in the simulator"] = train_sac(cfg, real, directory)
-    write_metrics(directory, [row for training in trainings.values() for row in training.rows])
+    wall_s += sum(training.progress["seconds"] for training in trainings.values())
 
     # What the policies do in reality, and in the simulator that they were trained in.
+    start = time.perf_counter()
     reality, simulator = make_reality(cfg), make_simulator(cfg)
     in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
-    in_simulator = {name: evaluate(simulator, policy, 1) for name, policy in policies.items()}
-    behaviour = episode_returns(real)
-    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, cfg)
-    film = try_to_film(cfg, policies["H2O+"], directory) if cfg.render else None
-
-    h2o_plus = trainings["H2O+"]
+    in_simulator = evaluate(simulator, policies["H2O+"], 1)
+    behaviour = behaviour_in(cfg, real)
+    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour.mean, cfg)
     write_summary(
         directory,
         {
@@ -151,16 +170,17 @@ def main(cfg: DictConfig) -> None:
             "mixing": cfg.mixing,
             "ratio": cfg.ratio,
             "seed": cfg.seed,
-            "updates": h2o_plus.updates,
+            "updates": trainings["H2O+"].updates,
             "return_real": in_reality["H2O+"].summary(),
-            "return_sim": in_simulator["H2O+"].summary(),
-            "return_data": {"mean": sum(behaviour) / len(behaviour), "episodes": len(behaviour)},
+            "return_sim": in_simulator.summary(),
+            "return_data": behaviour.summary(),
             "baselines": {name: in_reality[name].summary() for name in policies if name != "H2O+"},
-            "updates_per_second": h2o_plus.updates / h2o_plus.progress["seconds"],
-            "wall_s": time.perf_counter() - start,
+            "updates_per_second": trainings["H2O+"].updates_per_second,
+            "wall_s": wall_s + time.perf_counter() - start,
         },
     )
-    print_table(cfg, in_reality, real, behaviour, directory, film)
+    film = try_to_film(cfg, policies["H2O+"], directory) if cfg.render else None
+    print_table(cfg, in_reality | {"the data's behaviour": behaviour}, directory, film)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from run import Training
 COLOURS = {"H2O+": "#0b6e4f", "SAC in the simulator": "#c8553d"}
 
 
-def draw_learning_curve(path: Path, trainings: dict[str, Training], behaviour: list[float], cfg: DictConfig) -> None:
+def draw_learning_curve(path: Path, trainings: dict[str, Training], behaviour: float, cfg: DictConfig) -> None:
     """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(3, 2))
     for name, training in trainings.items():
@@ -28,7 +28,11 @@ def draw_learning_curve(path: Path, trainings: dict[str, Training], behaviour: l
             alpha=0.2,
             lw=0,
         )
-    left.axhline(sum(behaviour) / len(behaviour), color="0.4", ls="--", lw=1, label="the data's behaviour")
+    top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour])
+    if left.get_ylim()[0] < -abs(top):  # a robot that runs away loses without bound and would flatten all else
+        left.set_ylim(-0.25 * abs(top), 1.1 * top)
+        left.text(0.01, 0.01, "returns below are cut off", transform=left.transAxes, fontsize=8, color="0.4")
+    left.axhline(behaviour, color="0.4", ls="--", lw=1, label="the data's behaviour")
     gap = f", simulator with {cfg.gap}" if cfg.gap else ""
     left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
     left.legend(frameon=False)

@@ -1,17 +1,19 @@
 """The real transitions of a run: read from whatever ``data=`` names, or recorded once in ``env.reality`` and cached."""
 
+import contextlib
 import hashlib
 import json
 import os
 from pathlib import Path
 
 from environments import make_reality
+from evaluation import Evaluation
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 
 from torchrl_h2o import __version__
-from torchrl_h2o.data import check_specs, episodes, load, read_ted, write_ted
+from torchrl_h2o.data import DataError, check_specs, episodes, load, read_ted, write_ted
 from torchrl_h2o.envs import record
 
 RECORDED = "recorded"
@@ -28,7 +30,7 @@ def read_real_data(cfg: DictConfig) -> TensorDictBase:
         return _recorded(cfg)
     columns = cfg.columns or cfg.env.get("columns")
     reward = instantiate(cfg.env.reward) if "reward" in cfg.env else None
-    data = load(cfg.data, columns=columns, reward=reward)
+    data = load(cfg.data, columns=columns, reward=reward, task=cfg.env.name)
     check_specs(data, make_reality(cfg, raw=True), source=cfg.data)
     return data
 
@@ -39,12 +41,14 @@ def _recorded(cfg: DictConfig) -> TensorDictBase:
             f"data=recorded needs a controller to record, and {cfg.env.name} has none: name a data set, "
             "such as data=halfcheetah/medium-replay-v0"
         )
-    made_of = OmegaConf.to_container(OmegaConf.masked_copy(cfg.env, ["make", "reality", "behaviour", "recording"]))
+    env = OmegaConf.to_container(cfg.env, resolve=True)
+    made_of = [env[key] for key in ("make", "reality", "behaviour", "recording")]
     digest = hashlib.sha256(json.dumps([made_of, __version__], sort_keys=True).encode()).hexdigest()[:12]
     folder = _cache() / f"{cfg.env.name}_{digest}"
     if not folder.exists():
         data = record(make_reality(cfg, raw=True), instantiate(cfg.env.behaviour), **cfg.env.recording)
-        write_ted(data, folder)
+        with contextlib.suppress(DataError):  # another run, started at the same time, was faster
+            write_ted(data, folder)
     return read_ted(folder)
 
 
@@ -53,9 +57,10 @@ def _cache() -> Path:
     return Path(home) / "torchrl_h2o"
 
 
-def episode_returns(data: TensorDictBase) -> list[float]:
-    """Undiscounted returns of the data's episodes; one that the end of the recording cut counts only if alone."""
+def behaviour_in(cfg: DictConfig, data: TensorDictBase) -> Evaluation:
+    """Returns and lengths of the data's episodes; the one that our own recording cut off counts only if alone."""
     whole = list(episodes(data))
-    if len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:
+    if cfg.data == RECORDED and len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:
         whole.pop()
-    return [float(episode["next", "reward"].sum()) for episode in whole]
+    returns = [float(episode["next", "reward"].sum()) for episode in whole]
+    return Evaluation(returns, [len(episode) for episode in whole])

@@ -1,6 +1,7 @@
 """Films of a policy at work, where MuJoCo can render: with a display, or without one through EGL or OSMesa."""
 
 import os
+import sys
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -9,10 +10,10 @@ FPS = 25
 
 
 def try_to_film(cfg: DictConfig, policy, directory: Path) -> Path | None:
-    """A film in the run's folder, or None where there is nothing to render with."""
+    """A film in the run's folder; where that fails, None and a line that says why: the run is done without it."""
     try:
         return film(cfg, policy, directory / "policy.mp4")
-    except RenderingUnavailableError as error:
+    except Exception as error:
         print(f"\nno film: {error}")
         return None
 
@@ -41,7 +42,7 @@ def film(cfg: DictConfig, policy, path: Path, *, simulator: bool = False, second
     import imageio.v3 as iio
 
     if path.suffix == ".mp4":
-        iio.imwrite(path, frames, fps=FPS, codec="libx264")
+        iio.imwrite(path, frames, fps=1 / (_every(cfg) * cfg.env.seconds_per_step), codec="libx264")
     else:
         path.mkdir(parents=True, exist_ok=True)
         for index, frame in enumerate(frames):
@@ -50,13 +51,13 @@ def film(cfg: DictConfig, policy, path: Path, *, simulator: bool = False, second
 
 
 def _frames(cfg: DictConfig, policy, simulator: bool, seconds: float) -> list:
-    if "DISPLAY" not in os.environ:
+    if sys.platform == "linux" and "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")
     from environments import make_reality, make_simulator
     from evaluation import run_episode
 
     env = (make_simulator if simulator else make_reality)(cfg, render_mode="rgb_array")
-    every = max(1, round(1 / (FPS * cfg.env.seconds_per_step)))
+    every = _every(cfg)
     frames, steps = [], iter(range(10**9))
 
     def watched(tensordict):
@@ -77,3 +78,8 @@ def _frames(cfg: DictConfig, policy, simulator: bool, seconds: float) -> list:
     finally:
         env.close()
     return frames
+
+
+def _every(cfg: DictConfig) -> int:
+    """Steps between two frames: about FPS frames a second of simulated time."""
+    return max(1, round(1 / (FPS * cfg.env.seconds_per_step)))

@@ -6,6 +6,7 @@ simulator episodes. So a run that goes on from a checkpoint draws what an unbrok
 
 import csv
 import json
+import os
 import shlex
 import sys
 import time
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs import EnvBase
@@ -23,18 +25,32 @@ from tqdm import tqdm
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 
 
-def open_run(cfg: DictConfig, directory: str | Path) -> tuple[DictConfig, Path]:
+def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
     """The configuration and folder of a new run, or of the one that ``resume`` names, whose own configuration counts.
 
     Raises:
+        ValueError: for other overrides beside ``resume``, or settings that contradict each other.
         FileNotFoundError: if ``resume`` names a folder that is not a run's.
+        FileExistsError: if a new run is to go where a run is already.
     """
-    directory = Path(directory)
-    if cfg.resume is not None:
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    if not OmegaConf.is_missing(cfg, "resume"):
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        if others:
+            raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
         cfg = load_config(directory)
-    directory.mkdir(parents=True, exist_ok=True)
+    elif (directory / "config.yaml").exists():
+        raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
+    if cfg.updates < 1:
+        raise ValueError(f"updates={cfg.updates}: train for at least one")
+    if cfg.gap is None and cfg.gap_strength is not None:
+        raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
+    for key in ("data", "columns"):  # a resumed run may start elsewhere
+        if cfg[key] is not None and Path(cfg[key]).exists():
+            cfg[key] = str(Path(cfg[key]).resolve())
     save_config(cfg, directory)
     torch.set_num_threads(cfg.threads)
+    tqdm.write(f"run folder: {os.path.relpath(directory)}")
     return cfg, directory
 
 
@@ -65,22 +81,24 @@ class Training:
     """
 
     def __init__(self, name: str, cfg: DictConfig, directory: Path, **components) -> None:
-        self.name, self.cfg = name, cfg
-        self.progress = {"epoch": 0, "seconds": 0.0, "rows": []}
-        self.checkpoint = Checkpoint(**components)
-        self.rotation = CheckpointRotation(checkpoint_folder(directory, name), keep_last=1)
+        self.name, self.cfg, self.directory = name, cfg, directory
+        self.progress = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
+        self.checkpoint = Checkpoint(format="archive", **components)  # a ZIP: a damaged one is an error, not zeros
+        directory.mkdir(parents=True, exist_ok=True)
+        folder = checkpoint_folder(directory, name)
+        self.rotation = CheckpointRotation(folder, keep_last=1)
         if (latest := self.rotation.latest()) is not None:
             self.checkpoint.load(latest)
             self.progress = Checkpoint.manifest(latest)["metadata"]["progress"]
-
-    @property
-    def num_epochs(self) -> int:
-        return -(-self.cfg.updates // self.cfg.updates_per_epoch)
+        elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
+            raise RuntimeError(
+                f"{folder} holds no checkpoint that can be read: remove it to train {name} from the start"
+            )
 
     @property
     def updates(self) -> int:
-        """How many updates the epochs come to: the budget, rounded up to whole epochs."""
-        return self.num_epochs * self.cfg.updates_per_epoch
+        """How many updates the epochs come to."""
+        return num_epochs(self.cfg) * self.cfg.updates_per_epoch
 
     @property
     def rows(self) -> list[dict]:
@@ -88,15 +106,15 @@ class Training:
         return self.progress["rows"]
 
     def epochs(self, env: EnvBase) -> Iterator[tuple[int, bool]]:
-        """Yields each epoch's number and whether to evaluate at its end; seeds it, counts time, and checkpoints."""
+        """Yields each epoch's number and whether to evaluate at its end; seeds it before, and checkpoints after it."""
         done = self.progress["epoch"]
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * self.cfg.updates_per_epoch, unit=" updates")
-        for epoch in range(done, self.num_epochs):
+        for epoch in range(done, num_epochs(self.cfg)):
             start = time.perf_counter()
             seed = int(np.random.SeedSequence((self.cfg.seed, epoch)).generate_state(1)[0])
             torch.manual_seed(seed)
             env.set_seed(seed % 2**31)
-            last = epoch + 1 == self.num_epochs
+            last = epoch + 1 == num_epochs(self.cfg)
             yield epoch, last or (epoch + 1) % self.cfg.eval_every == 0
             self.progress["epoch"] = epoch + 1
             self.progress["seconds"] += time.perf_counter() - start
@@ -104,27 +122,46 @@ class Training:
                 self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
         self._bar.close()
 
-    def updated(self) -> None:
-        """One update is done."""
-        self._bar.update()
+    def epoch_updates(self) -> Iterator[int]:
+        """Counts the updates of an epoch, on the bar and in time."""
+        start = time.perf_counter()
+        for update in range(self.cfg.updates_per_epoch):
+            yield update
+            self._bar.update()
+        self.progress["update_seconds"] += time.perf_counter() - start
+
+    @property
+    def updates_per_second(self) -> float:
+        """Updates alone, without collection and evaluation."""
+        return self.progress["epoch"] * self.cfg.updates_per_epoch / self.progress["update_seconds"]
 
     def log(self, epoch: int, **metrics: float) -> None:
-        """Adds a row of metrics and shows the returns beside the bar."""
+        """Adds a row of metrics, writes metrics.csv, and shows the return in reality beside the bar."""
         row = {"method": self.name, "updates": (epoch + 1) * self.cfg.updates_per_epoch, **metrics}
         self.rows.append(row)
-        shown = {k: f"{v:.0f}" for k, v in metrics.items() if k in ("return_real", "return_sim")}
-        self._bar.set_postfix(shown)
+        write_metrics(self.directory, self.name, self.rows)
+        self._bar.set_postfix(return_real=f"{metrics['return_real']:.0f}")
+
+
+def num_epochs(cfg: DictConfig) -> int:
+    """The budget of updates, rounded up to whole epochs."""
+    return -(-cfg.updates // cfg.updates_per_epoch)
 
 
 def checkpoint_folder(directory: Path, name: str) -> Path:
     return Path(directory) / "checkpoints" / name.lower().replace(" ", "_")
 
 
-def write_metrics(directory: Path, rows: list[dict]) -> None:
-    """metrics.csv: a row an evaluation, a column a metric, of all methods of a run."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    with open(directory / "metrics.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
+def write_metrics(directory: Path, method: str, rows: list[dict]) -> None:
+    """metrics.csv: a row an evaluation, a column a metric; the rows of other methods stay."""
+    path = directory / "metrics.csv"
+    if path.exists():
+        with open(path, newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["method"] != method] + rows
+    first = ["method", "updates", "return_real", "return_real_std", "length_real"]
+    others = {key for row in rows for key in row} - set(first)
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, [*first, *sorted(others)])
         writer.writeheader()
         writer.writerows(rows)
 

@@ -3,16 +3,16 @@
 from pathlib import Path
 
 import torch
-from environments import learning_reward, make_reality, make_simulator
+from environments import as_observed, learning_reward, make_reality, make_simulator
 from evaluation import evaluate
 from omegaconf import DictConfig
-from run import Training
+from run import Training, num_epochs
 from tensordict import TensorDictBase
+from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS
+from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import make_actor, make_qvalue
 
 
@@ -27,34 +27,44 @@ def train_sac(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[t
     loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     optimiser = torch.optim.Adam(loss.parameters(), lr=cfg.lr)
+    schedule = LinearLR(optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     targets = SoftUpdate(loss, tau=cfg.tau)
 
-    capacity = int(cfg.sim_capacity * len(real))
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(capacity), batch_size=sum(cfg.batch_size))
+    # The buffer of H2O+, drawing simulated rows alone.
+    replay = HybridReplayBuffer(
+        as_observed(cfg, real), sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=(0, sum(cfg.batch_size))
+    )
     collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
     rollouts = iter(collector)
 
     training = Training(
-        "SAC in the simulator", cfg, directory, actor=actor, loss=loss, optimiser=optimiser, replay=replay
+        "SAC in the simulator",
+        cfg,
+        directory,
+        actor=actor,
+        loss=loss,
+        optimiser=optimiser,
+        schedule=schedule,
+        replay=replay,
     )
     for epoch, evaluating in training.epochs(simulator):
-        simulated = next(rollouts).select(*TRANSITION_KEYS)
+        simulated = next(rollouts)
         simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
         replay.extend(simulated)
-        for _ in range(cfg.updates_per_epoch):
+        for _ in training.epoch_updates():
             losses = loss(replay.sample())
             optimiser.zero_grad()
             sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
             optimiser.step()
             targets.step()
-            training.updated()
+        schedule.step()
         if evaluating:
             evaluation = evaluate(reality, actor, cfg.eval_episodes)
             training.log(
                 epoch,
                 return_real=evaluation.mean,
                 return_real_std=evaluation.std,
-                length_real=sum(evaluation.lengths) / len(evaluation.lengths),
+                length_real=evaluation.mean_length,
                 **{name: float(value) for name, value in losses.items()},
             )
     collector.shutdown()

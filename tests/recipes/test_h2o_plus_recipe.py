@@ -6,10 +6,17 @@ import os
 import signal
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
+import hydra
 import pytest
 import torch
+from environments import measure_observation_norm
+from h2o_plus import train_h2o_plus
+from real_data import read_real_data
+from run import Training
+from sac import train_sac
 from torchrl.checkpoint import CheckpointRotation
 
 ROOT = Path(__file__).parents[2]
@@ -51,14 +58,11 @@ def run(options):
     return done.stdout
 
 
-def latest_tensors(directory, method="h2o+"):
+def trained(directory, method="h2o+"):
+    """Every number of the last checkpoint, by the file that it stands in."""
     latest = CheckpointRotation(directory / "checkpoints" / method, keep_last=1).latest()
-    assert latest is not None
-    return {
-        str(path.relative_to(latest)): path.read_bytes()
-        for path in sorted(latest.rglob("*"))
-        if path.is_file() and path.suffix in (".memmap", ".pt", ".safetensors")
-    }
+    with zipfile.ZipFile(latest) as archive:
+        return {name: archive.read(name) for name in archive.namelist() if name.startswith("components")}
 
 
 def rows(directory):
@@ -103,34 +107,107 @@ def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, i
 
     broken = tmp_path / "broken"
     rotation = CheckpointRotation(broken / "checkpoints" / "h2o+", keep_last=1)
-    process = subprocess.Popen(**command(*small, "hydra.run.dir=broken"))
+    process = subprocess.Popen(**command(*small, "hydra.run.dir=broken"), text=True)
     while rotation.latest() is None:
         assert process.poll() is None, process.communicate()[0]
     process.send_signal(interruption)
-    process.communicate()
+    printed, _ = process.communicate()
     assert process.returncode != 0
     assert not (broken / "summary.json").exists()
+    if interruption == signal.SIGINT:
+        assert "resume=broken" in printed
 
     run(command("resume=broken"))
-    ours, theirs = latest_tensors(broken), latest_tensors(tmp_path / "unbroken")
-    assert ours.keys() == theirs.keys()
-    assert ours == theirs
+    assert trained(broken) == trained(tmp_path / "unbroken")
     assert rows(broken) == rows(tmp_path / "unbroken")
 
 
-def test_resume_of_something_else_says_so(command, tmp_path):
-    (tmp_path / "empty").mkdir()
-    done = subprocess.run(**command("resume=empty"), text=True, check=False)
+def test_every_job_of_a_multirun_has_a_folder_and_a_seed_of_its_own(command, tmp_path):
+    run(command("--multirun", *SMALL, *ROBOT, "baseline=false", "updates=20", "seed=0,1"))
+    summaries = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/multirun/*/*/summary.json")]
+    assert sorted(summary["seed"] for summary in summaries) == [0, 1]
+    assert summaries[0]["return_real"] != summaries[1]["return_real"]
+
+
+def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(command, tmp_path):
+    run(command(*SMALL, *ROBOT, "baseline=false", "updates=20"))
+    (summary,) = tmp_path.glob("outputs/wheel_legged/*/summary.json")
+    again = subprocess.run(**command(*SMALL, f"hydra.run.dir={summary.parent}"), text=True, check=False)
+    assert again.returncode != 0
+    assert "holds a run already" in again.stdout
+    other = subprocess.run(**command(f"resume={summary.parent}", "mixing=0.9"), text=True, check=False)
+    assert other.returncode != 0
+    assert "leave out mixing=0.9" in other.stdout
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["backbone=huber"], "choose expectile, sparse or exponential"),
+        (["gap_strength=2"], "belongs to a gap"),
+        (["env=halfcheetah", "data=recorded"], "name a data set"),
+        (["resume=nowhere"], "not the folder of a run"),
+    ],
+)
+def test_what_cannot_be_is_said_with_what_to_do(command, overrides, said):
+    done = subprocess.run(**command(*overrides), text=True, check=False)
     assert done.returncode != 0
-    assert "not the folder of a run" in done.stdout
+    assert said in done.stdout
 
 
-def test_backbone_mixing_and_ratio_are_overrides(command, tmp_path):
-    for backbone in ("sparse", "exponential"):
-        chosen = [f"backbone={backbone}", "mixing=0.5", "ratio=false", "baseline=false", "updates=20"]
-        run(command(*SMALL, *ROBOT, *chosen, "hydra.run.dir=" + backbone))
-        summary = json.loads((tmp_path / backbone / "summary.json").read_text())
-        assert (summary["backbone"], summary["mixing"], summary["ratio"]) == (backbone, 0.5, False)
+@pytest.fixture
+def compose(cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+    def build(*overrides):
+        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+            cfg = hydra.compose("h2o_plus", [*SMALL, *ROBOT, *overrides])
+        real = read_real_data(cfg)
+        measure_observation_norm(cfg, real)
+        return cfg, real
+
+    return build
+
+
+def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
+    chosen = [(), ("backbone=sparse",), ("backbone=exponential",), ("mixing=0.9",), ("ratio=false",), ("gamma=0.5",)]
+    losses = []
+    for number, overrides in enumerate(chosen):
+        cfg, real = compose("updates=20", *overrides)
+        _, training = train_h2o_plus(cfg, real, tmp_path / str(number))
+        losses.append((training.rows[-1]["loss_qvalue"], training.rows[-1]["loss_value"]))
+    assert len(set(losses)) == len(chosen)
+
+
+@pytest.mark.parametrize("train", [train_h2o_plus, train_sac])
+def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, train, monkeypatch):
+    cfg, real = compose("updates=60", "lr_end_factor=0.1")
+    train(cfg, real, tmp_path / "whole")
+    monkeypatch.setattr("run.Training.log", interrupt_at(epoch=1, log=Training.log))
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    train(cfg, real, tmp_path / "parts")
+    (method,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
+    assert trained(tmp_path / "parts", method) == trained(tmp_path / "whole", method)
+
+
+def interrupt_at(epoch, log):
+    def interrupted(self, current, **metrics):
+        if current == epoch:
+            raise KeyboardInterrupt
+        log(self, current, **metrics)
+
+    return interrupted
+
+
+def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
+    cfg, real = compose("updates=20")
+    train_sac(cfg, real, tmp_path)
+    (archive,) = (tmp_path / "checkpoints" / "sac_in_the_simulator").glob("checkpoint*")
+    archive.write_bytes(archive.read_bytes()[:-2000])
+    with pytest.raises(RuntimeError, match="no checkpoint that can be read"):
+        train_sac(cfg, real, tmp_path)
 
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured data are not there: {DATA}")
@@ -141,6 +218,14 @@ def test_the_real_robot_s_log_is_an_override(command, tmp_path):
     log = DATA / "wheel_legged" / "standing_still.txt"
     run(command(*SMALL, *ROBOT, f"data={log}", "baseline=false", "updates=20", "hydra.run.dir=out"))
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["transitions"] > 16_000
+
+
+@needs_data
+def test_data_of_another_task_are_refused(command):
+    data = DATA / "minari" / "halfcheetah" / "medium-v0"
+    done = subprocess.run(**command("env=walker2d", f"data={data}"), text=True, check=False)
+    assert done.returncode != 0
+    assert "recorded in HalfCheetah-v5, not in Walker2d-v5" in done.stdout
 
 
 @needs_data

@@ -30,6 +30,7 @@ def load(
     env: EnvBase | None = None,
     columns: LogColumns | str | Path | None = None,
     reward: Reward | None = None,
+    task: str | None = None,
 ) -> TensorDict:
     """Load transitions from a Minari dataset, a D4RL file, a robot log or a TED memory map.
 
@@ -39,6 +40,8 @@ def load(
         env: check dimensions, kinds and action bounds against this environment.
         columns: for a log, the layout of its columns; see :func:`read_robot_log`.
         reward: for a log, its reward function; see :func:`read_robot_log`.
+        task: a Gymnasium id such as ``"HalfCheetah-v5"``: refuse a Minari dataset of another task. Versions may
+            differ.
 
     Returns:
         TensorDict of batch size [T] in TED.
@@ -56,21 +59,21 @@ def load(
     """
     path = Path(source).expanduser()
     if path.is_dir():
-        td = _read_folder(path)
+        td = _read_folder(path, task)
     elif path.exists() or _looks_like_a_path(source):
         td = _read_file(path, columns, reward)
     else:
-        td = read_minari(str(source))
+        td = read_minari(str(source), task=task)
     if env is not None:
         check_specs(td, env, source=source)
     return td
 
 
-def _read_folder(path: Path) -> TensorDict:
+def _read_folder(path: Path, task: str | None) -> TensorDict:
     if (path / "meta.json").is_file():
         return read_ted(path)
     if (path / "metadata.json").is_file() or (path / "data" / "metadata.json").is_file():
-        return read_minari(path)
+        return read_minari(path, task=task)
     raise DataError(
         "the folder holds neither a Minari dataset (data/metadata.json) nor a memory-mapped TensorDict (meta.json)",
         "give the folder that does",

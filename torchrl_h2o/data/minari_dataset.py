@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # minari and gymnasium are imported where they are used: the 
 _FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
 
 
-def read_minari(source: str | Path) -> TensorDict:
+def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
     """Read a Minari dataset by its folder or by its name.
 
     A name such as ``"halfcheetah/medium-v0"`` is looked up in ``MINARI_DATASETS_PATH``, then
@@ -33,6 +33,7 @@ def read_minari(source: str | Path) -> TensorDict:
 
     Args:
         source: a dataset's folder (it holds ``data/``), or its name.
+        task: a Gymnasium id: refuse data of another task (of another version of it they may be).
 
     Returns:
         TensorDict of batch size [T] in TED.
@@ -52,6 +53,7 @@ def read_minari(source: str | Path) -> TensorDict:
         torch.Size([200, 1])
     """
     dataset = _open(source)
+    _require_task(dataset, task, source)
     parts = _read_episodes(dataset, source)
     lengths = [len(rewards) for rewards in parts["rewards"]]
     if sum(lengths) != dataset.total_steps or not lengths:
@@ -177,6 +179,13 @@ def _open(source: str | Path) -> MinariDataset:
             "MINARI_DATASETS_PATH or can be downloaded",
             source=source,
         ) from error
+
+
+def _require_task(dataset: MinariDataset, task: str | None, source: str | Path) -> None:
+    # Dimensions do not tell: HalfCheetah and Walker2d both have 17 and 6.
+    spec = dataset.spec.env_spec
+    if task is not None and spec is not None and spec.id.rpartition("-v")[0] != task.rpartition("-v")[0]:
+        raise DataError(f"it was recorded in {spec.id}, not in {task}", "choose data of the same task", source=source)
 
 
 def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list[np.ndarray]]:
