@@ -211,3 +211,11 @@ def test_folder_without_a_dataset_is_refused(tmp_path):
     (tmp_path / "data").mkdir()
     with pytest.raises(DataError, match="no Minari dataset"):
         read_minari(tmp_path)
+
+
+def test_data_of_another_task_are_refused_and_of_another_version_are_not(tmp_path):
+    env = GymEnv("Pendulum-v1")
+    folder = write_minari(env.rollout(5), "pendulum/random-v0", root=tmp_path, env_spec=gymnasium.spec("Pendulum-v1"))
+    assert len(load(folder, task="Pendulum-v0")) == 5
+    with pytest.raises(DataError, match=r"recorded in Pendulum-v1, not in HalfCheetah-v5"):
+        load(folder, task="HalfCheetah-v5")
