@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import NonTensorData, TensorDict
+from torchrl.envs import GymEnv
 
 from tests.data.recordings import assert_same, make_recording, recordings
 from torchrl_h2o.data import DataError, episodes, read_ted, write_ted
@@ -170,6 +171,63 @@ def test_reward_of_the_wrong_shape_is_refused():
     td["next", "reward"] = td["next", "reward"].squeeze(-1)
     with pytest.raises(DataError, match=r"'next.reward'.*\[8\], expected \[8, 1\]"):
         require_ted(td)
+
+
+@pytest.fixture
+def float64_folder(tmp_path):
+    """What a MuJoCo simulator records: float64."""
+    recorded = GymEnv("InvertedPendulum-v5").rollout(5)
+    assert recorded["observation"].dtype == torch.float64
+    return write_ted(recorded, tmp_path / "float64")
+
+
+def test_float64_recording_is_read_as_float32(float64_folder):
+    td = read_ted(float64_folder)
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
+        assert td[key].dtype == torch.float32
+    mapped = TensorDict.load_memmap(float64_folder)
+    assert torch.equal(td["observation"], mapped["observation"].float())
+
+
+def test_float64_recording_is_not_mapped(float64_folder):
+    with pytest.raises(DataError, match=r"'observation'.*float64.*in_memory=True"):
+        read_ted(float64_folder, in_memory=False)
+
+
+def test_integer_actions_stay_integers_and_integer_observations_are_refused(tmp_path):
+    td = make_recording()
+    td["action"] = td["action"].long()
+    assert read_ted(write_ted(td, tmp_path / "discrete"))["action"].dtype == torch.int64
+    td["observation"] = td["observation"].long()
+    with pytest.raises(DataError, match=r"'observation'.*int64.*real numbers"):
+        write_ted(td, tmp_path / "integers")
+
+
+@pytest.mark.parametrize("key", ["truncated", ("next", "done"), ("next", "terminated")], ids=str)
+def test_flags_other_than_bool_are_refused(key):
+    td = make_recording()
+    td[key] = td[key].float()
+    with pytest.raises(DataError, match=r"float32, expected torch.bool"):
+        require_ted(td)
+
+
+@pytest.mark.parametrize("flag", ["terminated", "truncated"])
+def test_end_without_done_is_named_by_its_row(flag):
+    td = make_recording()
+    td["next", flag][5] = True
+    with pytest.raises(DataError, match=f"{flag} holds and done does not") as caught:
+        require_ted(td)
+    assert (caught.value.column, caught.value.row) == ("next.done", 6)
+
+
+@pytest.mark.parametrize("key", ["observation", "action"])
+@pytest.mark.parametrize("shape", [(8,), (8, 2, 1)], ids=str)
+def test_entry_that_is_no_vector_a_step_is_refused(key, shape):
+    td = make_recording()
+    td[key] = torch.zeros(shape)
+    with pytest.raises(DataError, match=r"expected \[8, n\]") as caught:
+        require_ted(td)
+    assert caught.value.column == key
 
 
 def test_killed_writer_is_no_obstacle(tmp_path):

@@ -24,6 +24,7 @@ _REQUIRED_KEYS = (
     ("next", "terminated"),
 )
 _FLAGS = ("done", "terminated", "truncated")
+_FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
 
 
 def to_ted(
@@ -124,6 +125,16 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
             "reshape(-1) complete episodes that end in done, or record something",
             source=source,
         )
+    _require_shapes(td, keys, source)
+    _require_flags(td, source)
+    for key in sorted(keys, key=str):
+        if td.get(key).is_floating_point():
+            values = td.get(key).reshape(len(td), -1).numpy()
+            names = [f"{_name(key)}[{i}]" for i in range(values.shape[1])]
+            require_finite(values, names, source=source)
+
+
+def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
     for key in [("next", "reward"), *_FLAGS, *(("next", flag) for flag in _FLAGS)]:
         if key in keys and td.get(key).shape != (len(td), 1):
             raise DataError(
@@ -132,6 +143,14 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
                 source=source,
                 column=_name(key),
             )
+    for key in ("observation", "action"):
+        if td.get(key).ndim != 2:
+            raise DataError(
+                f"the shape is {list(td.get(key).shape)}, expected [{len(td)}, n]",
+                "flatten what belongs to one step into one vector, of length 1 at least",
+                source=source,
+                column=key,
+            )
     if td["observation"].shape != td["next", "observation"].shape:
         raise DataError(
             f"shape {list(td['next', 'observation'].shape)}, observation has {list(td['observation'].shape)}",
@@ -139,11 +158,41 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
             source=source,
             column="next.observation",
         )
-    for key in sorted(keys, key=str):
-        if td.get(key).is_floating_point():
-            values = td.get(key).reshape(len(td), -1).numpy()
-            names = [f"{_name(key)}[{i}]" for i in range(values.shape[1])]
-            require_finite(values, names, source=source)
+    for key in ("observation", ("next", "observation")):
+        if not td.get(key).is_floating_point():
+            raise DataError(
+                f"the dtype is {td.get(key).dtype}",
+                "observations must be real numbers: turn them with .float(), or encode them one-hot",
+                source=source,
+                column=_name(key),
+            )
+
+
+def _require_flags(td: TensorDictBase, source: str | Path) -> None:
+    for prefix in ((), ("next",)):
+        inner = td.get("next") if prefix else td
+        flags = {name: inner.get(name) for name in _FLAGS if name in inner.keys()}
+        for name, values in flags.items():
+            if values.dtype != torch.bool:
+                raise DataError(
+                    f"the dtype is {values.dtype}, expected torch.bool",
+                    "turn the flags with .bool()",
+                    source=source,
+                    column=_name((*prefix, name)),
+                )
+        done = flags.get("done")
+        for name in ("terminated", "truncated"):
+            if done is None or name not in flags:
+                continue
+            loose = (flags[name] & ~done).flatten().nonzero().flatten()
+            if len(loose):
+                raise DataError(
+                    f"{name} holds and done does not",
+                    "done must hold wherever terminated or truncated does: set done = terminated | truncated",
+                    source=source,
+                    column=_name((*prefix, "done")),
+                    row=int(loose[0]) + 1,
+                )
 
 
 def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
@@ -188,23 +237,43 @@ def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
 
     Args:
         folder: the folder that holds ``meta.json``.
-        in_memory: copy the data. Without it the tensors stay mapped to the files, for data larger
-            than the memory; writing to them then changes the files.
+        in_memory: copy the data, and turn observation, action and reward to float32 (our own
+            simulators record float64). Without it the tensors stay mapped to the files, for data
+            larger than the memory, and must be float32 there; writing to them changes the files.
 
     Returns:
         TensorDict of batch size [T], with every entry that was written. A last episode without an
         end is marked truncated.
 
     Raises:
-        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity.
+        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity, another
+            dtype than float32 that is to stay mapped.
     """
     td = load_memory_map(folder)
     require_ted(td, source=folder)
-    td = td.clone(recurse=in_memory)
+    td = _as_float32(td.clone(recurse=in_memory), in_memory, folder)
     ends = td["next", "done"].clone()
     ends[-1] = True
     td["next", "done"] = ends
     td["next", "truncated"] = ends & ~td["next", "terminated"]
+    return td
+
+
+def _as_float32(td: TensorDict, in_memory: bool, folder: str | Path) -> TensorDict:
+    for key in _FLOATS:
+        values = td.get(key, None)
+        # actions may be integers: those of a discrete task
+        discrete = key == "action" and not values.is_floating_point()
+        if values is None or values.dtype == torch.float32 or discrete:
+            continue
+        if not in_memory:
+            raise DataError(
+                f"the dtype is {values.dtype}, and mapped data are taken as they are: torch.float32",
+                "read with in_memory=True, or write the data again as float32",
+                source=folder,
+                column=_name(key),
+            )
+        td[key] = values.float()
     return td
 
 
