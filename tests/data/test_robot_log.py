@@ -171,8 +171,19 @@ def test_time_that_hardly_moves_is_irregular_too(tmp_path):
 def test_stated_dt_is_held_against_the_time_column(tmp_path):
     path = timed(tmp_path, [(0, 1, 0), (10, 2, 0), (20, 3, 0)])
     assert len(read_robot_log(path, changed(TIMED, dt=0.01))) == 2
-    with pytest.raises(DataError, match=r"dt is 0.005 s"):
-        read_robot_log(path, changed(TIMED, dt=0.005))
+    assert len(read_robot_log(path, changed(TIMED, dt=0.0101))) == 2
+    for wrong in (0.005, 0.0097, 0.0103, 1e3):
+        with pytest.raises(DataError, match=f"median time step is 0.01 s, dt is {wrong:g} s") as caught:
+            read_robot_log(path, changed(TIMED, dt=wrong))
+        assert caught.value.column == "t"
+    coarse = timed(tmp_path, [(10 * i // 3, i, 0) for i in range(31)])  # 300 Hz by a clock of 1 ms
+    assert len(read_robot_log(coarse, changed(TIMED, dt=1 / 300))) == 30
+
+
+def test_times_are_told_exactly_where_a_run_is_long(tmp_path):
+    path = timed(tmp_path, [(1234567.89, 1, 0), (1234577.89, 1, 0), (1234577.88, 1, 0)])
+    with pytest.raises(DataError, match=r"from 1234.57789 s to 1234.57788 s"):
+        read_robot_log(path, TIMED)
 
 
 def test_trailing_zero_rows_are_dropped_only_when_asked(tmp_path, log_messages):
