@@ -111,14 +111,15 @@ def cart() -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 def test_a_joint_force_acts_on_its_joint_alone():
-    np.testing.assert_array_equal(JointForce(3.0, "hinge").generalised_force(*cart()), [0.0, 3.0])
+    model, data = cart()
+    np.testing.assert_array_equal(JointForce(3.0, "hinge").process(model, rng())(data), [0.0, 3.0])
 
 
 def test_drag_takes_the_power_that_its_coefficient_says():
     model, data = cart()
     velocity = np.zeros(6)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 2, velocity, 0)
-    force = LinearDrag(0.7, bodies="pole").generalised_force(model, data)
+    force = LinearDrag(0.7, bodies="pole").process(model, rng())(data)
     # mjOBJ_BODY: the velocity at the body's centre of mass
     assert force @ data.qvel == pytest.approx(-0.7 * velocity[3:] @ velocity[3:])
 
@@ -126,4 +127,4 @@ def test_drag_takes_the_power_that_its_coefficient_says():
 @pytest.mark.parametrize("effect", [JointForce(1.0, "knee"), LinearDrag(1.0, "knee")])
 def test_a_force_on_what_is_not_there_is_refused(effect):
     with pytest.raises(ValueError, match="named 'knee'; it has"):
-        effect.generalised_force(*cart())
+        effect.process(cart()[0], rng())

@@ -125,6 +125,17 @@ def test_a_gap_and_its_clone_on_one_env_are_refused():
     assert mujoco_model(TransformedEnv(GymEnv(CHEETAH), gap.clone())).opt.gravity[2] == -19.62
 
 
+def test_another_gap_on_an_env_that_had_one_is_refused():
+    base = GymEnv(CHEETAH)
+    env = TransformedEnv(base, DynamicsGap(Gravity(2.0)))
+    complaint = r"not among the transforms of this env \(gravity × 2\).*make a new env"
+    with pytest.raises(ValueError, match=complaint):
+        TransformedEnv(base, DynamicsGap(Gravity(3.0)))
+    with pytest.raises(ValueError, match=complaint):
+        env.transform = DynamicsGap(Gravity(3.0))
+    assert mujoco_model(base).opt.gravity[2] == -19.62
+
+
 def test_a_gap_is_picklable_before_it_is_put_on():
     gap = pickle.loads(pickle.dumps(DynamicsGap(Gravity(2.0), ActionDelay(0.05))))
     env = TransformedEnv(GymEnv(CHEETAH), gap)

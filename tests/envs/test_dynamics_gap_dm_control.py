@@ -8,6 +8,7 @@ from torchrl.envs import DMControlEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.effects.models import as_bytes
+from tests.envs.own_effects import ControlForce
 from torchrl_h2o.effects import (
     PAPER_GAPS,
     ActionDelay,
@@ -72,8 +73,8 @@ def test_task_and_named_views_see_the_changed_simulation():
 
 
 def test_forces_act_anew_at_every_physics_step():
-    drag = LinearDrag(50.0, "torso")
-    env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(drag))
+    effect = LinearDrag(50.0, "torso")
+    env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(effect))
     env.set_seed(0)
     reset = env.reset()
     physics, model = env.base_env._env.physics, mujoco_model(env)
@@ -82,13 +83,28 @@ def test_forces_act_anew_at_every_physics_step():
     for field in ("qpos", "qvel", "qacc_warmstart"):
         getattr(data, field)[:] = getattr(physics.data, field)
     physics.forward()
+    drag = effect.process(model, np.random.default_rng(0))
     for _ in range(10):
         current.qpos[:], current.qvel[:] = data.qpos, data.qvel
         mujoco.mj_forward(model, current)
-        data.qfrc_applied[:] = drag.generalised_force(model, current)
+        data.qfrc_applied[:] = drag(current)
         mujoco.mj_step(model, data)
     env.step(reset.set("action", torch.zeros(6, dtype=torch.float64)))
     np.testing.assert_allclose(physics.data.qvel, data.qvel, rtol=1e-6)
+
+
+def test_a_force_sees_the_control_of_its_own_step():
+    env = TransformedEnv(DMControlEnv("cheetah", "run"), DynamicsGap(ControlForce(1e3)))
+    env.set_seed(0)
+    action = torch.zeros(6, dtype=torch.float64)
+    action[0] = 1.0
+    env.step(env.reset().set("action", action))
+    # cheetah's control step is one physics step: a force that came a step late would not show
+    plain = DMControlEnv("cheetah", "run")
+    plain.set_seed(0)
+    plain.step(plain.reset().set("action", action))
+    speeds = [e._env.physics.data.qvel[0] for e in (env.base_env, plain)]
+    assert speeds[0] - speeds[1] > 0.1
 
 
 def test_the_observation_entries_are_counted_over_all_keys():

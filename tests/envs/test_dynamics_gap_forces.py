@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from torchrl.envs import Compose, GymWrapper, TransformedEnv
 
 from tests.effects.models import CART
+from tests.envs.own_effects import ControlForce, Gust
 from torchrl_h2o.effects import BodyMass, JointForce, LinearDrag
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
 
@@ -82,13 +83,40 @@ def test_a_force_sees_the_bodies_where_they_are(cart):
     state = env.step(reset.set("action", torch.zeros(1)))["next", "observation"]
     model = mujoco.MjModel.from_xml_string(CART_XML)
     data, current = mujoco.MjData(model), mujoco.MjData(model)
+    drag = effect.process(model, np.random.default_rng(0))
     data.qpos[0], data.qvel[:] = 0.25, (1.0, 20.0)
     for _ in range(5):
         current.qpos[:], current.qvel[:] = data.qpos, data.qvel
         mujoco.mj_forward(model, current)
-        data.qfrc_applied[:] = effect.generalised_force(model, current)
+        data.qfrc_applied[:] = drag(current)
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(state, [*data.qpos, *data.qvel], rtol=1e-12)
+
+
+def test_a_force_sees_the_control_of_its_own_step(cart):
+    env = TransformedEnv(cart, DynamicsGap(ControlForce(2.0)))
+    doubled = env.step(env.reset().set("action", torch.ones(1)))["next", "observation"]
+    expected = stepped_cart(lambda v: 1.0 + 2.0, 0.0)  # the motor's 1 N and the force
+    assert (doubled[0].item(), doubled[2].item()) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_force_is_made_anew_at_every_reset_and_lasts_for_the_episode(cart):
+    log = []
+    env = TransformedEnv(cart, DynamicsGap(Gust(1.0, seen=(log,))))
+    log.clear()  # of the rehearsal
+    torch.manual_seed(0)
+    env.rollout(2)
+    first = log.copy()
+    assert [calls for _, calls in first] == list(range(1, 11))
+    assert len({gust for gust, _ in first}) == 1
+    log.clear()
+    env.rollout(2)
+    assert log[0][1] == 1
+    assert log[0][0] != first[0][0]
+    log.clear()
+    torch.manual_seed(0)
+    env.rollout(2)
+    assert log == first
 
 
 def test_a_task_of_ones_own_keeps_its_start(cart):

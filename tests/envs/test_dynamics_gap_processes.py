@@ -2,8 +2,20 @@
 
 import pytest
 import torch
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import (
+    ActionDiscretizer,
+    CatTensors,
+    Compose,
+    FrameSkipTransform,
+    GymEnv,
+    MultiAction,
+    ObservationNorm,
+    RenameTransform,
+    StepCounter,
+    TransformedEnv,
+)
 
+from tests.envs.own_effects import ForgetfulNoise
 from tests.envs.rollouts import CHEETAH, gapped, rollout
 from torchrl_h2o.effects import (
     ActionDelay,
@@ -101,3 +113,57 @@ def test_the_first_and_the_next_observations_are_altered():
     offset[3] = 0.5
     for key in ("observation", ("next", "observation")):
         torch.testing.assert_close(biased[key], true[key] + offset)
+
+
+def test_a_transform_that_steps_the_env_itself_shares_the_episode():
+    base = Executed(CHEETAH)
+    env = TransformedEnv(base, Compose(DynamicsGap(ActionDelay(0.05)), MultiAction(stack_rewards=False)))
+    state = env.reset()
+    for start in (1.0, 4.0):
+        base.executed = []
+        commands = torch.arange(start, start + 3.0)
+        state = env.step(state.set("action", commands[:, None].expand(3, 6) / 10))["next"]
+        torch.testing.assert_close(torch.stack(base.executed)[:, 0], (commands - 1) / 10)
+
+
+# ------------------------------------------------------------------------------------ errors
+@pytest.mark.parametrize(
+    "before",
+    [
+        lambda: ActionDiscretizer(num_intervals=3),
+        lambda: ObservationNorm(0.0, 2.0, in_keys=["observation"]),
+        lambda: RenameTransform(["observation"], ["state"]),
+        lambda: CatTensors(["observation"], out_key="state"),
+        StepCounter,
+    ],
+)
+@pytest.mark.parametrize("effect", [ActionGain(2.0), ObservationBias(1.0)])
+def test_an_effect_on_the_way_behind_another_transform_is_refused(before, effect):
+    complaint = r"put it first: env\.insert_transform\(0, "
+    with pytest.raises(ValueError, match=complaint):
+        TransformedEnv(GymEnv(CHEETAH), Compose(before(), DynamicsGap(effect)))
+    env = TransformedEnv(GymEnv(CHEETAH), before())
+    with pytest.raises(ValueError, match=complaint):
+        TransformedEnv(env, DynamicsGap(effect), auto_unwrap=False)
+
+
+def test_a_gap_can_be_put_first_afterwards_but_nothing_before_it():
+    env = TransformedEnv(GymEnv(CHEETAH), StepCounter())
+    env.insert_transform(0, DynamicsGap(ObservationBias(0.5)))
+    assert (env.reset()["observation"] - rollout(GymEnv(CHEETAH))["observation"][0]).min() > 0.0
+    env.insert_transform(0, StepCounter(step_count_key="again"))
+    with pytest.raises(ValueError, match="stands after StepCounter"):
+        env.reset()
+
+
+def test_an_effect_that_forgot_to_say_that_it_is_random_is_named():
+    for effects in ([ForgetfulNoise(0.5)], [ActionNoise(0.5), ForgetfulNoise(0.5)]):
+        with pytest.raises(ValueError, match=r"ForgetfulNoise\(std=0.5\) draws.*random: ClassVar\[bool\] = True"):
+            gapped(*effects)
+
+
+def test_frames_skipped_outside_the_gap_are_refused():
+    env = gapped(ActionDelay(0.05))
+    env.append_transform(FrameSkipTransform(2))
+    with pytest.raises(ValueError, match=r"FrameSkipTransform repeats actions.*frame_skip="):
+        env.reset()

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 Process = Callable[[np.ndarray], np.ndarray]
+Force = Callable[[mujoco.MjData], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -168,19 +169,25 @@ class ActionEffect(Effect):
 
 
 class ForceEffect(Effect):
-    """An effect that is a generalised force, a function of state, action and time."""
+    """An effect that is a generalised force, a function of state, action and time.
+
+    Forces act anew at every physics step. What steps many states at once must therefore step under
+    forces by one physics step at a time.
+    """
 
     @abstractmethod
-    def generalised_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """Returns the force on every degree of freedom, for one physics step.
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
+        """Returns the function that is the force of one episode.
 
         Args:
-            model: the model in use.
-            data: the state before the step (``qpos``, ``qvel``, ``ctrl``, ``time``), with the
-                bodies' positions and velocities up to date. Read only.
+            model: the model in use, in which names are found once, here.
+            rng: the episode's random generator, shared by its random effects.
 
         Returns:
-            Forces in N and torques in N·m, (nv,).
+            A function from the state before a physics step (``qpos``, ``qvel``, ``ctrl``, ``time``,
+            with the bodies' positions and velocities up to date; read only) to the forces in N and
+            torques in N·m on every degree of freedom, (nv,), which are not written to. What it must
+            remember, it keeps to itself: the effect stays frozen.
 
         Raises:
             ValueError: if the model has nothing that the effect could act on.

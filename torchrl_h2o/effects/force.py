@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import ForceEffect, parameter
+from torchrl_h2o.effects.effect import Force, ForceEffect, parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -31,10 +31,10 @@ class JointForce(ForceEffect):
     torque: float = parameter(unit="N·m", bounds=(-1000.0, 1000.0), neutral=0.0)
     joints: Names = "*"
 
-    def generalised_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
         force = np.zeros(model.nv)
         force[selection.joint_dofs(model, self.joints)] = self.torque
-        return force
+        return lambda data: force
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,15 @@ class LinearDrag(ForceEffect):
     coefficient: float = parameter(unit="N·s/m", bounds=(0.0, 1000.0), neutral=0.0)
     bodies: Names = "*"
 
-    def generalised_force(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        force = np.zeros(model.nv)
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
+        bodies = selection.body_ids(model, self.bodies)
         jacobian = np.zeros((3, model.nv))
-        for body in selection.body_ids(model, self.bodies):
-            mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
-            force -= self.coefficient * jacobian.T @ (jacobian @ data.qvel)
-        return force
+
+        def drag(data: mujoco.MjData) -> np.ndarray:
+            force = np.zeros(model.nv)
+            for body in bodies:
+                mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+                force -= self.coefficient * jacobian.T @ (jacobian @ data.qvel)
+            return force
+
+        return drag

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 import mujoco
 from torchrl.envs import DMControlWrapper, EnvBase
 
-from torchrl_h2o.effects import ForceEffect
 from torchrl_h2o.envs.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -56,9 +53,9 @@ class DMControlSimulator(Simulator):
         # through text. It renews the named views and the rendering contexts as well.
         self.owner._reload_from_model(MjModel(model))
 
-    def push(self, forces: Sequence[ForceEffect]) -> None:
-        self.owner.step = partial(self._step, tuple(forces))
+    def push(self) -> None:
+        self.owner.step = self._step
 
-    def _step(self, forces: tuple[ForceEffect, ...], nstep: int = 1) -> None:
+    def _step(self, nstep: int = 1) -> None:
         step = type(self.owner).step
-        self._pushed_steps(lambda: step(self.owner, 1), forces, nstep)
+        self._pushed_steps(lambda: step(self.owner, 1), nstep)

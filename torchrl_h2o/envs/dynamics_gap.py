@@ -1,27 +1,17 @@
 """DynamicsGap, the TorchRL transform that puts effects into a simulator."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform, TransformedEnv
 
 from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, paper_gap
+from torchrl_h2o.effects.effect import Process
+from torchrl_h2o.envs.episode import Episode
 from torchrl_h2o.envs.mujoco_model import find_simulator
-from torchrl_h2o.envs.simulator import Simulator
-
-Process = Callable[[np.ndarray], np.ndarray]
-
-
-class Episode(NamedTuple):
-    """The action and observation effects of one episode, with what they remember of it."""
-
-    actions: list[Process]
-    action_keys: list[NestedKey]
-    observations: list[Process]
-    observation_keys: list[NestedKey]
 
 
 class DynamicsGap(Transform):
@@ -39,8 +29,9 @@ class DynamicsGap(Transform):
     transforms of TorchRL.
 
     A gap is for one simulator and for its life: taking the transform off the env does not mend the
-    simulator. Put it directly on the env, before transforms that rename its keys, and within each
-    worker of a batched env. A copy of the env has its gaps again from its first reset on.
+    simulator, and another gap needs a new env. Put it directly on the env, before other transforms,
+    and within each worker of a batched env. A copy of the env has its gaps again from its first
+    reset on.
 
     All randomness of an episode is seeded at its reset from torch's global generator:
     ``torch.manual_seed`` repeats it. In ``ParallelEnv`` each worker has a generator of its own;
@@ -54,8 +45,9 @@ class DynamicsGap(Transform):
 
     Raises:
         TypeError: if one of them is not an effect.
-        ValueError: when put on an env that is batched, does not run on MuJoCo, or whose model has
-            nothing that one of the effects could act on.
+        ValueError: when put on an env that is batched, does not run on MuJoCo, had another gap, or
+            whose model has nothing that one of the effects could act on; or, with action or
+            observation effects, after transforms of other kinds.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -81,9 +73,8 @@ class DynamicsGap(Transform):
                 )
         self.effects = effects
         # TorchRL clones transforms freely, also onto the env that they are on already. Clones share
-        # this object, by which the simulator knows a gap that it has.
+        # this object, by which the simulator knows a gap that it has, and its present episode.
         self._identity = object()
-        self._episode: Episode | None = None
 
     def describe(self) -> str:
         """What the gap does, in words with units."""
@@ -97,73 +88,80 @@ class DynamicsGap(Transform):
         env = _env_of(self)
         if env is None:  # in a Compose that is not on an env yet
             return
+        self._check_place(env)
         simulator = find_simulator(env)
-        # Before the model is changed: does every index that an effect names exist?
-        rehearsal = self._new_episode(simulator, np.random.default_rng(0))
+        # Before the model is changed: does everything that an effect names exist?
+        rehearsal = Episode.begin(self.effects, simulator, np.random.default_rng(0))
         example = simulator.env.fake_tensordict()
         _alter(example, rehearsal.action_keys, rehearsal.actions)
         _alter(example, rehearsal.observation_keys, rehearsal.observations)
-        simulator.apply(self._identity, self.effects)
-
-    def clone(self) -> "DynamicsGap":
-        clone = super().clone()
-        clone._episode = None  # a delay line is not shared
-        return clone
-
-    def __getstate__(self) -> dict:
-        return {**super().__getstate__(), "_episode": None}  # its functions cannot be pickled
+        for force in rehearsal.forces:
+            force(mujoco.MjData(simulator.model))
+        simulator.apply(self._identity, self.effects, [gap._identity for gap in self._gaps_on(env)])
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # A copied or unpickled env may have built its simulator anew, without the gaps.
         env = _env_of(self)
-        gaps = _gaps_on(env)
-        if len({gap._identity for gap in gaps}) < len(gaps):
+        self._check_place(env)
+        gaps = self._gaps_on(env)
+        identities = [gap._identity for gap in gaps]
+        if len(set(identities)) < len(gaps):
             raise ValueError(
                 f"{self} and a clone of it are on one env, where they count as one gap; to have "
                 "its effects twice, make a second DynamicsGap"
             )
         simulator = find_simulator(env)
         for gap in gaps:
-            simulator.apply(gap._identity, gap.effects)
+            simulator.apply(gap._identity, gap.effects, identities)
         return super()._reset_env_preprocess(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        self._episode = None
+        find_simulator(_env_of(self)).episodes.pop(self._identity, None)
         return self._call(tensordict_reset)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        episode = self._current_episode()
+        episode = self._episode()
         return _alter(tensordict, episode.action_keys, episode.actions)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        episode = self._current_episode()
+        episode = self._episode()
         return _alter(next_tensordict, episode.observation_keys, episode.observations)
 
-    def _current_episode(self) -> Episode:
-        if self._episode is None:
-            env = _env_of(self)
-            if env is None:  # in a replay buffer there is no simulator to alter
-                return Episode([], [], [], [])
+    def _episode(self) -> Episode:
+        env = _env_of(self)
+        if env is None:  # in a replay buffer there is no simulator to alter
+            return Episode()
+        simulator = find_simulator(env)
+        episodes = simulator.episodes
+        if self._identity not in episodes:
             # Without random effects torch's generator is left alone: runs with and without the gap
             # then sample the same actions.
             rng = None
             if any(effect.random and not effect.is_neutral for effect in self.effects):
                 rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
-            self._episode = self._new_episode(find_simulator(env), rng)
-        return self._episode
+            episodes[self._identity] = Episode.begin(self.effects, simulator, rng)
+        return episodes[self._identity]
 
-    def _new_episode(self, simulator: Simulator, rng: np.random.Generator | None) -> Episode:
-        actions, observations = (
-            [
-                effect.process(simulator.control_step, rng)
-                for effect in self.effects
-                if isinstance(effect, kind) and not effect.is_neutral
-            ]
-            for kind in (ActionEffect, ObservationEffect)
-        )
-        observation_spec = simulator.env.observation_spec
-        observation_keys = [key for key, spec in observation_spec.items(True, True) if spec.dtype.is_floating_point]
-        return Episode(actions, simulator.env.action_keys, observations, observation_keys)
+    def _gaps_on(self, env: EnvBase) -> list["DynamicsGap"]:
+        return [transform for transform in _transforms_of(self, env) if isinstance(transform, DynamicsGap)]
+
+    def _check_place(self, env: EnvBase) -> None:
+        """Complains where another transform would stand between the simulator and what the effects alter."""
+        if not any(isinstance(effect, ActionEffect | ObservationEffect) for effect in self.effects):
+            return
+        transforms = _transforms_of(self, env)
+        if any(isinstance(transform, FrameSkipTransform) for transform in transforms):
+            raise ValueError(
+                f"FrameSkipTransform repeats actions as {self} has altered them, which would alter them "
+                "once more; let the env itself skip frames: GymEnv(..., frame_skip=...)"
+            )
+        for transform in transforms[: transforms.index(self)]:
+            if not isinstance(transform, DynamicsGap):
+                raise ValueError(
+                    f"{self} stands after {type(transform).__name__}, so that its actions and "
+                    "observations are not those of the simulator; put it first: "
+                    "env.insert_transform(0, DynamicsGap(...))"
+                )
 
 
 def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:
@@ -219,9 +217,17 @@ def _env_of(transform: Transform) -> EnvBase | None:
     return container
 
 
-def _gaps_on(env: EnvBase) -> list[DynamicsGap]:
-    """The gaps among an env's transforms, the innermost first."""
-    if not isinstance(env, TransformedEnv):
-        return []
-    outer = [module for module in env.transform.modules() if isinstance(module, DynamicsGap)]
-    return _gaps_on(env.base_env) + outer
+def _transforms_of(transform: Transform, env: EnvBase) -> list[Transform]:
+    """All transforms of the env that a transform is on or is just being put on, the innermost first."""
+    root = transform
+    while isinstance(container := root.__dict__["_container"](), Transform):
+        root = container
+    return [*_leaves(env.base_env), *_leaves(root)]
+
+
+def _leaves(node: EnvBase | Transform) -> list[Transform]:
+    if isinstance(node, TransformedEnv):
+        return [*_leaves(node.base_env), *_leaves(node.transform)]
+    if isinstance(node, Compose):
+        return [leaf for child in node for leaf in _leaves(child)]
+    return [node] if isinstance(node, Transform) else []

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from torchrl.envs import EnvBase, GymWrapper
 
-from torchrl_h2o.effects import ForceEffect, compile_model
+from torchrl_h2o.effects import compile_model
 from torchrl_h2o.envs.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -58,13 +56,14 @@ class GymnasiumSimulator(Simulator):
         renderer.viewer = None
         renderer.model, renderer.data = task.model, task.data
 
-    def push(self, forces: Sequence[ForceEffect]) -> None:
-        # a partial, because a copy of the task must step itself and not this one
-        self.owner._step_mujoco_simulation = partial(self._step, tuple(forces))
+    def push(self) -> None:
+        # a method and no lambda, because a copy of the task must step itself and not this one
+        self.owner._step_mujoco_simulation = self._step
 
-    def _step(self, forces: tuple[ForceEffect, ...], ctrl: np.ndarray, n_frames: int) -> None:
+    def _step(self, ctrl: np.ndarray, n_frames: int) -> None:
         step = type(self.owner)._step_mujoco_simulation
-        self._pushed_steps(lambda: step(self.owner, ctrl, 1), forces, n_frames)
+        self.data.ctrl[:] = ctrl  # forces are computed before the step that would write it
+        self._pushed_steps(lambda: step(self.owner, ctrl, 1), n_frames)
 
     def _check_source(self) -> None:
         super()._check_source()

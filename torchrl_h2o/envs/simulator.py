@@ -4,13 +4,15 @@ What :class:`~torchrl_h2o.envs.DynamicsGap` needs of a simulation, and nothing t
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import mujoco
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_h2o.effects import Effect, ForceEffect, compile_model
+from torchrl_h2o.effects.effect import Force
+from torchrl_h2o.envs.episode import Episodes
 
 _SIZES = ("nq", "nv", "nu", "na", "nbody", "njnt", "ngeom", "nsite", "nsensor")
 
@@ -18,8 +20,9 @@ _SIZES = ("nq", "nv", "nu", "na", "nbody", "njnt", "ngeom", "nsite", "nsensor")
 class Simulator(ABC):
     """The simulation inside one env: its model, and how to put another one in.
 
-    The gaps that are in a simulation are remembered on the object that owns the model. A copy that
-    is built anew, without the gaps' model, thus comes without the memory of them too.
+    The gaps that are in a simulation, and their episodes, are remembered on the object that owns the
+    model. A copy that is built anew, without the gaps' model, thus comes without the memory of them
+    too; and all clones that TorchRL makes of a gap on one env live in the same episode.
 
     Args:
         owner: the object that owns model and data, and lives as long as they do.
@@ -54,22 +57,35 @@ class Simulator(ABC):
         """Puts a model and fresh data in, where the simulation and its renderers will use them."""
 
     @abstractmethod
-    def push(self, forces: Sequence[ForceEffect]) -> None:
-        """Makes every physics step from now on apply these forces, and no others."""
+    def push(self) -> None:
+        """Makes every physics step from now on apply the forces of the present episodes."""
 
-    def apply(self, gap: object, effects: Sequence[Effect]) -> None:
+    @property
+    def episodes(self) -> Episodes:
+        """The present episode of every gap, under what stands for the gap."""
+        return self.owner.__dict__.setdefault("_dynamics_gap_episodes", Episodes())
+
+    def apply(self, gap: object, effects: Sequence[Effect], on_env: Collection[object]) -> None:
         """Puts a gap in, after those that are in already; does nothing if it is one of them.
 
         Args:
             gap: stands for the gap: the same object, the same gap.
             effects: what the gap consists of. Action and observation effects are passed over.
+            on_env: all gaps that the env has, this one included.
 
         Raises:
-            ValueError: if the model has nothing that an effect could act on. Nothing is changed.
+            ValueError: if the model has nothing that an effect could act on, or has a gap in it that
+                the env has not. Nothing is changed.
         """
         applied = getattr(self.owner, "_dynamics_gaps", {})
         if gap in applied:
             return
+        if not set(applied) <= set(on_env):
+            left = ", ".join(e.describe() for other in applied if other not in on_env for e in applied[other])
+            raise ValueError(
+                f"the simulator of {self.env} still has a gap in it that is not among the transforms "
+                f"of this env ({left}), and would have both: make a new env for the new gap"
+            )
         if not applied:
             self._check_source()
         applied = {**applied, gap: tuple(effects)}
@@ -78,12 +94,9 @@ class Simulator(ABC):
         self._check_sizes(model)
         model.vis.global_.offwidth = self.model.vis.global_.offwidth
         model.vis.global_.offheight = self.model.vis.global_.offheight
-        forces = [e for e in everything if isinstance(e, ForceEffect) and not e.is_neutral]
-        for force in forces:
-            force.generalised_force(model, mujoco.MjData(model))  # complains now, not when stepping
         self.load(model)
-        if forces:
-            self.push(forces)
+        if any(isinstance(effect, ForceEffect) and not effect.is_neutral for effect in everything):
+            self.push()
         self.owner._dynamics_gaps = applied
 
     def _check_source(self) -> None:
@@ -99,18 +112,23 @@ class Simulator(ABC):
                     "model must come from its file unchanged"
                 )
 
-    def _pushed_steps(self, step: Callable[[], None], forces: Sequence[ForceEffect], n_steps: int) -> None:
+    def _pushed_steps(self, step: Callable[[], None], n_steps: int) -> None:
         """Takes physics steps one by one, each under the forces of the state that it starts from."""
-        model, data = self.model, self.data
+        model, data, forces = self.model, self.data, self._forces()
         for _ in range(n_steps):
             # after a step, MuJoCo leaves the bodies where they were before it
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
             others = data.qfrc_applied.copy()
-            data.qfrc_applied += sum(force.generalised_force(model, data) for force in forces)
+            data.qfrc_applied += sum(force(data) for force in forces)
             step()
             data.qfrc_applied[:] = others
+
+    def _forces(self) -> list[Force]:
+        # in the order of the gaps, not of their resets, because a sum is rounded in its order
+        episodes = self.episodes
+        return [force for gap in self.owner._dynamics_gaps if gap in episodes for force in episodes[gap].forces]
 
 
 def base_env(env: EnvBase) -> EnvBase:
