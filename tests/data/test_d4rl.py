@@ -71,10 +71,53 @@ def test_observations_chain_inside_episodes_only(tmp_path_factory, drawn):
 
 
 def test_episode_cut_by_the_end_of_the_file_is_truncated(tmp_path):
-    td = read_d4rl(write(tmp_path / "a.hdf5", timeouts=np.zeros(8)))
+    one = make_arrays((8,), (False,))
+    one = {"observations": one["observation"], "next_observations": one["next_observation"]}
+    td = read_d4rl(write(tmp_path / "a.hdf5", timeouts=np.zeros(8), terminals=np.zeros(8), **one))
     assert td["next", "truncated"].flatten().tolist() == [False] * 7 + [True]
     td = read_d4rl(write(tmp_path / "b.hdf5", timeouts=np.zeros(8), next_observations=None))
     assert td["next", "truncated"].flatten().tolist() == [False, False, True, False, False, True]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(1, 4), min_size=1, max_size=5))
+def test_episodes_without_flags_are_not_linked(tmp_path_factory, lengths):
+    made = make_arrays(lengths, [False] * len(lengths))
+    path = write(
+        tmp_path_factory.mktemp("d4rl") / "a.hdf5",
+        observations=made["observation"],
+        next_observations=made["next_observation"],
+        actions=made["action"],
+        rewards=made["reward"],
+        terminals=np.zeros(sum(lengths)),
+        timeouts=np.zeros(sum(lengths)),
+    )
+    assert_same(read_d4rl(path), make_recording(lengths, [False] * len(lengths)))
+
+
+def test_jumps_without_a_flag_are_counted_in_the_log(tmp_path, log_messages):
+    read_d4rl(write(tmp_path / "a.hdf5", timeouts=np.zeros(8)))
+    assert "1 of 8 rows are marked truncated" in log_messages[-1]
+    log_messages.clear()
+    read_d4rl(write(tmp_path / "b.hdf5"))
+    assert not log_messages
+
+
+def test_rewards_and_flags_may_be_columns(tmp_path):
+    made = make_arrays(LENGTHS, ENDINGS)
+    columns = {"rewards": "reward", "terminals": "terminated", "timeouts": "truncated"}
+    path = write(tmp_path / "a.hdf5", **{name: made[key][:, None] for name, key in columns.items()})
+    assert_same(read_d4rl(path), make_recording(LENGTHS, ENDINGS))
+
+
+@pytest.mark.parametrize("name", ["terminals", "timeouts"])
+@pytest.mark.parametrize("bad", [2, -1, 0.5])
+def test_flag_other_than_zero_and_one_is_refused(tmp_path, name, bad):
+    flags = np.zeros(8)
+    flags[5] = bad
+    with pytest.raises(DataError, match=f"flag is {bad}") as caught:
+        read_d4rl(write(tmp_path / "a.hdf5", **{name: flags}))
+    assert (caught.value.column, caught.value.row) == (name, 6)
 
 
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminals", "timeouts"])

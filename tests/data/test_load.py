@@ -4,6 +4,7 @@ import io
 import pickle
 import zipfile
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -21,6 +22,33 @@ def test_each_source_finds_its_reader(tmp_path):
     (tmp_path / "log.txt").write_text("0 0 0 0 1 0\n" * 3)
     read = load(tmp_path / "log.txt", columns="wheel_legged_moving_forward")
     assert read["observation"].shape == (2, 3)
+
+
+def test_task_that_cannot_be_checked_is_warned_of(tmp_path, log_messages):
+    td = make_recording()
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        for name in ("observations", "actions"):
+            file[name] = np.zeros((4, 2))
+        for name in ("rewards", "terminals", "timeouts"):
+            file[name] = np.zeros(4)
+    sources = [tmp_path / "a.hdf5", write_ted(td, tmp_path / "ted"), write_minari(td, "test-v0", root=tmp_path)]
+    for source in sources:
+        log_messages.clear()
+        load(source)
+        assert not any("which task" in message for message in log_messages)
+        load(source, task="HalfCheetah-v5")
+        (warning,) = (message for message in log_messages if "which task" in message)
+        assert warning == f"{source} does not say which task it was recorded in: not checked to be HalfCheetah-v5"
+
+
+def test_columns_for_what_is_no_log_are_refused(tmp_path):
+    td = make_recording()
+    (tmp_path / "a.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    sources = [tmp_path / "a.hdf5", write_ted(td, tmp_path / "ted"), write_minari(td, "test-v0", root=tmp_path)]
+    for source in [*sources, "halfcheetah/medium-v0"]:
+        with pytest.raises(DataError, match="columns were given, and this is no log") as caught:
+            load(source, columns="simple_pendulum")
+        assert caught.value.source == str(source)
 
 
 def test_log_without_columns_says_what_is_missing(tmp_path):

@@ -18,21 +18,25 @@ _REQUIRED = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "tim
 def read_d4rl(path: str | Path) -> TensorDict:
     """Read a D4RL file.
 
-    With ``next_observations`` every row is a transition. Without it the next observation is the
-    row after; the last row of an episode then has none and is dropped (the row before it becomes
-    the truncated end), because the row after belongs to another episode. The number of dropped
-    rows is logged. A terminal row dropped so takes its reward with it: prefer files with
-    ``next_observations`` (D4RL's MuJoCo files from v1 on have it) for tasks that terminate.
+    With ``next_observations`` every row is a transition; a row that does not lead to the row after
+    it, though neither flag is set, is marked truncated, and the number of those is logged.
+
+    Without it the next observation is the row after; the last row of an episode then has none and
+    is dropped (the row before it becomes the truncated end), because the row after belongs to
+    another episode. The number of dropped rows is logged. A terminal row dropped so takes its
+    reward with it: prefer files with ``next_observations`` (D4RL's MuJoCo files from v1 on have
+    it) for tasks that terminate.
 
     Args:
-        path: an HDF5 file with observations, actions, rewards, terminals and timeouts.
+        path: an HDF5 file with observations, actions, rewards, terminals and timeouts; the last
+            three of shape (N,) or (N, 1).
 
     Returns:
         TensorDict of batch size [T] in TED.
 
     Raises:
         DataError: a file that is missing, empty, cut off or a pickle; a missing array, arrays of
-            different lengths, NaN or infinity. Rows are counted from 1.
+            different lengths, NaN or infinity, a flag other than 0 and 1. Rows are counted from 1.
 
     Example:
         >>> import h5py, numpy as np, tempfile
@@ -62,6 +66,8 @@ def read_d4rl(path: str | Path) -> TensorDict:
         columns = values.reshape(steps, -1)
         names = [name] if values.ndim == 1 else [f"{name}[{i}]" for i in range(columns.shape[1])]
         require_finite(columns, names, source=path)
+    for name in ("terminals", "timeouts"):
+        arrays[name] = _flags(arrays[name], name, path)
     if "next_observations" in arrays:
         rows, following = slice(None), arrays["next_observations"]
         if following.shape != arrays["observations"].shape:
@@ -71,7 +77,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
                 source=path,
                 column="next_observations",
             )
-        terminated, truncated = (arrays[name].astype(bool) for name in ("terminals", "timeouts"))
+        terminated, truncated = arrays["terminals"], _truncated_at_jumps(arrays, path)
     else:
         rows, following, terminated, truncated = _link_rows(arrays, path)
     return to_ted(
@@ -106,6 +112,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
             source=path,
         ) from error
     for name, values in arrays.items():
+        if _REQUIRED.get(name) == 1 and values.ndim == 2 and values.shape[1] == 1:
+            arrays[name] = values = values[:, 0]
         if values.ndim != _REQUIRED.get(name, 2) or values.dtype.kind not in "fiub":
             raise DataError(
                 f"it has {values.ndim} dimensions of {values.dtype}",
@@ -116,9 +124,37 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _flags(values: np.ndarray, name: str, path: Path) -> np.ndarray:
+    wrong = np.flatnonzero((values != 0) & (values != 1))
+    if len(wrong):
+        raise DataError(
+            f"the flag is {values[wrong[0]]}",
+            "it must be 0 or 1",
+            source=path,
+            column=name,
+            row=int(wrong[0]) + 1,
+        )
+    return values.astype(bool)
+
+
+def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
+    """The timeouts, and where the next row begins elsewhere: another episode, or rows were left out."""
+    led, found = (
+        arrays[name][rows].astype(np.float32)
+        for name, rows in (("next_observations", slice(-1)), ("observations", slice(1, None)))
+    )
+    jumps = np.append((led != found).any(1), False) & ~arrays["terminals"] & ~arrays["timeouts"]
+    if jumps.any():
+        torchrl_logger.warning(
+            f"{path}: {jumps.sum()} of {len(jumps)} rows are marked truncated, as the row after "
+            "them does not begin where they led to"
+        )
+    return arrays["timeouts"] | jumps
+
+
 def _link_rows(arrays: dict[str, np.ndarray], path: Path) -> tuple:
     """The rows whose next observation is known, that observation, and both flags."""
-    ends = arrays["terminals"].astype(bool) | arrays["timeouts"].astype(bool)
+    ends = arrays["terminals"] | arrays["timeouts"]
     ends[-1] = True
     rows = np.flatnonzero(~ends)
     if not len(rows):

@@ -14,7 +14,7 @@ from torchrl_h2o.data.file_kind import require_file
 from torchrl_h2o.data.log_columns import LogColumns
 from torchrl_h2o.data.minari_dataset import read_minari
 from torchrl_h2o.data.robot_log import Reward, read_robot_log
-from torchrl_h2o.data.specs import check_specs
+from torchrl_h2o.data.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.ted import read_ted
 
 if TYPE_CHECKING:
@@ -40,14 +40,15 @@ def load(
         env: check dimensions, kinds and action bounds against this environment.
         columns: for a log, the layout of its columns; see :func:`read_robot_log`.
         reward: for a log, its reward function; see :func:`read_robot_log`.
-        task: a Gymnasium id such as ``"HalfCheetah-v5"``: refuse a Minari dataset of another task. Versions may
-            differ.
+        task: a Gymnasium id such as ``"HalfCheetah-v5"``: refuse a Minari dataset of another task.
+            Versions may differ. Where the source does not name its task, a warning is logged.
 
     Returns:
         TensorDict of batch size [T] in TED.
 
     Raises:
-        DataError: naming file, column and row; nothing is half-loaded.
+        DataError: naming file, column and row; nothing is half-loaded. Also columns for what is
+            no log.
 
     Example:
         >>> import pathlib, tempfile
@@ -59,18 +60,30 @@ def load(
     """
     path = Path(source).expanduser()
     if path.is_dir():
+        _require_no_columns(columns, source)
         td = _read_folder(path, task)
     elif path.exists() or _looks_like_a_path(source):
-        td = _read_file(path, columns, reward)
+        td = _read_file(path, columns, reward, task)
     else:
+        _require_no_columns(columns, source)
         td = read_minari(str(source), task=task)
     if env is not None:
         check_specs(td, env, source=source)
     return td
 
 
+def _require_no_columns(columns: LogColumns | str | Path | None, source: str | Path) -> None:
+    if columns is not None:
+        raise DataError(
+            "columns were given, and this is no log: it names its own entries",
+            "leave columns out, or give the log",
+            source=source,
+        )
+
+
 def _read_folder(path: Path, task: str | None) -> TensorDict:
     if (path / "meta.json").is_file():
+        warn_of_unknown_task(task, path)
         return read_ted(path)
     if (path / "metadata.json").is_file() or (path / "data" / "metadata.json").is_file():
         return read_minari(path, task=task)
@@ -81,11 +94,18 @@ def _read_folder(path: Path, task: str | None) -> TensorDict:
     )
 
 
-def _read_file(path: Path, columns: LogColumns | str | Path | None, reward: Reward | None) -> TensorDict:
+def _read_file(
+    path: Path,
+    columns: LogColumns | str | Path | None,
+    reward: Reward | None,
+    task: str | None,
+) -> TensorDict:
     path = require_file(path)
     with path.open("rb") as file:
         is_hdf5 = file.read(len(_HDF5_START)) == _HDF5_START
     if is_hdf5 or path.suffix.lower() in _HDF5_SUFFIXES:
+        _require_no_columns(columns, path)
+        warn_of_unknown_task(task, path)
         return read_d4rl(path)
     if columns is None:
         raise DataError(

@@ -13,7 +13,7 @@ import numpy as np
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_h2o.data.error import DataError, require_finite
-from torchrl_h2o.data.specs import check_specs
+from torchrl_h2o.data.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.ted import episodes, require_ted, to_ted
 from torchrl_h2o.data.whole_folder import whole_folder
 
@@ -34,6 +34,7 @@ def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
     Args:
         source: a dataset's folder (it holds ``data/``), or its name.
         task: a Gymnasium id: refuse data of another task (of another version of it they may be).
+            Data that do not name theirs are taken with a warning in the log.
 
     Returns:
         TensorDict of batch size [T] in TED.
@@ -184,7 +185,9 @@ def _open(source: str | Path) -> MinariDataset:
 def _require_task(dataset: MinariDataset, task: str | None, source: str | Path) -> None:
     # Dimensions do not tell: HalfCheetah and Walker2d both have 17 and 6.
     spec = dataset.spec.env_spec
-    if task is not None and spec is not None and spec.id.rpartition("-v")[0] != task.rpartition("-v")[0]:
+    if spec is None:
+        warn_of_unknown_task(task, source)
+    elif task is not None and spec.id.rpartition("-v")[0] != task.rpartition("-v")[0]:
         raise DataError(f"it was recorded in {spec.id}, not in {task}", "choose data of the same task", source=source)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
+from torchrl import torchrl_logger
 
 from torchrl_h2o.data.error import DataError
 from torchrl_h2o.data.ted import require_ted
@@ -72,6 +73,17 @@ def check_specs(td: TensorDictBase, env: EnvBase, *, source: str | Path = "trans
                 column=key,
             )
     _require_bounds(td["action"], specs["action"]["action"], source)
+
+
+def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
+    """Log a warning that data which name no task could not be checked to be of the one asked for.
+
+    Args:
+        task: what was asked for; without one there is nothing to warn of.
+        source: what to call the data.
+    """
+    if task is not None:
+        torchrl_logger.warning(f"{source} does not say which task it was recorded in: not checked to be {task}")
 
 
 def _require_bounds(action: torch.Tensor, spec, source: str | Path) -> None:
