@@ -14,7 +14,7 @@ from torchrl.envs import GymEnv
 
 from tests.data.recordings import assert_same, make_recording, recordings
 from torchrl_h2o.data import DataError, episodes, read_ted, write_ted
-from torchrl_h2o.data.ted import require_ted
+from torchrl_h2o.data.ted import require_continuous, require_ted
 
 
 def test_entries_have_ted_names_shapes_and_dtypes():
@@ -228,6 +228,21 @@ def test_entry_that_is_no_vector_a_step_is_refused(key, shape):
     with pytest.raises(DataError, match=r"expected \[8, n\]") as caught:
         require_ted(td)
     assert caught.value.column == key
+
+
+@settings(max_examples=30, deadline=None)
+@given(recordings())
+def test_whole_episodes_are_continuous(td):
+    require_continuous(td)
+
+
+@pytest.mark.parametrize("row", [1, 3, 6])
+def test_row_that_begins_elsewhere_is_named(row):
+    td = make_recording()  # episodes begin in the rows 0, 4 and 5
+    td["observation"][row, 1] += 1e-3
+    with pytest.raises(DataError, match="not the next observation") as caught:
+        require_continuous(td, source="here")
+    assert (caught.value.source, caught.value.column, caught.value.row) == ("here", "observation", row + 1)
 
 
 def test_killed_writer_is_no_obstacle(tmp_path):

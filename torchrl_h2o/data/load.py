@@ -12,10 +12,10 @@ from torchrl_h2o.data.d4rl import read_d4rl
 from torchrl_h2o.data.error import DataError
 from torchrl_h2o.data.file_kind import require_file
 from torchrl_h2o.data.log_columns import LogColumns
+from torchrl_h2o.data.memory_map import read_ted
 from torchrl_h2o.data.minari_dataset import read_minari
 from torchrl_h2o.data.robot_log import Reward, read_robot_log
 from torchrl_h2o.data.specs import check_specs, warn_of_unknown_task
-from torchrl_h2o.data.ted import read_ted
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase

@@ -1,4 +1,4 @@
-"""Open a memory-mapped TensorDict only after its files have been looked at.
+"""Write a TED TensorDict as a memory map, and open one only after its files have been looked at.
 
 torch maps a file that is too short by growing it with zeros: the source would change, and nobody
 would be told. And tensordict keeps what is not a tensor in a pickle.
@@ -11,10 +11,78 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_h2o.data.error import DataError
 from torchrl_h2o.data.file_kind import is_pickle
+from torchrl_h2o.data.ted import entry_name, require_ted
+from torchrl_h2o.data.whole_folder import whole_folder
+
+_FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
+
+
+def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
+    """Write a flat TED TensorDict as a memory map: one file an entry, no pickle, all or nothing.
+
+    Args:
+        td: batch size [T]; tensors only.
+        folder: a folder that does not exist yet.
+
+    Returns:
+        the folder.
+
+    Raises:
+        DataError: the folder exists, or the TensorDict is not what :func:`read_ted` would take.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data import read_ted, write_ted
+        >>> recorded = GymEnv("Pendulum-v1").rollout(10)
+        >>> folder = write_ted(recorded, tempfile.mkdtemp() + "/pendulum")
+        >>> td = read_ted(folder)
+        >>> bool((td["observation"] == recorded["observation"]).all())
+        True
+    """
+    require_ted(td, source=folder)
+    for key in td.keys(True, True, is_leaf=lambda kind: not issubclass(kind, TensorDictBase)):
+        if not isinstance(td.get(key), torch.Tensor):
+            raise DataError(
+                "the entry is not a tensor and would be pickled",
+                "drop it with td.exclude(...)",
+                source=folder,
+                column=entry_name(key),
+            )
+    with whole_folder(folder) as partial:
+        td.detach().contiguous().memmap(partial)
+    return Path(folder)
+
+
+def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
+    """Read a flat TED TensorDict that :func:`write_ted` or ``TensorDict.memmap`` has written.
+
+    Args:
+        folder: the folder that holds ``meta.json``.
+        in_memory: copy the data, and turn observation, action and reward to float32 (our own
+            simulators record float64). Without it the tensors stay mapped to the files, for data
+            larger than the memory, and must be float32 there; writing to them changes the files.
+
+    Returns:
+        TensorDict of batch size [T], with every entry that was written. A last episode without an
+        end is marked truncated.
+
+    Raises:
+        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity, another
+            dtype than float32 that is to stay mapped.
+    """
+    td = load_memory_map(folder)
+    require_ted(td, source=folder)
+    td = _as_float32(td.clone(recurse=in_memory), in_memory, folder)
+    ends = td["next", "done"].clone()
+    ends[-1] = True
+    td["next", "done"] = ends
+    td["next", "truncated"] = ends & ~td["next", "terminated"]
+    return td
 
 
 def load_memory_map(folder: str | Path) -> TensorDict:
@@ -78,3 +146,21 @@ def _require_whole_files(folder: Path) -> None:
             )
     for key in inner:
         _require_whole_files(folder / key)
+
+
+def _as_float32(td: TensorDict, in_memory: bool, folder: str | Path) -> TensorDict:
+    for key in _FLOATS:
+        values = td.get(key, None)
+        # actions may be integers: those of a discrete task
+        discrete = key == "action" and not values.is_floating_point()
+        if values is None or values.dtype == torch.float32 or discrete:
+            continue
+        if not in_memory:
+            raise DataError(
+                f"the dtype is {values.dtype}, and mapped data are taken as they are: torch.float32",
+                "read with in_memory=True, or write the data again as float32",
+                source=folder,
+                column=entry_name(key),
+            )
+        td[key] = values.float()
+    return td

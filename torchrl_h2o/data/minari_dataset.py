@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from torchrl_h2o.data.error import DataError, require_finite
 from torchrl_h2o.data.specs import check_specs, warn_of_unknown_task
-from torchrl_h2o.data.ted import episodes, require_ted, to_ted
+from torchrl_h2o.data.ted import episodes, require_continuous, require_ted, to_ted
 from torchrl_h2o.data.whole_folder import whole_folder
 
 if TYPE_CHECKING:  # minari and gymnasium are imported where they are used: the buffer needs neither
@@ -234,17 +234,7 @@ def _require_recordable(td: TensorDictBase, source: str) -> None:
     if ("next", "reward") not in td.keys(True):
         raise DataError("the entry is missing", "Minari needs it", source=source, column="next.reward")
     # an episode is stored as one array of observations: a jump inside it would be lost
-    inside = ~td["next", "done"][:-1].flatten()
-    same = (td["next", "observation"][:-1] == td["observation"][1:]).flatten(1).all(-1)
-    jumps = (inside & ~same).nonzero().flatten()
-    if len(jumps):
-        raise DataError(
-            "the observation is not the next observation of the row before",
-            "mark the row before as truncated if another episode begins here",
-            source=source,
-            column="observation",
-            row=int(jumps[0]) + 2,
-        )
+    require_continuous(td, source=source)
 
 
 def _truncations(episode: TensorDictBase) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The one form that every reader returns, TorchRL's TED as a flat TensorDict, and its memory map.
+"""The one form that every reader returns, TorchRL's TED as a flat TensorDict, and its checks.
 
 Row t is a transition; ``next`` of an episode's last row is that episode's own final observation.
 """
@@ -13,8 +13,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from torchrl_h2o.data.error import DataError, require_finite
-from torchrl_h2o.data.memory_map import load_memory_map
-from torchrl_h2o.data.whole_folder import whole_folder
 
 _REQUIRED_KEYS = (
     "observation",
@@ -24,7 +22,6 @@ _REQUIRED_KEYS = (
     ("next", "terminated"),
 )
 _FLAGS = ("done", "terminated", "truncated")
-_FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
 
 
 def to_ted(
@@ -118,7 +115,7 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
     keys = set(td.keys(True, True))
     for key in _REQUIRED_KEYS:
         if key not in keys:
-            raise DataError("the entry is missing", "record it", source=source, column=_name(key))
+            raise DataError("the entry is missing", "record it", source=source, column=entry_name(key))
     if td.ndim != 1 or not len(td):
         raise DataError(
             f"the batch size is {list(td.batch_size)}, expected [T] with T of at least 1",
@@ -130,8 +127,42 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
     for key in sorted(keys, key=str):
         if td.get(key).is_floating_point():
             values = td.get(key).reshape(len(td), -1).numpy()
-            names = [f"{_name(key)}[{i}]" for i in range(values.shape[1])]
+            names = [f"{entry_name(key)}[{i}]" for i in range(values.shape[1])]
             require_finite(values, names, source=source)
+
+
+def require_continuous(td: TensorDictBase, *, source: str | Path = "transitions") -> None:
+    """Check that inside an episode every observation is the one that the row before led to.
+
+    Args:
+        td: flat TED transitions of batch size [T], cut at ("next", "done").
+        source: what to call them in errors.
+
+    Raises:
+        DataError: at the first row that begins elsewhere, counted from 1.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data.ted import require_continuous
+        >>> td = GymEnv("Pendulum-v1").rollout(4)
+        >>> require_continuous(td)
+        >>> require_continuous(td[[0, 1, 3]])
+        Traceback (most recent call last):
+        ...
+        torchrl_h2o.data.error.DataError: transitions, column 'observation', row 3: the observation
+        is not the next observation of the row before; ...
+    """
+    inside = ~td["next", "done"][:-1].flatten()
+    same = (td["next", "observation"][:-1] == td["observation"][1:]).flatten(1).all(-1)
+    jumps = (inside & ~same).nonzero().flatten()
+    if len(jumps):
+        raise DataError(
+            "the observation is not the next observation of the row before",
+            "mark the row before as done and truncated if another episode begins here",
+            source=source,
+            column="observation",
+            row=int(jumps[0]) + 2,
+        )
 
 
 def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
@@ -141,7 +172,7 @@ def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
                 f"the shape is {list(td.get(key).shape)}, expected {[len(td), 1]}",
                 "add the last dimension",
                 source=source,
-                column=_name(key),
+                column=entry_name(key),
             )
     for key in ("observation", "action"):
         if td.get(key).ndim != 2:
@@ -164,7 +195,7 @@ def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
                 f"the dtype is {td.get(key).dtype}",
                 "observations must be real numbers: turn them with .float(), or encode them one-hot",
                 source=source,
-                column=_name(key),
+                column=entry_name(key),
             )
 
 
@@ -178,7 +209,7 @@ def _require_flags(td: TensorDictBase, source: str | Path) -> None:
                     f"the dtype is {values.dtype}, expected torch.bool",
                     "turn the flags with .bool()",
                     source=source,
-                    column=_name((*prefix, name)),
+                    column=entry_name((*prefix, name)),
                 )
         done = flags.get("done")
         for name in ("terminated", "truncated"):
@@ -190,92 +221,11 @@ def _require_flags(td: TensorDictBase, source: str | Path) -> None:
                     f"{name} holds and done does not",
                     "done must hold wherever terminated or truncated does: set done = terminated | truncated",
                     source=source,
-                    column=_name((*prefix, "done")),
+                    column=entry_name((*prefix, "done")),
                     row=int(loose[0]) + 1,
                 )
 
 
-def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
-    """Write a flat TED TensorDict as a memory map: one file an entry, no pickle, all or nothing.
-
-    Args:
-        td: batch size [T]; tensors only.
-        folder: a folder that does not exist yet.
-
-    Returns:
-        the folder.
-
-    Raises:
-        DataError: the folder exists, or the TensorDict is not what :func:`read_ted` would take.
-
-    Example:
-        >>> import tempfile, torch
-        >>> from torchrl.envs import GymEnv
-        >>> from torchrl_h2o.data import read_ted, write_ted
-        >>> recorded = GymEnv("Pendulum-v1").rollout(10)
-        >>> folder = write_ted(recorded, tempfile.mkdtemp() + "/pendulum")
-        >>> td = read_ted(folder)
-        >>> bool((td["observation"] == recorded["observation"]).all())
-        True
-    """
-    require_ted(td, source=folder)
-    for key in td.keys(True, True, is_leaf=lambda kind: not issubclass(kind, TensorDictBase)):
-        if not isinstance(td.get(key), torch.Tensor):
-            raise DataError(
-                "the entry is not a tensor and would be pickled",
-                "drop it with td.exclude(...)",
-                source=folder,
-                column=_name(key),
-            )
-    with whole_folder(folder) as partial:
-        td.detach().contiguous().memmap(partial)
-    return Path(folder)
-
-
-def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
-    """Read a flat TED TensorDict that :func:`write_ted` or ``TensorDict.memmap`` has written.
-
-    Args:
-        folder: the folder that holds ``meta.json``.
-        in_memory: copy the data, and turn observation, action and reward to float32 (our own
-            simulators record float64). Without it the tensors stay mapped to the files, for data
-            larger than the memory, and must be float32 there; writing to them changes the files.
-
-    Returns:
-        TensorDict of batch size [T], with every entry that was written. A last episode without an
-        end is marked truncated.
-
-    Raises:
-        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity, another
-            dtype than float32 that is to stay mapped.
-    """
-    td = load_memory_map(folder)
-    require_ted(td, source=folder)
-    td = _as_float32(td.clone(recurse=in_memory), in_memory, folder)
-    ends = td["next", "done"].clone()
-    ends[-1] = True
-    td["next", "done"] = ends
-    td["next", "truncated"] = ends & ~td["next", "terminated"]
-    return td
-
-
-def _as_float32(td: TensorDict, in_memory: bool, folder: str | Path) -> TensorDict:
-    for key in _FLOATS:
-        values = td.get(key, None)
-        # actions may be integers: those of a discrete task
-        discrete = key == "action" and not values.is_floating_point()
-        if values is None or values.dtype == torch.float32 or discrete:
-            continue
-        if not in_memory:
-            raise DataError(
-                f"the dtype is {values.dtype}, and mapped data are taken as they are: torch.float32",
-                "read with in_memory=True, or write the data again as float32",
-                source=folder,
-                column=_name(key),
-            )
-        td[key] = values.float()
-    return td
-
-
-def _name(key: str | tuple) -> str:
+def entry_name(key: str | tuple) -> str:
+    """Write a nested key as errors name it: ``("next", "done")`` as ``next.done``."""
     return key if isinstance(key, str) else ".".join(key)
