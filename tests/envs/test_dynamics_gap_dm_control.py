@@ -1,5 +1,8 @@
 """DynamicsGap on tasks of dm_control."""
 
+import copy
+import pickle
+
 import mujoco
 import numpy as np
 import pytest
@@ -124,6 +127,44 @@ def test_two_envs_do_not_touch_each_other():
     rollout(TransformedEnv(DMControlEnv("cheetah", "run"), gap))
     assert as_bytes(mujoco_model(untouched)) == model
     assert (rollout(untouched) == rollout(DMControlEnv("cheetah", "run"))).all()
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+def test_a_copied_env_keeps_its_gaps(duplicate):
+    env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(paper_gap("gravity"), JointForce(5.0)))
+    env.append_transform(dynamics_gap("friction"))
+    rollout(env)
+    twin = duplicate(env)
+    assert (rollout(twin) == rollout(env)).all()
+    assert as_bytes(mujoco_model(twin)) == as_bytes(mujoco_model(env))
+
+
+def test_a_model_changed_by_hand_is_not_silently_replaced():
+    env = DMControlEnv("cheetah", "run")
+    mujoco_model(env).opt.gravity[2] = -1.0
+    with pytest.raises(ValueError, match=r"changed after loading.*Make the change an effect"):
+        TransformedEnv(env, DynamicsGap(BodyMass(2.0)))
+
+
+@pytest.mark.parametrize("task", [("reacher", "easy"), ("finger", "turn_hard"), ("point_mass", "hard")])
+def test_what_a_task_writes_at_its_reset_is_no_change_by_hand(task):
+    env = DMControlEnv(*task)
+    env.reset()
+    TransformedEnv(env, dynamics_gap("gravity")).rollout(2)
+
+
+@pytest.mark.parametrize(
+    ("task", "complaint"),
+    [
+        (("swimmer", "swimmer6"), r"swimmer6.* builds a model from arguments \(n_joints\)"),
+        (("lqr", "lqr_2_1"), r"lqr_2_1.* from arguments \(n_bodies, n_actuators, random\)"),
+        (("quadruped", "walk"), r"quadruped, task=walk.* does not say where its model comes from"),
+        (("dog", "walk"), r"dog, task=walk.* built with arguments of its own"),
+    ],
+)
+def test_a_task_whose_model_cannot_be_built_anew_is_named(task, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        TransformedEnv(DMControlEnv(*task), dynamics_gap("gravity"))
 
 
 def test_a_model_built_in_code_is_not_mistaken_for_the_one_in_the_file():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -12,6 +14,14 @@ from torchrl_h2o.envs.simulator import Simulator
 
 if TYPE_CHECKING:
     from dm_control.mujoco import Physics
+
+
+_WRITTEN_AT_RESET = {
+    "finger": ("site_rgba", "site_pos", "site_size", "dof_damping"),
+    "fish": ("geom_rgba", "geom_pos"),
+    "point_mass": ("wrap_prm",),
+    "reacher": ("geom_size", "geom_pos"),
+}
 
 
 class DMControlSimulator(Simulator):
@@ -37,14 +47,33 @@ class DMControlSimulator(Simulator):
         return self.env._env.control_timestep() * self.env.wrapper_frame_skip
 
     def spec(self) -> mujoco.MjSpec:
-        module = sys.modules[type(self.env._env.task).__module__]
-        if not hasattr(module, "get_model_and_assets"):
+        get = getattr(self._module, "get_model_and_assets", None)
+        if get is None:
             raise ValueError(
-                f"{self.env}: {module.__name__} does not say where its model comes from "
-                "(get_model_and_assets), as the tasks of dm_control.suite do"
+                f"{self.env}: {self._module.__name__} does not say where its model comes from "
+                "(get_model_and_assets), as most tasks of dm_control.suite do; choose one of those"
             )
-        xml, assets = module.get_model_and_assets()
-        return mujoco.MjSpec.from_string(xml.decode(), include=assets)
+        asked = [p.name for p in inspect.signature(get).parameters.values() if p.default is p.empty]
+        if asked:
+            raise ValueError(
+                f"{self.env}: {self.source} builds a model from arguments ({', '.join(asked)}) that the "
+                "task does not keep, so that it cannot be built anew; choose a task whose model is a file"
+            )
+        xml, assets = get()
+        return mujoco.MjSpec.from_string(xml.decode(), include=assets, assets=assets)
+
+    @property
+    def source(self) -> str:
+        return f"{self._module.__name__}.get_model_and_assets"
+
+    @property
+    def written_at_reset(self) -> tuple[str, ...]:
+        package, _, domain = self._module.__name__.rpartition(".")
+        return _WRITTEN_AT_RESET.get(domain, ()) if package == "dm_control.suite" else ()
+
+    @property
+    def _module(self) -> ModuleType:
+        return sys.modules[type(self.env._env.task).__module__]
 
     def load(self, model: mujoco.MjModel) -> None:
         from dm_control.mujoco.wrapper import MjModel

@@ -97,22 +97,22 @@ class DynamicsGap(Transform):
         _alter(example, rehearsal.observation_keys, rehearsal.observations)
         for force in rehearsal.forces:
             force(mujoco.MjData(simulator.model))
-        simulator.apply(self._identity, self.effects, [gap._identity for gap in self._gaps_on(env)])
+        simulator.apply(self._identity, {gap._identity: gap.effects for gap in self._gaps_on(env)})
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # A copied or unpickled env may have built its simulator anew, without the gaps.
         env = _env_of(self)
         self._check_place(env)
         gaps = self._gaps_on(env)
-        identities = [gap._identity for gap in gaps]
-        if len(set(identities)) < len(gaps):
+        effects = {gap._identity: gap.effects for gap in gaps}
+        if len(effects) < len(gaps):
             raise ValueError(
                 f"{self} and a clone of it are on one env, where they count as one gap; to have "
                 "its effects twice, make a second DynamicsGap"
             )
         simulator = find_simulator(env)
-        for gap in gaps:
-            simulator.apply(gap._identity, gap.effects, identities)
+        for identity in effects:
+            simulator.apply(identity, effects)
         return super()._reset_env_preprocess(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase, GymWrapper
 
-from torchrl_h2o.effects import compile_model
 from torchrl_h2o.envs.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -45,6 +44,10 @@ class GymnasiumSimulator(Simulator):
     def spec(self) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_file(self.owner.fullpath)
 
+    @property
+    def source(self) -> str:
+        return self.owner.fullpath
+
     def load(self, model: mujoco.MjModel) -> None:
         task, old = self.owner, self.owner.model
         task.model, task.data = model, mujoco.MjData(model)
@@ -64,21 +67,3 @@ class GymnasiumSimulator(Simulator):
         step = type(self.owner)._step_mujoco_simulation
         self.data.ctrl[:] = ctrl  # forces are computed before the step that would write it
         self._pushed_steps(lambda: step(self.owner, ctrl, 1), n_frames)
-
-    def _check_source(self) -> None:
-        super()._check_source()
-        source = compile_model(self.spec())
-        source.vis.global_.offwidth = self.model.vis.global_.offwidth
-        source.vis.global_.offheight = self.model.vis.global_.offheight
-        if not np.array_equal(_bytes(source), _bytes(self.model)):
-            raise ValueError(
-                f"the model of {self.env} is not the one in {self.owner.fullpath}: it was changed "
-                "after loading, and a dynamics gap compiles the file anew. Make the change an "
-                "effect of the gap"
-            )
-
-
-def _bytes(model: mujoco.MjModel) -> np.ndarray:
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer

@@ -4,10 +4,11 @@ What :class:`~torchrl_h2o.envs.DynamicsGap` needs of a simulation, and nothing t
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_h2o.effects import Effect, ForceEffect, compile_model
@@ -52,6 +53,16 @@ class Simulator(ABC):
     def spec(self) -> mujoco.MjSpec:
         """The specification of the model without any gap, parsed anew from its source."""
 
+    @property
+    @abstractmethod
+    def source(self) -> str:
+        """Where the model without any gap comes from, for error messages."""
+
+    @property
+    def written_at_reset(self) -> tuple[str, ...]:
+        """The fields of the model that the task itself writes whenever an episode begins."""
+        return ()
+
     @abstractmethod
     def load(self, model: mujoco.MjModel) -> None:
         """Puts a model and fresh data in, where the simulation and its renderers will use them."""
@@ -65,13 +76,13 @@ class Simulator(ABC):
         """The present episode of every gap, under what stands for the gap."""
         return self.owner.__dict__.setdefault("_dynamics_gap_episodes", Episodes())
 
-    def apply(self, gap: object, effects: Sequence[Effect], on_env: Collection[object]) -> None:
+    def apply(self, gap: object, on_env: Mapping[object, Sequence[Effect]]) -> None:
         """Puts a gap in, after those that are in already; does nothing if it is one of them.
 
         Args:
             gap: stands for the gap: the same object, the same gap.
-            effects: what the gap consists of. Action and observation effects are passed over.
-            on_env: all gaps that the env has, this one included.
+            on_env: what each of the env's gaps consists of, this one included, the innermost first.
+                Action and observation effects are passed over.
 
         Raises:
             ValueError: if the model has nothing that an effect could act on, or has a gap in it that
@@ -80,15 +91,15 @@ class Simulator(ABC):
         applied = getattr(self.owner, "_dynamics_gaps", {})
         if gap in applied:
             return
-        if not set(applied) <= set(on_env):
+        if not applied.keys() <= on_env.keys():
             left = ", ".join(e.describe() for other in applied if other not in on_env for e in applied[other])
             raise ValueError(
                 f"the simulator of {self.env} still has a gap in it that is not among the transforms "
                 f"of this env ({left}), and would have both: make a new env for the new gap"
             )
         if not applied:
-            self._check_source()
-        applied = {**applied, gap: tuple(effects)}
+            self._check_source([effect for effects in on_env.values() for effect in effects])
+        applied = {**applied, gap: tuple(on_env[gap])}
         everything = [effect for effects in applied.values() for effect in effects]
         model = compile_model(self.spec(), everything)
         self._check_sizes(model)
@@ -99,8 +110,24 @@ class Simulator(ABC):
             self.push()
         self.owner._dynamics_gaps = applied
 
-    def _check_source(self) -> None:
+    def _check_source(self, effects: Sequence[Effect]) -> None:
         self._check_sizes(compile_model(self.spec()))
+        # dm_control copies a model with its gaps, but not what we remember of them
+        if not self._came_from([]) and not self._came_from(effects):
+            raise ValueError(
+                f"the model of {self.env} is not the one of {self.source}: it was changed after "
+                "loading or built with arguments of its own, and a dynamics gap compiles its source "
+                "anew. Make the change an effect of the gap"
+            )
+
+    def _came_from(self, effects: Sequence[Effect]) -> bool:
+        """Whether the model in use is the one of the source with these effects in it."""
+        model, source = self.model, compile_model(self.spec(), effects)
+        source.vis.global_.offwidth = model.vis.global_.offwidth
+        source.vis.global_.offheight = model.vis.global_.offheight
+        for field in self.written_at_reset:
+            getattr(source, field)[:] = getattr(model, field)
+        return np.array_equal(_bytes(source), _bytes(model))
 
     def _check_sizes(self, model: mujoco.MjModel) -> None:
         for size in _SIZES:
@@ -129,6 +156,12 @@ class Simulator(ABC):
         # in the order of the gaps, not of their resets, because a sum is rounded in its order
         episodes = self.episodes
         return [force for gap in self.owner._dynamics_gaps if gap in episodes for force in episodes[gap].forces]
+
+
+def _bytes(model: mujoco.MjModel) -> np.ndarray:
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer
 
 
 def base_env(env: EnvBase) -> EnvBase:
