@@ -1,15 +1,13 @@
-"""What the columns of a robot log mean: names, roles, units and timing, read from a small YAML."""
+"""What the columns of a robot log mean: names, roles, units and timing."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, fields
-from importlib import resources
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from torchrl_h2o.data.error import DataError
 from torchrl_h2o.data.units import to_si
 
 ROLES = ("observation", "action", "reward", "done", "time", "ignore")
@@ -40,6 +38,8 @@ class Column:
     bounds: tuple[float, float] | None = None
 
     def __post_init__(self):
+        if not isinstance(self.name, str):
+            raise ValueError(f"name {self.name!r} is no text: put it in quotes (YAML reads on, off, yes, no as flags)")
         if self.role not in ROLES:
             raise ValueError(f"unknown role {self.role!r}; known are {', '.join(ROLES)}")
         try:
@@ -122,9 +122,9 @@ class LogColumns:
             raise ValueError("dt is missing, and so is a time column to take it from")
         if self.dt is not None and not 0 < self.dt < math.inf:
             raise ValueError(f"dt {self.dt} must be a positive number of seconds")
-        if self.separator != "whitespace" and len(self.separator) != 1:
+        if not isinstance(self.separator, str) or (self.separator != "whitespace" and len(self.separator) != 1):
             raise ValueError(f"separator {self.separator!r} must be 'whitespace' or one character")
-        if self.time_tolerance <= 0:
+        if not 0 < self.time_tolerance < math.inf:
             raise ValueError(f"time_tolerance {self.time_tolerance} must be positive")
         for name, allowed in (
             ("outside_bounds", ("error", "clip")),
@@ -152,73 +152,14 @@ class LogColumns:
                 or ``"simple_pendulum"``.
 
         Raises:
-            DataError: no such file, no YAML, an unknown entry, a contradiction.
+            DataError: no such file, no YAML, an unknown, doubled or wrong entry, a contradiction.
 
         Example:
             >>> from torchrl_h2o.data import LogColumns
             >>> LogColumns.load("wheel_legged_standing_still").observation
             ('theta', 'theta_dot', 'x', 'v')
         """
-        import yaml
+        # here: that file imports this one, and yaml, which a layout in code does without
+        from torchrl_h2o.data.columns_file import read_columns
 
-        path = _find(source)
-        try:
-            entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise DataError(f"no YAML: {error}", "correct it", source=source) from error
-        known = _known_entries(cls, entries, source)
-        if not isinstance(known.get("columns"), list) or not known["columns"]:
-            raise DataError("'columns' is no list", "list the file's columns", source=source)
-        columns = tuple(
-            _build(
-                Column,
-                {"name": f"column {number}", **_known_entries(Column, entry, source)},
-                source,
-            )
-            for number, entry in enumerate(known["columns"], start=1)
-        )
-        return _build(cls, {**known, "columns": columns}, source)
-
-
-def _find(source: str | Path) -> Path:
-    path = Path(source).expanduser()
-    if path.is_file():
-        return path
-    shipped = Path(str(resources.files("torchrl_h2o.data") / "logs"))
-    names = sorted(file.stem for file in shipped.glob("*.yaml"))
-    if str(source) in names:
-        return shipped / f"{source}.yaml"
-    raise DataError(
-        "there is no such column description",
-        f"give a YAML file or one of {', '.join(names)}",
-        source=source,
-    )
-
-
-def _known_entries(kind: type, entries: Any, source: str | Path) -> dict[str, Any]:
-    known = [field.name for field in fields(kind)]
-    if not isinstance(entries, dict):
-        raise DataError(f"{entries!r} is no mapping", f"give {', '.join(known)}", source=source)
-    for name in entries:
-        if name not in known:
-            raise DataError(f"unknown entry {name!r}", f"known are {', '.join(known)}", source=source)
-    return entries
-
-
-def _build(kind: type, entries: dict[str, Any], source: str | Path) -> Any:
-    numbers = {"dt", "scale", "time_tolerance"}
-    lists = {"bounds", "observation", "action"}
-    column = str(entries["name"]) if kind is Column else None
-    try:
-        # YAML 1.1 takes 5e-3 for a text
-        values = {
-            name: float(value) if name in numbers and value is not None else value for name, value in entries.items()
-        }
-        for name in lists & values.keys():
-            values[name] = tuple(values[name])
-        if "bounds" in values:
-            low, high = values["bounds"]
-            values["bounds"] = (float(low), float(high))
-        return kind(**values)
-    except (ValueError, TypeError) as error:
-        raise DataError(str(error), "correct the column description", source=source, column=column) from error
+        return read_columns(source)
