@@ -12,6 +12,7 @@ from torchrl_h2o.data.error import DataError
 _PICKLE_SUFFIXES = {".pkl", ".pickle", ".pt", ".pth", ".npy", ".npz", ".joblib", ".ckpt"}
 # protocol 2 and later start with PROTO; torch.save and .npz are zip files, .npy may hold objects
 _PICKLE_STARTS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05", b"PK\x03\x04", b"\x93NUMPY")
+_GZIP_START = b"\x1f\x8b"
 
 
 def is_pickle(path: str | Path) -> bool:
@@ -41,7 +42,7 @@ def require_file(path: str | Path) -> Path:
         path: a file.
 
     Raises:
-        DataError: a missing file, a folder, an empty file, a pickle.
+        DataError: a missing file, a folder, an empty or compressed file, a pickle.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -56,4 +57,7 @@ def require_file(path: str | Path) -> Path:
         )
     if path.stat().st_size == 0:
         raise DataError("the file is empty", "copy or record it again", source=path)
+    with path.open("rb") as file:
+        if file.read(len(_GZIP_START)) == _GZIP_START:
+            raise DataError("this is compressed by gzip", "unpack it with gunzip first", source=path)
     return path

@@ -69,8 +69,12 @@ class LogColumns:
     Args:
         columns: the columns; without a header in the file's order.
         dt: seconds between two rows; ``None`` takes the median of the time column.
-        separator: ``"whitespace"`` or one character.
+        separator: ``"whitespace"`` or one character; with a character, cells may stand in "".
         header: whether the first row holds the names.
+        comment: a character; lines that begin with it are skipped, before the header too.
+        decimal: what stands before the fraction, ``"."`` or ``","``.
+        other_columns: columns of the header that are not described are an ``"error"``, or
+            ``"ignore"`` them.
         observation: names in the order of the observation vector; the file's order by default.
         action: the same for the action vector.
         outside_bounds: an action outside its bounds is an ``"error"``, or ``"clip"`` it.
@@ -95,6 +99,9 @@ class LogColumns:
     dt: float | None = None
     separator: str = "whitespace"
     header: bool = False
+    comment: str | None = None
+    decimal: Literal[".", ","] = "."
+    other_columns: Literal["error", "ignore"] = "error"
     observation: tuple[str, ...] = ()
     action: tuple[str, ...] = ()
     outside_bounds: Literal["error", "clip"] = "error"
@@ -124,6 +131,14 @@ class LogColumns:
             raise ValueError(f"dt {self.dt} must be a positive number of seconds")
         if not isinstance(self.separator, str) or (self.separator != "whitespace" and len(self.separator) != 1):
             raise ValueError(f"separator {self.separator!r} must be 'whitespace' or one character")
+        if self.separator in ('"', "\n", "\r"):
+            raise ValueError(f"separator {self.separator!r} cannot stand between cells; take another")
+        if self.comment is not None and not (isinstance(self.comment, str) and len(self.comment.strip()) == 1):
+            raise ValueError(f"comment {self.comment!r} must be one character (in quotes: YAML's own comment is #)")
+        if self.decimal == self.separator:
+            raise ValueError(f"decimal and separator are both {self.decimal!r}; one of them is another")
+        if self.other_columns == "ignore" and not self.header:
+            raise ValueError("other_columns: ignore needs a header; without one, describe all with role: ignore")
         if not 0 < self.time_tolerance < math.inf:
             raise ValueError(f"time_tolerance {self.time_tolerance} must be positive")
         for name, allowed in (
@@ -131,6 +146,8 @@ class LogColumns:
             ("on_time_jump", ("error", "split")),
             ("after_done", ("error", "drop", "new_episode")),
             ("header", (True, False)),
+            ("decimal", (".", ",")),
+            ("other_columns", ("error", "ignore")),
             ("drop_trailing_zero_rows", (True, False)),
         ):
             if getattr(self, name) not in allowed:

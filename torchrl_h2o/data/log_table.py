@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -66,16 +67,15 @@ def read_table(path: str, layout: LogColumns) -> LogTable:
         lines = path.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         raise DataError(f"this is no text: {error}", "give a text or CSV file", source=path) from error
-    separator = None if layout.separator == "whitespace" else layout.separator
-    # blank lines are skipped and still counted, as in an editor
+    # blank lines and comments are skipped and still counted, as in an editor
     rows = [
-        (number, [cell.strip() for cell in line.split(separator)])
+        (number, _cells(line, layout.separator, path, number))
         for number, line in enumerate(lines, start=1)
-        if line.strip()
+        if line.strip() and not (layout.comment and line.lstrip().startswith(layout.comment))
     ]
     names = [column.name for column in layout.columns]
     if layout.header and rows:
-        names = _require_names(rows.pop(0), names, path)
+        names = _require_names(rows.pop(0), names, path, layout.other_columns == "ignore")
     if len(rows) < 2:
         raise DataError(
             f"there are {len(rows)} rows of data",
@@ -84,9 +84,9 @@ def read_table(path: str, layout: LogColumns) -> LogTable:
         )
     _require_width(rows, names, path)
     by_name = {column.name: column for column in layout.columns}
-    kept = [i for i, name in enumerate(names) if by_name[name].role != "ignore"]
+    kept = [i for i, name in enumerate(names) if name in by_name and by_name[name].role != "ignore"]
     names = [names[i] for i in kept]
-    values = _numbers([[cells[i] for i in kept] for _, cells in rows], names, rows, path)
+    values = _numbers([[cells[i] for i in kept] for _, cells in rows], names, rows, layout.decimal, path)
     numbers = np.array([number for number, _ in rows])
     zero_rows = 0
     if layout.drop_trailing_zero_rows:
@@ -100,15 +100,34 @@ def read_table(path: str, layout: LogColumns) -> LogTable:
     return LogTable(str(path), tuple(names), values, numbers, int(zero_rows))
 
 
-def _require_names(header: tuple[int, list[str]], expected: list[str], path) -> list[str]:
+def _cells(line: str, separator: str, path, number: int) -> list[str]:
+    if separator == "whitespace":
+        return line.split()
+    try:
+        # skipinitialspace: a quote behind a space is a quote still
+        skip = separator != " "
+        (cells,) = csv.reader([line.rstrip("\r")], delimiter=separator, skipinitialspace=skip, strict=True)
+    except csv.Error as error:
+        raise DataError(
+            f"the line cannot be cut into cells: {error}",
+            "correct its quotes; a cell ends on its own line",
+            source=path,
+            row=number,
+        ) from error
+    return [cell.strip() for cell in cells]
+
+
+def _require_names(header: tuple[int, list[str]], expected: list[str], path, ignore_others: bool) -> list[str]:
     number, cells = header
     names = [cell.strip("\"'") for cell in cells]
     remedy = f"the header is {', '.join(names)}; correct the file or its column description"
     for name in names:
+        if ignore_others and name not in expected:
+            continue
         if names.count(name) > 1:
             problem = "two columns have this name"
         elif name not in expected:
-            problem = "the column is not described (the role ignore leaves it out)"
+            problem = "the column is not described (role: ignore leaves it out, other_columns: ignore all such)"
         else:
             continue
         raise DataError(problem, remedy, source=path, column=name, row=number)
@@ -123,7 +142,7 @@ def _require_width(rows: list[tuple[int, list[str]]], names: list[str], path) ->
         if len(cells) == len(names):
             continue
         place = {"source": path, "row": number}
-        found = f"the row has {len(cells)} columns, {len(names)} are described"
+        found = f"the row has {len(cells)} columns, {len(names)} are expected"
         if len(cells) > len(names):
             raise DataError(
                 f"{found}; extra: {', '.join(cells[len(names) :])}",
@@ -137,20 +156,27 @@ def _require_width(rows: list[tuple[int, list[str]]], names: list[str], path) ->
         raise DataError(f"{found}; missing", "correct the row, or check the separator", **place)
 
 
-def _numbers(cells: list[list[str]], names: list[str], rows: list[tuple[int, list[str]]], path) -> np.ndarray:
-    try:
-        return np.array([list(map(float, row)) for row in cells])
-    except ValueError:
-        for (number, _), row in zip(rows, cells, strict=True):
-            for name, cell in zip(names, row, strict=True):
-                try:
-                    float(cell)
-                except ValueError:
-                    raise DataError(
-                        f"{cell!r} is no number",
-                        "correct it, or check separator and header",
-                        source=path,
-                        column=name,
-                        row=number,
-                    ) from None
-        raise
+def _numbers(
+    cells: list[list[str]], names: list[str], rows: list[tuple[int, list[str]]], decimal: str, path
+) -> np.ndarray:
+    values = np.empty((len(cells), len(names)))
+    for index, row in enumerate(cells):
+        for position, cell in enumerate(row):
+            try:
+                values[index, position] = _number(cell, decimal)
+            except ValueError:
+                raise DataError(
+                    f"{cell!r} is no number",
+                    f"correct it, or check separator, header and decimal ({decimal!r})",
+                    source=path,
+                    column=names[position],
+                    row=rows[index][0],
+                ) from None
+    return values
+
+
+def _number(cell: str, decimal: str) -> float:
+    # float takes 1_5 for 15; and with a decimal comma, a point stands between thousands
+    if "_" in cell or (decimal == "," and "." in cell):
+        raise ValueError
+    return float(cell.replace(",", ".") if decimal == "," else cell)
