@@ -6,12 +6,22 @@ import pickle
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from torchrl_h2o import effects
-from torchrl_h2o.effects import Effect, GeomSize, Gravity, JointDamping, ObservationBias, paper_gap
+from torchrl_h2o.effects import (
+    ActionNoise,
+    BodyMass,
+    Effect,
+    GeomSize,
+    Gravity,
+    JointDamping,
+    ObservationBias,
+    paper_gap,
+)
 
 KINDS = {
     effects.ModelEffect,
@@ -67,6 +77,24 @@ def test_an_effect_is_a_frozen_value():
     assert dataclasses.replace(effect, scale=3.0) == GeomSize(3.0, geoms=("a", "b"))
     with pytest.raises(dataclasses.FrozenInstanceError):
         effect.scale = 1.0
+
+
+def test_one_index_selects_as_a_tuple_of_one_does():
+    assert ActionNoise(1.0, actuators=1) == ActionNoise(1.0, actuators=[np.int64(1)])
+    assert ActionNoise(1.0, actuators=1).actuators == (1,)
+    assert ActionNoise(1.0, actuators=None).actuators is None
+
+
+@pytest.mark.parametrize("names", [(), "", 0, ("torso", 1), ("",), None])
+def test_what_selects_no_names_is_refused(names):
+    with pytest.raises(ValueError, match=r"BodyMass: bodies = .* selects nothing by name; give"):
+        BodyMass(2.0, bodies=names)
+
+
+@pytest.mark.parametrize("indices", [(), "0", "", (0, "1"), True, 1.0, -1, (0, -1)])
+def test_what_selects_no_indices_is_refused(indices):
+    with pytest.raises(ValueError, match=r"ActionNoise: actuators = .* selects nothing by index; give"):
+        ActionNoise(1.0, actuators=indices)
 
 
 def test_words_name_what_the_effect_acts_on():

@@ -144,6 +144,16 @@ def test_what_the_model_does_not_have_is_named_with_what_it_has(effect, complain
         compile_model(spec(CART), [effect])
 
 
+def test_an_exact_name_is_no_pattern():
+    names = CART.replace('name="slider"', 'name="j[0]"').replace('name="hinge"', 'name="j0"')
+    model = compile_model(spec(names), [JointDamping(1.0, joints="j[0]")])
+    np.testing.assert_array_equal(model.dof_damping, [1.0, 0.0])
+    model = compile_model(spec(names), [JointDamping(1.0, joints="cart/j[0]")])
+    np.testing.assert_array_equal(model.dof_damping, [1.0, 0.0])
+    model = compile_model(spec(names), [JointDamping(1.0, joints="j[0-9]")])
+    np.testing.assert_array_equal(model.dof_damping, [0.0, 1.0])
+
+
 def test_edits_are_made_in_their_order():
     doubled = compile_model(spec("HalfCheetah"), [BodyMass(2.0), GeomSize(2.0, geoms="bfoot")])
     # BodyMass doubles the total that the compiler then shares out over the larger foot

@@ -16,6 +16,7 @@ from torchrl_h2o.effects.effect import (
     compile_model,
     parameter,
 )
+from torchrl_h2o.effects.entries import Indices
 from torchrl_h2o.effects.force import JointForce, LinearDrag
 from torchrl_h2o.effects.geom import GeomFriction, GeomLength, GeomSize, RollingResistance
 from torchrl_h2o.effects.gravity import Gravity
@@ -28,6 +29,7 @@ from torchrl_h2o.effects.joint import (
 )
 from torchrl_h2o.effects.observation import ObservationBias, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
+from torchrl_h2o.effects.selection import Names
 
 __all__ = [
     "PAPER_GAPS",
@@ -43,6 +45,7 @@ __all__ = [
     "GeomLength",
     "GeomSize",
     "Gravity",
+    "Indices",
     "JointDamping",
     "JointForce",
     "JointFrictionLoss",
@@ -50,6 +53,7 @@ __all__ = [
     "JointStiffness",
     "LinearDrag",
     "ModelEffect",
+    "Names",
     "ObservationBias",
     "ObservationEffect",
     "ObservationNoise",

@@ -14,6 +14,12 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
+from torchrl_h2o.effects.entries import Indices, checked_indices
+from torchrl_h2o.effects.selection import Names, checked_names
+
+# by the types of the fields, as types and as text under ``from __future__ import annotations``
+_SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_indices, "Indices": checked_indices}
+
 Process = Callable[[np.ndarray], np.ndarray]
 Force = Callable[[mujoco.MjData], np.ndarray]
 
@@ -58,11 +64,13 @@ class Effect(ABC):
     """Base of all effects. Subclass one of the four kinds below, not this class.
 
     A subclass is a frozen dataclass: fields made by :func:`parameter` are its parameters, all other
-    fields say what it acts on (name patterns, indices). ``wording`` is what it does in words, with
-    the fields' names in braces. ``random`` is whether it draws from the generator that it is given.
+    fields say what it acts on, name patterns (``Names``) or indices (``Indices``). ``wording`` is
+    what it does in words, with the fields' names in braces. ``random`` is whether it draws from the
+    generator that it is given.
 
     Raises:
-        ValueError: if a parameter is not a number within its bounds.
+        ValueError: if a parameter is not a number within its bounds, or a field of type ``Names`` or
+            ``Indices`` selects nothing.
 
     Examples:
         >>> from torchrl_h2o.effects import Gravity
@@ -84,6 +92,8 @@ class Effect(ABC):
             value = getattr(self, field.name)
             if "unit" in field.metadata:
                 value = self._checked(field.name, value, *field.metadata["bounds"])
+            elif field.type in _SELECTIONS:
+                value = self._selected(field, value)
             elif isinstance(value, Iterable) and not isinstance(value, str):
                 value = tuple(value)  # a list from a configuration file must stay hashable
             object.__setattr__(self, field.name, value)
@@ -101,6 +111,12 @@ class Effect(ABC):
                 f"[{low:g}, {high:g}]; choose a value within them"
             )
         return value
+
+    def _selected(self, field: dataclasses.Field, value: Any) -> Names | Indices:
+        try:
+            return _SELECTIONS[field.type](value)
+        except ValueError as error:
+            raise ValueError(f"{type(self).__name__}: {field.name} = {error}") from None
 
     @property
     def parameters(self) -> dict[str, Parameter]:

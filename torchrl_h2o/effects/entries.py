@@ -1,8 +1,21 @@
 """Selects the entries of an action or an observation that an effect acts on, by their indices."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
 Indices = tuple[int, ...] | None
+
+
+def checked_indices(value: Any) -> Indices:
+    """None or a tuple of at least one index, made of a bare one too; raises ValueError for others."""
+    if value is None:
+        return None
+    indices = tuple(value) if isinstance(value, Iterable) else (value,)
+    if indices and all(isinstance(i, int | np.integer) and not isinstance(i, bool) and i >= 0 for i in indices):
+        return tuple(int(index) for index in indices)
+    raise ValueError(f"{value!r} selects nothing by index; give an index from 0 on or several, None for all")
 
 
 def entry_mask(vector: np.ndarray, indices: Indices) -> np.ndarray:

@@ -1,15 +1,28 @@
 """Selects the bodies, joints and geoms of a model that an effect acts on, by name patterns.
 
 A pattern is a shell pattern on the element's name: ``"*thigh*"``. With a slash, ``"*thigh*/*"``, it
-is one on ``body/name``: every element of the bodies so named. ``"*"`` selects all.
+is one on ``body/name``: every element of the bodies so named. ``"*"`` selects all. What is the name
+of an element is no pattern: ``"j[0]"`` selects the joint of that name.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
+from typing import Any
 
 import mujoco
 
 Names = str | tuple[str, ...]
+
+
+def checked_names(value: Any) -> Names:
+    """One name pattern or a tuple of at least one; raises ValueError for anything else."""
+    if isinstance(value, str) and value:
+        return value
+    if isinstance(value, Iterable):
+        patterns = tuple(value)
+        if patterns and all(isinstance(pattern, str) and pattern for pattern in patterns):
+            return patterns
+    raise ValueError(f"{value!r} selects nothing by name; give a name pattern or several, '*' for all")
 
 
 def joints(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsJoint]:
@@ -51,7 +64,7 @@ def _matching(paths: Sequence[tuple[str, str]], patterns: Names, kind: str) -> l
     """The indices of the (body, name) pairs that match at least one of the patterns."""
     chosen = set()
     for pattern in (patterns,) if isinstance(patterns, str) else patterns:
-        matches = {
+        matches = {i for i, (body, name) in enumerate(paths) if pattern in (name, f"{body}/{name}")} or {
             i
             for i, (body, name) in enumerate(paths)
             if fnmatchcase(name, pattern) or ("/" in pattern and fnmatchcase(f"{body}/{name}", pattern))
