@@ -8,7 +8,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from tensordict import TensorDict
-from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
+from torchrl.envs import CatTensors, DMControlEnv, GymEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from torchrl_h2o.effects import BodyMass
@@ -212,3 +212,17 @@ def test_recording_nothing_is_an_error():
 def test_recording_a_batch_of_envs_is_an_error():
     with pytest.raises(ValueError, match=r"batch of \(2,\)"):
         record(SerialEnv(2, lambda: GymEnv("InvertedPendulum-v5")), BalanceController(), 5)
+
+
+def test_recording_names_the_remedy_for_an_env_without_observation_and_is_single_precision():
+    def policy(state):
+        return state.set("action", torch.zeros(6, dtype=torch.float64))
+
+    env = TransformedEnv(DMControlEnv("cheetah", "run"))
+    with pytest.raises(ValueError, match=r"no 'observation', but position, velocity.*CatTensors"):
+        record(env, policy, 5, progress=False)
+    env.append_transform(CatTensors(["position", "velocity"], out_key="observation"))
+    data = record(env, policy, 5, progress=False)
+    numbers = ("observation", "action", ("next", "observation"), ("next", "reward"))
+    assert {data[key].dtype for key in numbers} == {torch.float32}
+    assert {data[key].dtype for key in ("done", ("next", "terminated"))} == {torch.bool}

@@ -1,13 +1,18 @@
 """DynamicsGap's actions and observations: what is executed, what is reported, what is repeated."""
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium import ObservationWrapper
+from gymnasium.spaces import Box
 from torchrl.envs import (
     ActionDiscretizer,
     CatTensors,
     Compose,
     FrameSkipTransform,
     GymEnv,
+    GymWrapper,
     MultiAction,
     ObservationNorm,
     RenameTransform,
@@ -154,6 +159,23 @@ def test_a_gap_can_be_put_first_afterwards_but_nothing_before_it():
     env.insert_transform(0, StepCounter(step_count_key="again"))
     with pytest.raises(ValueError, match="stands after StepCounter"):
         env.reset()
+
+
+class Grey(ObservationWrapper):
+    """Observes integers only, as an env of pixels does."""
+
+    def __init__(self):
+        super().__init__(gymnasium.make(CHEETAH))
+        self.observation_space = Box(0, 255, (2,), np.uint8)
+
+    def observation(self, observation):
+        return np.zeros(2, np.uint8)
+
+
+def test_an_observation_effect_on_pixels_alone_is_refused():
+    with pytest.raises(ValueError, match=r"no floating-point observations.*only observation; leave"):
+        TransformedEnv(GymWrapper(Grey()), DynamicsGap(ObservationBias(1.0)))
+    TransformedEnv(GymWrapper(Grey()), DynamicsGap(ObservationBias(), ActionGain(2.0))).rollout(2)
 
 
 def test_an_effect_that_forgot_to_say_that_it_is_random_is_named():

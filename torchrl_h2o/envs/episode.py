@@ -46,10 +46,17 @@ class Episode(NamedTuple):
 
         env, dt = simulator.env, simulator.control_step
         observed = [key for key, spec in env.observation_spec.items(True, True) if spec.dtype.is_floating_point]
+        observations = processes(ObservationEffect, dt)
+        if observations and not observed:
+            raise ValueError(
+                f"{env} has no floating-point observations that an observation effect could alter, only "
+                f"{', '.join(map(str, env.observation_spec.keys(True, True)))}; leave the effect out or let "
+                "the env observe its state too (pixels_only=False)"
+            )
         return cls(
             actions=processes(ActionEffect, dt),
             action_keys=env.action_keys,
-            observations=processes(ObservationEffect, dt),
+            observations=observations,
             observation_keys=observed,
             forces=processes(ForceEffect, simulator.model),
         )

@@ -37,9 +37,11 @@ def record(
     Returns:
         TensorDict of batch size ``(num_transitions,)`` in TED form: observation, action, done,
         terminated, truncated, and under ``next`` observation, reward, done, terminated, truncated.
+        Whatever the env's own precision, numbers are float32, as in all measured data.
 
     Raises:
-        ValueError: for fewer than one transition, or for a batched env.
+        ValueError: for fewer than one transition, or for an env that is batched or has no
+            ``observation``.
 
     Example:
         >>> from torchrl_h2o.envs.balance_controller import BalanceController
@@ -54,6 +56,11 @@ def record(
         raise ValueError(
             f"record takes one env, not a batch of {tuple(env.batch_size)}; record from each of "
             "its envs and concatenate"
+        )
+    if "observation" not in env.observation_spec.keys():
+        raise ValueError(
+            f"{env} has no 'observation', but {', '.join(map(str, env.observation_spec.keys()))}; join "
+            "what belongs to it: env.append_transform(CatTensors([...], out_key='observation'))"
         )
     # nested on purpose: TorchRL would unwrap the env, warn of it, and work on clones of its transforms
     tracked = TransformedEnv(env, InitTracker(), auto_unwrap=False)
@@ -74,4 +81,6 @@ def record(
     recording = torch.stack(transitions)
     recording["next", "truncated"][-1] |= ~recording["next", "terminated"][-1]
     recording["next", "done"][-1] = True
+    for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
+        recording[key] = recording[key].float()
     return recording
