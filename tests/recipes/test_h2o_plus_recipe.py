@@ -19,6 +19,8 @@ from run import Training
 from sac import train_sac
 from torchrl.checkpoint import CheckpointRotation
 
+from torchrl_h2o.data import write_ted
+
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
 SMALL = [
@@ -167,6 +169,13 @@ def compose(cache, monkeypatch):
         return cfg, real
 
     return build
+
+
+def test_recorded_data_can_be_named_by_their_folder(compose, tmp_path):
+    cfg, real = compose()
+    again, same = compose(f"data={write_ted(real, tmp_path / 'recording')}")
+    assert (same == real).all()
+    assert again.observation_norm == cfg.observation_norm
 
 
 def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
