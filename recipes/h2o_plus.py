@@ -109,8 +109,8 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
                 ratio_of_sim=float(estimator(batch)["dynamics_ratio"][sim].mean()),
                 accuracy_sa=float(ratio_losses["accuracy_sa"]),
                 accuracy=float(ratio_losses["accuracy"]),
-                **{name: float(value) for name, value in losses.items()},
-                **{name: float(value) for name, value in ratio_losses.items() if name.startswith("loss_")},
+                **{name: value.item() for name, value in losses.items()},
+                **{name: value.item() for name, value in ratio_losses.items() if name.startswith("loss_")},
             )
     collector.shutdown()
     return actor, training

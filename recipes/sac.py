@@ -65,7 +65,7 @@ def train_sac(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[t
                 return_real=evaluation.mean,
                 return_real_std=evaluation.std,
                 length_real=evaluation.mean_length,
-                **{name: float(value) for name, value in losses.items()},
+                **{name: value.item() for name, value in losses.items()},
             )
     collector.shutdown()
     return actor, training
