@@ -28,6 +28,7 @@ SMALL = [
     "updates_per_epoch=20",
     "steps_per_epoch=40",
     "eval_every=1",
+    "checkpoint_every=1",
     "eval_episodes=1",
     "final_episodes=1",
     "num_cells=[8,8]",
