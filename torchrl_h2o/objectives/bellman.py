@@ -20,7 +20,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_h2o.objectives.common import HybridLoss, like_rows
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, like_rows
 
 
 class EntropyBonus(TensorDictModuleBase):
@@ -78,7 +78,7 @@ class MixedBellmanLoss(HybridLoss):
         exploration (TensorDictModule, optional): writes ``exploration_bonus``. Defaults to :class:`EntropyBonus`.
         alpha_init (float, optional): β. Defaults to 1.0.
         num_qvalue_nets (int, optional): size of the ensemble; the target takes its minimum. Defaults to 2.
-        reduction (str, optional): see :class:`~torchrl_h2o.objectives.common.HybridLoss`.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`.
 
     Raises:
         ValueError: if λ is outside [0, 1] or β is not positive.
@@ -180,10 +180,10 @@ class MixedBellmanLoss(HybridLoss):
         """Sets γ of Eq. (7): ``loss.make_value_estimator(gamma=0.98)``.
 
         Raises:
-            NotImplementedError: for an estimator that is not TD(0): Eq. (7) is a one-step target.
+            ValueError: for an estimator that is not TD(0): Eq. (7) is a one-step target, there is no other.
         """
         if value_type not in (None, ValueEstimators.TD0):
-            raise NotImplementedError(f"Eq. (7) is a one-step target: TD0 alone fits, not {value_type}.")
+            raise ValueError(f"Eq. (7) is a one-step target: TD0 alone fits, not {value_type}.")
         self.gamma = float(hyperparams.pop("gamma", 0.99))
         if hyperparams:
             raise TypeError(f"TD0 takes gamma alone, not {sorted(hyperparams)}.")

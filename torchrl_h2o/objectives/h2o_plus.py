@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite
 
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
-from torchrl_h2o.objectives.common import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 from torchrl_h2o.objectives.ratio import DynamicsRatioLoss
 from torchrl_h2o.objectives.value import InSampleValueLoss
 
@@ -40,7 +40,7 @@ class H2OPlusLoss(MixedBellmanLoss):
         fixed_alpha (bool, optional): whether β stays as it is. Defaults to ``False``.
         target_entropy (float or "auto", optional): in nats; ``"auto"`` is -dim(A), from the actor's spec.
         num_qvalue_nets (int, optional): see :class:`MixedBellmanLoss`.
-        reduction (str, optional): see :class:`~torchrl_h2o.objectives.common.HybridLoss`; that of its parts too.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`; that of its parts too.
 
     Raises:
         ValueError: if the target entropy is "auto" and the actor has no action spec, or a part reduces differently.

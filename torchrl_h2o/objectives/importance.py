@@ -10,7 +10,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from torchrl_h2o.objectives.common import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
 class ImportanceWeightedLoss(HybridLoss):

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_h2o.objectives.common import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
 class DynamicsRatioEstimator(TensorDictModuleBase):
@@ -129,7 +129,7 @@ class DynamicsRatioLoss(HybridLoss):
     Keyword Args:
         input_noise (float or None, optional): standard deviation, in each input's own unit. 0 or ``None`` switches
             it off. Defaults to 0.1.
-        reduction (str, optional): see :class:`~torchrl_h2o.objectives.common.HybridLoss`.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`.
 
     Reads what the estimator reads and ``real`` ``[*B]``. Writes ``loss_ratio_sa``, ``loss_ratio_sas``, and
     ``accuracy_sa`` and ``accuracy`` (of the classifier of (s, a, s')), the mean of the two streams' hit rates.

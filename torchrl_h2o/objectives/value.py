@@ -14,7 +14,7 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 
-from torchrl_h2o.objectives.common import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
 class InSampleValueLoss(HybridLoss):

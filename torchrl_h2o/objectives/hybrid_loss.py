@@ -7,6 +7,7 @@ the rows nor the share of real rows in a batch changes a loss.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -56,15 +57,17 @@ class HybridLoss(LossModule):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', not {reduction!r}.")
         self.reduction = reduction
 
+    @abstractmethod
     def _read_keys(self) -> Iterable[NestedKey]:
-        raise NotImplementedError
+        """What the loss cannot do without: its ``in_keys``."""
 
     def _optional_keys(self) -> Iterable[NestedKey]:
         """What the loss reads if it is there: not in ``in_keys``, but dispatched like them, after them."""
         return ()
 
+    @abstractmethod
     def _written_keys(self) -> Iterable[NestedKey]:
-        raise NotImplementedError
+        """What the loss returns: its ``out_keys``."""
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """No loss here holds a value estimator: the targets are written out beside their equations."""
