@@ -1,8 +1,8 @@
 """The losses of H2O+ as TorchRL loss modules. Needs torch, tensordict and torchrl alone."""
 
 from torchrl_h2o.objectives.bellman import EntropyBonus, MixedBellmanLoss
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 from torchrl_h2o.objectives.h2o_plus import H2OPlusLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 from torchrl_h2o.objectives.importance import ImportanceWeightedLoss
 from torchrl_h2o.objectives.networks import (
     make_actor,
