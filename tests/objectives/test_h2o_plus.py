@@ -68,12 +68,12 @@ def test_actor_and_alpha_losses_are_equation_10(parts, batch):
         terms[row["real"]].append(0.3 * expected_log_prob - q)
         entropies[row["real"]].append(expected_log_prob)
     torch.manual_seed(4)
-    got, sampled = loss.actor_loss(batch)
+    got, sampled = loss.actor_loss(batch, loss._rows(batch))
     expected = (reference.mean(terms[True]) + reference.mean(terms[False])) / 2
     assert got.item() == pytest.approx(expected, rel=1e-5)
     mean_log_prob = (reference.mean(entropies[True]) + reference.mean(entropies[False])) / 2
     expected_alpha = -loss.log_alpha.item() * (mean_log_prob - ACTION_DIM)
-    assert loss.alpha_loss(sampled, batch).item() == pytest.approx(expected_alpha, rel=1e-5)
+    assert loss.alpha_loss(sampled, loss._rows(batch)).item() == pytest.approx(expected_alpha, rel=1e-5)
 
 
 def test_alpha_grows_while_the_entropy_is_below_its_target(parts, batch):
@@ -87,7 +87,7 @@ def test_the_logged_entropy_is_minus_the_mean_log_probability(parts, batch):
     loss = parts.h2o_plus(ratio=False)
     torch.manual_seed(3)
     loss.mixed_target(batch)
-    _, log_prob = loss.actor_loss(batch)
+    _, log_prob = loss.actor_loss(batch, loss._rows(batch))
     torch.manual_seed(3)
     expected = -(log_prob[batch["real"]].mean() + log_prob[~batch["real"]].mean()) / 2
     torch.testing.assert_close(loss(batch)["entropy"], expected)

@@ -20,7 +20,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss, like_rows
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, like_rows
 
 
 class EntropyBonus(TensorDictModuleBase):
@@ -213,15 +213,15 @@ class MixedBellmanLoss(HybridLoss):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._output({"loss_qvalue": self.qvalue_loss(tensordict)}, tensordict)
+        return self._output({"loss_qvalue": self.qvalue_loss(tensordict, self._rows(tensordict))}, tensordict)
 
-    def qvalue_loss(self, tensordict: TensorDictBase) -> Tensor:
+    def qvalue_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Eq. (8), reduced; writes the td error into ``tensordict``."""
         qvalues = self._qvalues(tensordict, self.qvalue_network_params)
         td_error = qvalues - self.mixed_target(tensordict)
         tensordict.set(self.tensor_keys.priority, td_error.detach().abs().amax(0))
         terms = (td_error**2).sum(0)
-        return self._sum_of_means(self._weight(terms, tensordict), tensordict)  # Eq. (8)
+        return self._expectation(self._weight(terms, tensordict, rows), *rows)  # Eq. (8)
 
     @torch.no_grad()
     def mixed_target(self, tensordict: TensorDictBase) -> Tensor:
@@ -266,7 +266,7 @@ class MixedBellmanLoss(HybridLoss):
         qvalue = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
         return self._entry(qvalue(inputs, params), self.tensor_keys.state_action_value).squeeze(-1)
 
-    def _weight(self, terms: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _weight(self, terms: Tensor, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Terms of simulated rows times P / P̂, real rows as they are; both times the priority's weight."""
         priority_weight = self._maybe_get_priority_weight(tensordict)
         if priority_weight is not None:
@@ -274,8 +274,7 @@ class MixedBellmanLoss(HybridLoss):
         ratio = tensordict.get(self.tensor_keys.dynamics_ratio, None)
         if ratio is None:
             return terms
-        real, _ = self._rows(terms, tensordict)
-        return torch.where(real, terms, like_rows(ratio.detach(), terms) * terms)
+        return torch.where(rows.real, terms, like_rows(ratio.detach(), terms) * terms)
 
 
 def _action_key(actor_network: ProbabilisticTensorDictSequential) -> NestedKey:

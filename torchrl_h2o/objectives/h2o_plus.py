@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite
 
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 from torchrl_h2o.objectives.ratio import DynamicsRatioLoss
 from torchrl_h2o.objectives.value import InSampleValueLoss
 
@@ -176,52 +176,49 @@ class H2OPlusLoss(MixedBellmanLoss):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        batch = tensordict.copy()
-        ratio_terms = {} if self.ratio_loss is None else self._ratio_terms(batch)
-        loss_qvalue = self.qvalue_loss(batch)
+        batch, rows = tensordict.copy(), self._rows(tensordict)
+        ratio_terms = {} if self.ratio_loss is None else self._ratio_terms(batch, rows)
+        loss_qvalue = self.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
         batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
         loss_value = self.value_loss.value_loss(batch)
-        loss_actor, log_prob = self.actor_loss(batch)
+        loss_actor, log_prob = self.actor_loss(batch, rows)
         terms = {
             "loss_actor": loss_actor,
             "loss_qvalue": loss_qvalue,
             "loss_value": loss_value,
-            "loss_alpha": self.alpha_loss(log_prob, batch),
+            "loss_alpha": self.alpha_loss(log_prob, rows),
             **ratio_terms,
         }
         if self.reduction != "none":
-            terms |= {"alpha": self.alpha, "entropy": self._metric(-log_prob, batch)}
+            terms |= {"alpha": self.alpha, "entropy": self._metric(-log_prob, rows)}
         return self._output(terms, tensordict)
 
-    def _ratio_terms(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _ratio_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
         """Eq. (9): writes the ratio into the batch and returns the discriminators' losses."""
-        estimator = self.ratio_loss.estimator
-        ratio = self.ratio_loss.log_dynamics_ratio(batch).get(estimator.out_keys[-1])
+        ratio = self.ratio_loss.dynamics_ratio(batch)
         batch.set(self.tensor_keys.dynamics_ratio, ratio)
-        terms = dict(self.ratio_loss(batch).items())
-        _, sim = self._rows(ratio, batch)
-        terms["dynamics_ratio"] = ratio if self.reduction == "none" else self._mean(ratio, sim)
-        return terms
+        shown = ratio if self.reduction == "none" else self._expectation(ratio, rows.sim, reduction="mean")
+        return {**self.ratio_loss(batch), "dynamics_ratio": shown}
 
     @torch.no_grad()
     def _data_qvalue(self, batch: TensorDictBase) -> Tensor:
         """Minimum of the target Q at the data's own action, ``[*B]``: what V is regressed on."""
         return self._qvalues(batch, self.target_qvalue_network_params).amin(0)
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def actor_loss(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, Tensor]:
         """Eq. (10), reduced, and log π(a|s) of the sampled actions, ``[*B]``, a constant."""
         states = tensordict.copy()
         action, log_prob = self._sample_action(states)
         states.set(self.tensor_keys.action, action)
         qvalue = self._qvalues(states, self.qvalue_network_params.data).amin(0)
         terms = self.alpha * log_prob - qvalue  # Eq. (10)
-        return self._mean_of_means(terms, tensordict), log_prob.detach()
+        return self._union_expectation(terms, rows), log_prob.detach()
 
-    def alpha_loss(self, log_prob: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def alpha_loss(self, log_prob: Tensor, rows: Rows) -> Tensor:
         """SAC's loss for β, reduced: it grows while the entropy is below its target."""
         terms = -self.log_alpha * (log_prob + self.target_entropy)
-        return self._mean_of_means(terms, tensordict)
+        return self._union_expectation(terms, rows)
 
 
 def _action_dim(actor_network: ProbabilisticTensorDictSequential, action_key: NestedKey) -> int:

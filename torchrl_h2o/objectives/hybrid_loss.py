@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -17,12 +18,19 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 
+class Rows(NamedTuple):
+    """The rows of a batch by stream, masks ``[*B]``; one that ``loss_mask_key`` excludes is in neither."""
+
+    real: Tensor
+    sim: Tensor
+
+
 class HybridLoss(LossModule):
     """Base of the losses over real (𝒟) and simulated (B) rows.
 
-    A subclass lists what it reads in ``_read_keys`` and what it writes in ``_written_keys`` and reduces
-    its per-row terms with one of :meth:`_real_mean` (:math:`E_𝒟`), :meth:`_sum_of_means`
-    (:math:`E_𝒟 + E_B`) and :meth:`_mean_of_means` (:math:`E_{𝒟∪B}`). TorchRL's ``loss_mask_key`` is honoured.
+    A subclass lists what it reads in ``_read_keys`` and what it writes in ``_written_keys``, and reduces its per-row
+    terms with :meth:`_expectation` over the rows of one stream or of both, or :meth:`_union_expectation`. TorchRL's
+    ``loss_mask_key`` is honoured.
 
     Args:
         reduction (str, optional): ``"mean"`` (default) takes each expectation over its own stream;
@@ -104,58 +112,51 @@ class HybridLoss(LossModule):
             )
         return value
 
-    def _rows(self, terms: Tensor, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Real and simulated rows as two masks of the shape of ``terms``."""
+    def _rows(self, tensordict: TensorDictBase) -> Rows:
+        """Which rows of the batch belong to which stream; found once a forward and handed on."""
         real = tensordict.get(self.tensor_keys.real, None)
         if real is None:
             raise KeyError(
                 f"the batch has no entry {self.tensor_keys.real!r}. Mark its rows with a boolean of the batch's "
                 "shape (True for measured data), or rename the entry with set_keys(real=...)."
             )
-        real = self._expand_loss_mask(real.bool(), terms)
+        real = real.bool()
+        if real.ndim > tensordict.ndim:
+            real = real.squeeze(-1)
         sim = ~real
         for key in self._loss_mask_keys():
             valid = tensordict.get(key, None)
             if valid is not None:
-                valid = self._expand_loss_mask(valid, terms)
+                valid = self._expand_loss_mask(valid, real)
                 real, sim = real & valid, sim & valid
-        return real, sim
+        return Rows(real, sim)
 
-    @staticmethod
-    def _mean(terms: Tensor, rows: Tensor) -> Tensor:
-        # Selected, not multiplied: 0 * inf is NaN. No row at all gives zero.
-        return torch.where(rows, terms, 0.0).sum() / rows.sum().clamp_min(1)
+    def _expectation(self, terms: Tensor, *streams: Tensor, reduction: str | None = None) -> Tensor:
+        """The sum over streams of the mean of the terms over each: :math:`E_𝒟[.]`, or :math:`E_𝒟[.] + E_B[.]`.
 
-    def _real_mean(self, terms: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """:math:`E_𝒟`: the mean over the real rows."""
-        real, _ = self._rows(terms, tensordict)
-        if self.reduction == "mean":
-            return self._mean(terms, real)
-        terms = torch.where(real, terms, 0.0)
-        return terms.sum() if self.reduction == "sum" else terms
-
-    def _sum_of_means(self, terms: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """:math:`E_𝒟 + E_B`: the mean over the real rows plus the mean over the simulated ones."""
-        real, sim = self._rows(terms, tensordict)
-        if self.reduction == "mean":
-            return self._mean(terms, real) + self._mean(terms, sim)
-        terms = torch.where(real | sim, terms, 0.0)
-        return terms.sum() if self.reduction == "sum" else terms
-
-    def _mean_of_means(self, terms: Tensor, tensordict: TensorDictBase, reduction: str | None = None) -> Tensor:
-        """:math:`E_{𝒟∪B}`: both streams weigh the same, however many rows each has; one alone is that stream."""
-        real, sim = self._rows(terms, tensordict)
+        Args:
+            terms: one a row, ``[*B]``.
+            *streams: the rows of each expectation, masks ``[*B]``. One without any row contributes zero.
+            reduction: instead of the loss's own.
+        """
+        # Selected, not multiplied: 0 * inf is NaN.
+        selected = [torch.where(rows, terms, 0.0) for rows in streams]
         reduction = reduction or self.reduction
         if reduction == "mean":
-            streams = real.any().to(terms.dtype) + sim.any().to(terms.dtype)
-            return (self._mean(terms, real) + self._mean(terms, sim)) / streams.clamp_min(1)
-        terms = torch.where(real | sim, terms, 0.0)
-        return terms.sum() if reduction == "sum" else terms
+            selected = [part.sum() / rows.sum().clamp_min(1) for part, rows in zip(selected, streams, strict=True)]
+        total = sum(selected)
+        return total.sum() if reduction == "sum" else total
 
-    def _metric(self, terms: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _union_expectation(self, terms: Tensor, rows: Rows, reduction: str | None = None) -> Tensor:
+        """:math:`E_{𝒟∪B}[.]`: both streams weigh the same, however many rows each has; one alone is that stream."""
+        total = self._expectation(terms, *rows, reduction=reduction)
+        if (reduction or self.reduction) != "mean":
+            return total
+        return total / sum(stream.any().to(terms.dtype) for stream in rows).clamp_min(1)
+
+    def _metric(self, terms: Tensor, rows: Rows) -> Tensor:
         """A figure to log: a mean whatever the losses' reduction, or one value a row beside one loss a row."""
-        reduction = "none" if self.reduction == "none" else "mean"
-        return self._mean_of_means(terms.detach(), tensordict, reduction)
+        return self._union_expectation(terms.detach(), rows, "none" if self.reduction == "none" else "mean")
 
     def _output(self, losses: dict[str, Tensor], tensordict: TensorDictBase) -> TensorDict:
         """The losses as TorchRL returns them: scalars, or one term a row with ``reduction="none"``."""

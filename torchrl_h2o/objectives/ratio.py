@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 
 
 class DynamicsRatioEstimator(TensorDictModuleBase):
@@ -171,34 +171,33 @@ class DynamicsRatioLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return "loss_ratio_sa", "loss_ratio_sas", "accuracy_sa", "accuracy"
 
-    def log_dynamics_ratio(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The transitions with the estimator's two entries, ``[*B]`` each, from this loss's current parameters."""
+    def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
+        """Eq. (9) of this loss's current parameters, a constant, ``[*B]``."""
         with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
-            return self.estimator(tensordict.select(*self.estimator.in_keys))
+            estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
+        return estimated.get(self.estimator.out_keys[-1])
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        inputs = tensordict.select(*self.estimator.in_keys)
+        inputs, rows = tensordict.select(*self.estimator.in_keys), self._rows(tensordict)
         if self.training and self.input_noise:
             inputs = inputs.apply(lambda x: x + self.input_noise * torch.randn_like(x))
         with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
             sa, sas = self.estimator.log_odds(inputs)
         return self._output(
             {
-                "loss_ratio_sa": self._cross_entropy(sa, tensordict),
-                "loss_ratio_sas": self._cross_entropy(sas, tensordict),
-                "accuracy_sa": self._accuracy(sa, tensordict),
-                "accuracy": self._accuracy(sas, tensordict),
+                "loss_ratio_sa": self._cross_entropy(sa, rows),
+                "loss_ratio_sas": self._cross_entropy(sas, rows),
+                "accuracy_sa": self._accuracy(sa, rows),
+                "accuracy": self._accuracy(sas, rows),
             },
             tensordict,
         )
 
-    def _cross_entropy(self, log_odds: Tensor, tensordict: TensorDictBase) -> Tensor:
-        real, _ = self._rows(log_odds, tensordict)
-        terms = F.softplus(torch.where(real, -log_odds, log_odds))  # -log p(own stream)
-        return self._sum_of_means(terms, tensordict)
+    def _cross_entropy(self, log_odds: Tensor, rows: Rows) -> Tensor:
+        terms = F.softplus(torch.where(rows.real, -log_odds, log_odds))  # -log p(own stream)
+        return self._expectation(terms, *rows)
 
-    def _accuracy(self, log_odds: Tensor, tensordict: TensorDictBase) -> Tensor:
-        real, _ = self._rows(log_odds, tensordict)
-        hits = ((log_odds > 0) == real).to(log_odds.dtype)
-        return self._metric(hits, tensordict)
+    def _accuracy(self, log_odds: Tensor, rows: Rows) -> Tensor:
+        hits = ((log_odds > 0) == rows.real).to(log_odds.dtype)
+        return self._metric(hits, rows)

@@ -95,7 +95,7 @@ class InSampleValueLoss(HybridLoss):
         with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
             value = self._entry(self.value_network(states), self.tensor_keys.value).squeeze(-1)
         qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
-        return self._real_mean(self.penalty(qvalue - value), tensordict)  # Eq. (4)
+        return self._expectation(self.penalty(qvalue - value), self._rows(tensordict).real)  # Eq. (4)
 
 
 class ExpectileValueLoss(InSampleValueLoss):
