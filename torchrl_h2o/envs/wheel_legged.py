@@ -7,7 +7,9 @@ effects, see recipes/config/env/wheel_legged.yaml.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -31,6 +33,7 @@ OBSERVATIONS = {
 TARGET_VELOCITY = 0.2  # m/s, of the task moving_forward
 MAX_PITCH = math.pi / 6  # rad; beyond it the robot is lost
 FRAME_SKIP = 2  # physics steps of 2.5 ms a control step: 200 Hz
+WHEEL_RADIUS = 0.065  # m
 
 
 def reward(task: str, observation: Array, action: Array, next_observation: Array) -> Array:
@@ -117,6 +120,10 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
         "render_fps": 200,
     }
+    #: what the robot does not observe but follows, as its wheels roll without slip: they turn against the body
+    hidden_state: Mapping[str, Mapping[str, float]] = MappingProxyType(
+        {"axle_velocity": {"x_velocity": 1.0 / WHEEL_RADIUS, "pitch_velocity": -1.0}}
+    )
 
     def __init__(
         self,

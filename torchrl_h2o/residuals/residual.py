@@ -1,0 +1,91 @@
+"""The residual: what was measured minus what the simulator makes of the same state and the same actions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.effects import ObservationEffect
+from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.simulation import Simulation
+
+_SETTLING = 12  # control steps in which what is hidden follows from what is not
+
+
+def residuals(
+    simulation: Simulation,
+    measured: Measured,
+    starts: np.ndarray,
+    horizon: int = 1,
+    *,
+    states: np.ndarray | None = None,
+    applied: np.ndarray | None = None,
+) -> np.ndarray:
+    """Residuals over windows that each start from their own measured state.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        starts: (W), the first row of each window.
+        horizon: control steps a window.
+        states: (T, nq + nv), to start from instead of the measured ones.
+        applied: (W, H, nv), generalised forces in N or N·m beside those of the effects.
+
+    Returns:
+        (W, H, n), in the units of the observations; NaN where the simulation diverges.
+    """
+    if states is None:
+        states = start_states(simulation, measured)
+    rows = starts[:, None] + np.arange(horizon)
+    reached = simulation.rollout(
+        states[starts], executed_actions(simulation, measured)[rows], time=measured.time[starts], applied=applied
+    )
+    observed = simulation.state_map.observations(reached)
+    for effect in simulation.effects:
+        if isinstance(effect, ObservationEffect) and effect.memoryless and not effect.is_neutral and not effect.random:
+            observed = effect.process(simulation.control_step, None)(observed)
+    return _without_delay(simulation, measured)[rows] - observed
+
+
+def start_states(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """The measured states, (T, nq + nv): observations through the state map, what is hidden carried along."""
+    state_map = simulation.state_map
+    true = np.concatenate([simulation.true_observations(measured.observation[run]) for run in measured.runs])
+    states = state_map.states(true)
+    if state_map.hidden:
+        states[:, state_map.hidden] = _settled(simulation, measured, states)
+    return states
+
+
+def _settled(simulation: Simulation, measured: Measured, states: np.ndarray) -> np.ndarray:
+    """What is hidden, (T, hidden): simulated from some rows before, with all else as measured at every row."""
+    hidden = list(simulation.state_map.hidden)
+    actions = executed_actions(simulation, measured)
+    first = np.maximum(np.arange(len(measured)) - _SETTLING, 0)
+    # where a run begins, its first row is repeated
+    begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])
+    carried = states[:, hidden]
+    for step in range(_SETTLING):
+        row = np.maximum(first + step, begins)
+        now = states[row]
+        now[:, hidden] = carried
+        carried = simulation.rollout(now, actions[row][:, None], time=measured.time[row])[:, 0, hidden]
+    return carried
+
+
+def executed_actions(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """What is executed of the measured actions, (T, nu), run by run."""
+    return np.concatenate([simulation.executed(measured.action[run]) for run in measured.runs])
+
+
+def _without_delay(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """The following observations, (T, n), at the time at which they were true: sensors that remember are undone."""
+    remember = [
+        effect
+        for effect in simulation.effects
+        if isinstance(effect, ObservationEffect) and not effect.memoryless and not effect.is_neutral
+    ]
+    following = measured.following
+    for effect in reversed(remember):
+        whole = [np.vstack([measured.observation[run][:1], following[run]]) for run in measured.runs]
+        following = np.concatenate([effect.restore(part, simulation.control_step)[1:] for part in whole])
+    return following

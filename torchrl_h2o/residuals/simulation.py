@@ -1,0 +1,181 @@
+"""A simulator as tracing sees it: a model that effects can be put into, stepped from many states at once.
+
+Everything runs through ``mujoco.rollout``; one control step is ``frame_skip`` physics steps under one action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from os import cpu_count
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+from torchrl.envs import EnvBase
+
+from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect, compile_model
+from torchrl_h2o.residuals.state_map import StateMap
+
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_CTRL_AND_FORCE = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+_CHUNK = 2**24  # numbers that a rollout may return at once: 128 MB
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulator, its control step, what is observed of it, and the effects that are in it.
+
+    Args:
+        spec: returns the model's specification, parsed anew.
+        frame_skip: physics steps a control step.
+        state_map: how observations and states belong together.
+        effects: those in it, in their order.
+        name: what to call it in reports.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.effects import Gravity
+        >>> from torchrl_h2o.residuals import Simulation
+        >>> simulation = Simulation.from_env(GymEnv("HalfCheetah-v5"))
+        >>> simulation.with_effects(Gravity(2.0)).model.opt.gravity[2]
+        np.float64(-19.62)
+    """
+
+    spec: Callable[[], mujoco.MjSpec]
+    frame_skip: int
+    state_map: StateMap
+    effects: tuple[Effect, ...] = ()
+    name: str = "simulator"
+    _pool: Rollout = field(default_factory=lambda: Rollout(nthread=cpu_count()), repr=False)
+
+    @classmethod
+    def from_env(cls, env: EnvBase) -> Simulation:
+        """The simulation inside a TorchRL env of a Gymnasium MuJoCo task, with the env's gaps.
+
+        Raises:
+            ValueError: if the env does not run on MuJoCo or its observation is not linear in the state.
+        """
+        from torchrl_h2o.residuals.from_env import simulation_of
+
+        return simulation_of(env)
+
+    @classmethod
+    def from_mjcf(
+        cls, path: str | Path, state_map: StateMap | Sequence[str], control_step: float, effects: Sequence[Effect] = ()
+    ) -> Simulation:
+        """An MJCF file.
+
+        Args:
+            path: of the file.
+            state_map: a map, or the names of what is observed, in the order of the data: a joint's name for its
+                position, with ``_velocity`` behind it for its velocity.
+            control_step: the time between two rows of the data, in s: a multiple of the model's timestep.
+            effects: put into it.
+
+        Raises:
+            ValueError: for names that the model does not have, or a control step that is no multiple.
+        """
+        from torchrl_h2o.residuals.from_mjcf import simulation_of
+
+        return simulation_of(Path(path), state_map, control_step, tuple(effects), cls)
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled model with the model effects in it."""
+        return compile_model(self.spec(), self.effects)
+
+    @property
+    def control_step(self) -> float:
+        """The time between two actions, in s."""
+        return self.frame_skip * self.model.opt.timestep
+
+    @cached_property
+    def _data(self) -> list[mujoco.MjData]:
+        return [mujoco.MjData(self.model) for _ in range(max(1, self._pool.nthread))]
+
+    def with_effects(self, *effects: Effect) -> Simulation:
+        """The simulation with more effects in it, behind those that are in it."""
+        return replace(self, effects=(*self.effects, *effects))
+
+    def executed(self, actions: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
+        """What is executed of the actions of one recorded run, (T, nu), after the action effects.
+
+        Random effects are left out without a generator.
+        """
+        for effect in self.effects:
+            if isinstance(effect, ActionEffect) and not effect.is_neutral and (rng or not effect.random):
+                actions = effect.run(actions, self.control_step, rng)
+        return actions
+
+    def true_observations(self, observations: np.ndarray) -> np.ndarray:
+        """What the sensors of one run, (T, n), saw before the observation effects; NaN where that cannot be told."""
+        for effect in reversed(self.effects):
+            if isinstance(effect, ObservationEffect) and not effect.is_neutral:
+                observations = effect.restore(observations, self.control_step)
+        return observations
+
+    def rollout(
+        self,
+        states: np.ndarray,
+        actions: np.ndarray,
+        *,
+        time: np.ndarray | None = None,
+        applied: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Steps many states at once.
+
+        Args:
+            states: (B, nq + nv), where to start from.
+            actions: (B, H, nu), executed for H control steps.
+            time: (B), of the start, in s; 0 by default.
+            applied: (B, H, nv), generalised forces in N or N·m beside those of the effects.
+
+        Returns:
+            The states after each control step, (B, H, nq + nv); NaN from where the simulation diverges on.
+        """
+        batch, horizon, _ = actions.shape
+        size = mujoco.mj_stateSize(self.model, _FULL)
+        full = np.zeros((batch, size))
+        full[:, 0] = 0.0 if time is None else time
+        full[:, 1 : 1 + states.shape[1]] = states
+        forces = [e.batched(self.model) for e in self.effects if isinstance(e, ForceEffect) and not e.is_neutral]
+        step = self._forced if forces else self._free
+        chunk = max(1, _CHUNK // (horizon * self.frame_skip * size))
+        parts = [
+            step(full[i : i + chunk], actions[i : i + chunk], None if applied is None else applied[i : i + chunk], forces)
+            for i in range(0, batch, chunk)
+        ]
+        reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
+        reached = reached[:, :, 1 : 1 + states.shape[1]]
+        # MuJoCo starts anew from the model's own pose where a state is not finite or far too large
+        return reached
+
+    def _free(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
+        """Without forces that depend on the state: one rollout."""
+        control, spec = actions, mujoco.mjtState.mjSTATE_CTRL
+        if applied is not None:
+            control, spec = np.concatenate([actions, applied], -1), _CTRL_AND_FORCE
+        control = np.repeat(control, self.frame_skip, axis=1)
+        states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=spec.value)
+        return states[:, self.frame_skip - 1 :: self.frame_skip]
+
+    def _forced(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
+        """Under forces: physics step by physics step, each under the forces of the state that it starts from."""
+        nq, nv = self.model.nq, self.model.nv
+        reached = []
+        for step in range(actions.shape[1]):
+            ctrl = actions[:, step]
+            for _ in range(self.frame_skip):
+                total = np.zeros((len(full), nv)) if applied is None else applied[:, step].copy()
+                for force in forces:
+                    total += force(full[:, 1 : 1 + nq], full[:, 1 + nq : 1 + nq + nv], ctrl, full[:, 0])
+                control = np.concatenate([ctrl, total], -1)[:, None]
+                states, _ = self._pool.rollout(
+                    self.model, self._data, full, control, control_spec=_CTRL_AND_FORCE.value
+                )
+                full = states[:, 0]
+            reached.append(full)
+        return np.stack(reached, axis=1)

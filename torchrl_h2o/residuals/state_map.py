@@ -1,0 +1,148 @@
+"""How an observation and the model's state belong together: what turns measured rows into states to start from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+_PROBES = 4  # states beyond those that a linear map needs, to see whether it is one
+
+
+@dataclass(frozen=True, eq=False)
+class StateMap:
+    """A linear map between observations and states (qpos, qvel).
+
+    Args:
+        names: of the observations, (n).
+        units: of the observations, (n).
+        observe: (n, nq + nv), the observation is ``observe @ state``, clipped to ``clip``.
+        restore: (nq + nv, n), the state is ``offset + restore @ observation``.
+        offset: (nq + nv), what is not observed stands there.
+        clip: (n, 2), the smallest and the largest value that is reported.
+        hidden: the indices of the state that no observation tells and that matter: they follow from what the simulator
+            did before.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_h2o.residuals import StateMap
+        >>> pendulum = StateMap.of_coordinates(("angle", "rate"), ("rad", "rad/s"), (0, 1), num_states=2)
+        >>> pendulum.states(np.array([[0.5, -1.0]]))
+        array([[ 0.5, -1. ]])
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    observe: np.ndarray
+    restore: np.ndarray
+    offset: np.ndarray
+    clip: np.ndarray
+    hidden: tuple[int, ...] = ()
+
+    @classmethod
+    def of_coordinates(
+        cls, names: Sequence[str], units: Sequence[str], indices: Sequence[int], num_states: int
+    ) -> StateMap:
+        """Every observation is one coordinate of the state, at an index of (qpos, qvel)."""
+        observe = np.zeros((len(names), num_states))
+        observe[np.arange(len(names)), indices] = 1.0
+        clip = np.tile([-np.inf, np.inf], (len(names), 1))
+        return cls(tuple(names), tuple(units), observe, observe.T.copy(), np.zeros(num_states), clip)
+
+    def states(self, observations: np.ndarray) -> np.ndarray:
+        """The states, (..., nq + nv), that observations (..., n) tell of."""
+        return self.offset + observations @ self.restore.T
+
+    def observations(self, states: np.ndarray) -> np.ndarray:
+        """The observations (..., n) of states (..., nq + nv), without any clipping."""
+        return states @ self.observe.T
+
+    def clipped(self, observations: np.ndarray) -> np.ndarray:
+        """Which rows, (...), of observations (..., n) hold a value at which the sensor was at its end."""
+        low, high = self.clip.T
+        return ((observations <= low) | (observations >= high)).any(-1)
+
+
+def coordinate_names(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
+    """Names and units of every coordinate of (qpos, qvel), after the joints.
+
+    A joint's angle goes by its own name, its velocity by ``name_velocity``.
+    """
+    positions, velocities, position_units, velocity_units = [], [], [], []
+    for index in range(model.njnt):
+        name, kind = model.joint(index).name or f"joint_{index}", model.jnt_type[index]
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            positions += [f"{name}_{axis}" for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+            position_units += ["m"] * 3 + ["1"] * 4
+            velocities += [f"{name}_{axis}_velocity" for axis in ("x", "y", "z", "roll", "pitch", "yaw")]
+            velocity_units += ["m/s"] * 3 + ["rad/s"] * 3
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            positions += [f"{name}_{axis}" for axis in ("qw", "qx", "qy", "qz")]
+            position_units += ["1"] * 4
+            velocities += [f"{name}_{axis}_velocity" for axis in ("roll", "pitch", "yaw")]
+            velocity_units += ["rad/s"] * 3
+        else:
+            unit = "rad" if kind == mujoco.mjtJoint.mjJNT_HINGE else "m"
+            positions.append(name)
+            position_units.append(unit)
+            velocities.append(f"{name}_velocity")
+            velocity_units.append(f"{unit}/s")
+    return positions + velocities, position_units + velocity_units
+
+
+def probe_gymnasium(task, rng: np.random.Generator) -> StateMap:
+    """The state map of a Gymnasium MuJoCo task, found by showing it states and reading its observations.
+
+    A task may state in ``hidden_state`` how a velocity that it does not observe follows from observations:
+    ``{joint: {observed coordinate: factor}}``.
+
+    Args:
+        task: a :class:`gymnasium.envs.mujoco.MujocoEnv`; its state is put back afterwards.
+        rng: draws the states.
+
+    Returns:
+        The map.
+
+    Raises:
+        ValueError: if the observation is not linear in the state.
+    """
+    model = task.model
+    num_states = model.nq + model.nv
+    before = task.data.qpos.copy(), task.data.qvel.copy()
+    states = 0.01 * rng.standard_normal((num_states + 1 + _PROBES, num_states))
+    observed = np.array([_observation(task, state) for state in states], dtype=np.float64)
+    design = np.hstack([states, np.ones((len(states), 1))])
+    solution = np.linalg.lstsq(design, observed, rcond=None)[0]
+    error = np.abs(design @ solution - observed).max()
+    far = 1e3 * np.ones((2, num_states)) * np.array([[-1.0], [1.0]])
+    clip = np.array([_observation(task, state) for state in far], dtype=np.float64).T
+    task.set_state(*before)
+    observe = solution[:-1].T
+    observe[np.abs(observe) < 1e-5] = 0.0
+    one_each = (np.abs(observe) > 0).sum(1) == 1
+    if error > 1e-5 or np.abs(solution[-1]).max() > 1e-5 or not one_each.all():
+        raise ValueError(
+            f"{type(task).__name__} does not observe coordinates of its state as they are (qpos and qvel); its "
+            "observation cannot be turned into a state. Give the simulation a StateMap of your own"
+        )
+    indices = np.abs(observe).argmax(1)
+    names, units = coordinate_names(model)
+    found = StateMap.of_coordinates(
+        [names[i] for i in indices], [units[i] for i in indices], indices.tolist(), num_states
+    )
+    offset = np.concatenate([task.init_qpos, np.zeros(model.nv)])
+    offset[indices] = 0.0
+    restore = found.restore.copy()
+    for joint, factors in getattr(task, "hidden_state", {}).items():
+        for coordinate, factor in factors.items():
+            restore[names.index(joint), found.names.index(coordinate)] = factor
+    unclipped = np.sort(far[:, indices].T, axis=1)
+    clip = np.where(np.abs(clip) < np.abs(unclipped), clip, unclipped * np.inf)
+    return StateMap(found.names, found.units, found.observe, restore, offset, clip)
+
+
+def _observation(task, state: np.ndarray) -> np.ndarray:
+    task.set_state(state[: task.model.nq], state[task.model.nq :])
+    return task._get_obs()
