@@ -1,13 +1,13 @@
-"""Effects on the way in: what becomes of an action before the simulator executes it."""
+"""Effects on the size of actions: stronger or weaker, off by a constant, noisy."""
 
-from collections import deque
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from torchrl_h2o.effects.effect import ActionEffect, Process, parameter
+from torchrl_h2o.effects.effect import ActionEffect, Process
 from torchrl_h2o.effects.entries import Indices, entry_mask
+from torchrl_h2o.effects.parameter import parameter
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,7 @@ class ActionNoise(ActionEffect):
 
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"
     random: ClassVar[bool] = True
+    memoryless: ClassVar[bool] = True
     std: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=0.0)
     actuators: Indices = None
 
@@ -41,41 +42,6 @@ class ActionNoise(ActionEffect):
             return action + entry_mask(action, self.actuators) * noise
 
         return noisy
-
-
-@dataclass(frozen=True)
-class ActionDelay(ActionEffect):
-    """Actuation that is late, by any time, also a fraction of a control step.
-
-    With a delay of k + f control steps the drive still follows the command before last for the
-    first f of a step. A control step executes one action, so it is given the mean of the two,
-    (1 - f) · a(t - k) + f · a(t - k - 1), which has the same impulse. Before the first command the
-    delay line holds zeros.
-
-    Args:
-        delay: the delay, in s.
-
-    Examples:
-        >>> import numpy as np
-        >>> late = ActionDelay(0.015).process(dt=0.01, rng=np.random.default_rng(0))
-        >>> [float(late(np.array([command]))[0]) for command in (1.0, 1.0, 1.0, 1.0)]
-        [0.0, 0.5, 1.0, 1.0]
-    """
-
-    wording: ClassVar[str] = "actions late by {delay}"
-    delay: float = parameter(unit="s", bounds=(0.0, 1.0), neutral=0.0)
-
-    def process(self, dt: float, rng: np.random.Generator) -> Process:
-        steps, fraction = divmod(self.delay / dt, 1.0)
-        line = deque(maxlen=int(steps) + 2)
-
-        def late(action: np.ndarray) -> np.ndarray:
-            if not line:
-                line.extend([np.zeros_like(action)] * (line.maxlen - 1))
-            line.append(action.copy())
-            return (1.0 - fraction) * line[1] + fraction * line[0]
-
-        return late
 
 
 @dataclass(frozen=True)
@@ -96,6 +62,7 @@ class ActionGain(ActionEffect):
     """
 
     wording: ClassVar[str] = "{actuators} × {scale}"
+    memoryless: ClassVar[bool] = True
     scale: float = parameter(unit="1", bounds=(-10.0, 10.0), neutral=1.0)
     actuators: Indices = None
 
@@ -104,3 +71,29 @@ class ActionGain(ActionEffect):
             return np.where(entry_mask(action, self.actuators), self.scale * action, action)
 
         return scaled
+
+
+@dataclass(frozen=True)
+class ActionBias(ActionEffect):
+    """Actuation that is off by a constant.
+
+    Args:
+        bias: what is added to the action, in units of the action.
+        actuators: indices of the entries of the action that are off, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> ActionBias(0.5, actuators=(1,)).process(0.05, np.random.default_rng(0))(np.ones(2))
+        array([1. , 1.5])
+    """
+
+    wording: ClassVar[str] = "bias of {bias} on {actuators}"
+    memoryless: ClassVar[bool] = True
+    bias: float = parameter(unit="1", bounds=(-100.0, 100.0), neutral=0.0)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        def biased(action: np.ndarray) -> np.ndarray:
+            return action + entry_mask(action, self.actuators) * self.bias
+
+        return biased

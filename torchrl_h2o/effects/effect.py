@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects.entries import Indices, checked_indices
+from torchrl_h2o.effects.parameter import Parameter
 from torchrl_h2o.effects.selection import Names, checked_names
 
 # by the types of the fields, as types and as text under ``from __future__ import annotations``
@@ -22,41 +23,7 @@ _SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_in
 
 Process = Callable[[np.ndarray], np.ndarray]
 Force = Callable[[mujoco.MjData], np.ndarray]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter of an effect, with what a fit or a reader needs to know of it.
-
-    Args:
-        value: the value, in ``unit``.
-        unit: the unit, ``"1"`` for a pure number.
-        bounds: the smallest and the largest legal value, both inclusive.
-        neutral: the value at which the effect changes nothing.
-    """
-
-    value: float
-    unit: str
-    bounds: tuple[float, float]
-    neutral: float
-
-    def __str__(self) -> str:
-        return f"{self.value:g}" if self.unit == "1" else f"{self.value:g} {self.unit}"
-
-
-def parameter(*, unit: str, bounds: tuple[float, float], neutral: float) -> Any:
-    """A dataclass field that is a parameter of an effect; its default is the neutral value.
-
-    Args:
-        unit: the unit, ``"1"`` for a pure number.
-        bounds: the smallest and the largest legal value, both inclusive.
-        neutral: the value at which the effect changes nothing.
-
-    Returns:
-        The field, for the body of an :class:`Effect` subclass.
-    """
-    metadata = {"unit": unit, "bounds": bounds, "neutral": neutral}
-    return dataclasses.field(default=neutral, metadata=metadata)
+BatchedForce = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -168,7 +135,13 @@ class ModelEffect(Effect):
 
 
 class ActionEffect(Effect):
-    """An effect on the way in: what the simulator executes of the action asked for."""
+    """An effect on the way in: what the simulator executes of the action asked for.
+
+    ``memoryless`` is whether an action executed depends on nothing but the one asked for at the same
+    step, so that :meth:`process` may be given many steps at once.
+    """
+
+    memoryless: ClassVar[bool] = False
 
     @abstractmethod
     def process(self, dt: float, rng: np.random.Generator) -> Process:
@@ -182,6 +155,22 @@ class ActionEffect(Effect):
             A function from the action asked for to the action executed, both (..., nu), called
             once a control step. What it must remember, it keeps to itself: the effect stays frozen.
         """
+
+    def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
+        """What becomes of the actions of one whole run, as :meth:`process` makes it step by step.
+
+        Args:
+            actions: the actions asked for (T, nu), from the start of the run.
+            dt: the control step, in seconds.
+            rng: the run's random generator.
+
+        Returns:
+            The actions executed (T, nu), a new array.
+        """
+        process = self.process(dt, rng)
+        if self.memoryless:
+            return process(actions)
+        return np.array([process(action) for action in actions]).reshape(actions.shape)
 
 
 class ForceEffect(Effect):
@@ -209,6 +198,34 @@ class ForceEffect(Effect):
             ValueError: if the model has nothing that the effect could act on.
         """
 
+    def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
+        """Returns the force in many states at once, for an effect that remembers nothing.
+
+        Args:
+            model: the model in use.
+            rng: the random generator of a random effect.
+
+        Returns:
+            A function of ``qpos`` (B, nq), ``qvel`` (B, nv), ``ctrl`` (B, nu) and ``time`` (B,) to the
+            generalised forces (B, nv), which are not written to.
+
+        Raises:
+            ValueError: if the model has nothing that the effect could act on.
+        """
+        force, data = self.process(model, rng or np.random.default_rng()), mujoco.MjData(model)
+
+        def forces(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
+            together = np.empty((len(qpos), model.nv))
+            for i, moment in enumerate(time):
+                data.qpos, data.qvel, data.ctrl, data.time = qpos[i], qvel[i], ctrl[i], moment
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_comPos(model, data)
+                mujoco.mj_comVel(model, data)
+                together[i] = force(data)
+            return together
+
+        return forces
+
 
 class ObservationEffect(Effect):
     """An effect on the way out: what is observed of the simulator's state."""
@@ -225,6 +242,19 @@ class ObservationEffect(Effect):
             A function from the true observation to the one reported, both (..., n), called at the
             reset and after every control step.
         """
+
+    def restore(self, observations: np.ndarray, dt: float) -> np.ndarray:
+        """The best guess of what was true, from what was reported in one whole run.
+
+        Args:
+            observations: the observations reported (T, n), from the start of the run.
+            dt: the control step, in seconds.
+
+        Returns:
+            The observations without the effect (T, n), a new array: by default those reported, NaN
+            where nothing is known.
+        """
+        return np.array(observations, dtype=float)
 
 
 def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco.MjModel:

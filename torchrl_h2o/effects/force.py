@@ -1,5 +1,6 @@
 """Effects that are generalised forces, put on the joints at every physics step."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -7,7 +8,8 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import Force, ForceEffect, parameter
+from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect
+from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -36,6 +38,10 @@ class JointForce(ForceEffect):
         force[selection.joint_dofs(model, self.joints)] = self.torque
         return lambda data: force
 
+    def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
+        force = self.process(model, rng)(None)
+        return lambda qpos, qvel, ctrl, time: np.broadcast_to(force, qvel.shape)
+
 
 @dataclass(frozen=True)
 class LinearDrag(ForceEffect):
@@ -58,14 +64,44 @@ class LinearDrag(ForceEffect):
     bodies: Names = "*"
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
-        bodies = selection.body_ids(model, self.bodies)
-        jacobian = np.zeros((3, model.nv))
+        return _drag(model, self.bodies, lambda speed: self.coefficient)
 
-        def drag(data: mujoco.MjData) -> np.ndarray:
-            force = np.zeros(model.nv)
-            for body in bodies:
-                mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
-                force -= self.coefficient * jacobian.T @ (jacobian @ data.qvel)
-            return force
 
-        return drag
+@dataclass(frozen=True)
+class QuadraticDrag(ForceEffect):
+    """A force on bodies against the velocity v of their centre of mass, -c |v| v, as of air or water.
+
+    Args:
+        coefficient: c, force per velocity squared, in N·s²/m².
+        bodies: name patterns of the bodies.
+
+    Raises:
+        ValueError: when put into a model that has no such body.
+
+    Examples:
+        >>> QuadraticDrag(0.4, bodies="torso").describe()
+        'quadratic drag of 0.4 N·s²/m² on bodies torso'
+    """
+
+    wording: ClassVar[str] = "quadratic drag of {coefficient} on {bodies}"
+    coefficient: float = parameter(unit="N·s²/m²", bounds=(0.0, 1000.0), neutral=0.0)
+    bodies: Names = "*"
+
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
+        return _drag(model, self.bodies, lambda speed: self.coefficient * speed)
+
+
+def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[float], float]) -> Force:
+    """The force on bodies against their velocity, of a resistance (N·s/m) that depends on the speed."""
+    bodies = selection.body_ids(model, names)
+    jacobian = np.zeros((3, model.nv))
+
+    def drag(data: mujoco.MjData) -> np.ndarray:
+        force = np.zeros(model.nv)
+        for body in bodies:
+            mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+            velocity = jacobian @ data.qvel
+            force -= resistance(np.linalg.norm(velocity)) * jacobian.T @ velocity
+        return force
+
+    return drag

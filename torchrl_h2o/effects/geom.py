@@ -1,4 +1,4 @@
-"""Effects on geoms: the shape of the limbs, and what they do when they touch."""
+"""Effects on geoms: the shape of the limbs, and how they rub."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -7,7 +7,8 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import ModelEffect, parameter
+from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -101,34 +102,3 @@ class GeomLength(ModelEffect):
             raise ValueError(f"no geom of {names} is given by its two ends (fromto); use GeomSize")
         for geom in spanned:
             geom.fromto *= self.scale
-
-
-@dataclass(frozen=True)
-class RollingResistance(ModelEffect):
-    """Resistance to rolling, as of a soft wheel or a carpet: a torque of ``coefficient`` · load.
-
-    The geoms' contacts get the rolling friction of MuJoCo (``condim`` 6). Where they had none, the
-    torsional friction that the geom names begins to act as well.
-
-    Args:
-        coefficient: added to the rolling friction that acts already, in m.
-        geoms: name patterns of the geoms.
-
-    Raises:
-        ValueError: when put into a model that has no such geom.
-
-    Examples:
-        >>> RollingResistance(0.002, geoms="*wheel*").describe()
-        'rolling resistance of geoms *wheel* + 0.002 m'
-    """
-
-    wording: ClassVar[str] = "rolling resistance of {geoms} + {coefficient}"
-    coefficient: float = parameter(unit="m", bounds=(0.0, 1.0), neutral=0.0)
-    geoms: Names = "*"
-
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        for geom in selection.geoms(spec, self.geoms):
-            if self.coefficient and geom.condim < 6:
-                geom.condim = 6
-                geom.friction[2] = 0.0  # stood in the model but did not act
-            geom.friction[2] += self.coefficient

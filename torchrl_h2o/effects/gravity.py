@@ -1,11 +1,13 @@
-"""Effects on the pull of the ground."""
+"""Effects on gravity: how strong it is and where it points."""
 
 from dataclasses import dataclass
+from math import cos, pi, sin
 from typing import ClassVar
 
 import mujoco
 
-from torchrl_h2o.effects.effect import ModelEffect, parameter
+from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.parameter import parameter
 
 
 @dataclass(frozen=True)
@@ -27,3 +29,35 @@ class Gravity(ModelEffect):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         spec.option.gravity *= self.scale
+
+
+@dataclass(frozen=True)
+class GravityTilt(ModelEffect):
+    """Gravity, turned: what a slope is to a robot that calls its floor level.
+
+    Gravity is turned about the world's x axis by ``roll``, then about its y axis by ``pitch``. A floor
+    that rises towards +x by an angle has gravity pitched by that angle.
+
+    Args:
+        pitch: angle about the world's y axis, in rad.
+        roll: angle about the world's x axis, in rad.
+
+    Examples:
+        >>> GravityTilt(pitch=0.05).describe()
+        'gravity tilted by 0.05 rad in pitch, 0 rad in roll'
+        >>> from torchrl_h2o.effects import compile_model
+        >>> compile_model(mujoco.MjSpec(), [GravityTilt(pitch=0.1)]).opt.gravity.round(3)
+        array([-0.979,  0.   , -9.761])
+    """
+
+    wording: ClassVar[str] = "gravity tilted by {pitch} in pitch, {roll} in roll"
+    pitch: float = parameter(unit="rad", bounds=(-pi, pi), neutral=0.0)
+    roll: float = parameter(unit="rad", bounds=(-pi, pi), neutral=0.0)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        if self.is_neutral:  # a product with the identity would still turn zeros to -0.0
+            return
+        x, y, z = spec.option.gravity
+        y, z = cos(self.roll) * y - sin(self.roll) * z, sin(self.roll) * y + cos(self.roll) * z
+        x, z = cos(self.pitch) * x + sin(self.pitch) * z, cos(self.pitch) * z - sin(self.pitch) * x
+        spec.option.gravity = [x, y, z]

@@ -1,6 +1,6 @@
-"""Effects on joints: range, springs, and what resists their motion.
+"""Effects on joints: range, and what resists their motion.
 
-Numbers for sliding joints have the sliding unit: N for N·m, N/m for N·m/rad, kg for kg·m².
+Numbers for sliding joints have the sliding unit: N for N·m, kg for kg·m².
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from typing import ClassVar
 import mujoco
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import ModelEffect, parameter
+from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -36,35 +37,8 @@ class JointRange(ModelEffect):
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        for joint in _those_with("range", selection.joints(spec, self.joints)):
+        for joint in those_with("range", selection.joints(spec, self.joints)):
             joint.range *= self.scale
-
-
-@dataclass(frozen=True)
-class JointStiffness(ModelEffect):
-    """The springs of joints, scaled.
-
-    Args:
-        scale: factor on the stiffness.
-        joints: name patterns of the joints; those without a spring are passed over.
-
-    Raises:
-        ValueError: when put into a model that has no such joint, or none of them with a spring.
-
-    Examples:
-        >>> JointStiffness(0.0, joints="*foot*").describe()
-        'stiffness of joints *foot* × 0'
-
-    Source: H2O+ (arXiv 2309.12716), the gap ``soft_feet``.
-    """
-
-    wording: ClassVar[str] = "stiffness of {joints} × {scale}"
-    scale: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=1.0)
-    joints: Names = "*"
-
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        for joint in _those_with("stiffness", selection.joints(spec, self.joints)):
-            joint.stiffness *= self.scale
 
 
 @dataclass(frozen=True)
@@ -90,7 +64,7 @@ class JointDamping(ModelEffect):
     def edit(self, spec: mujoco.MjSpec) -> None:
         for joint in selection.joints(spec, self.joints):
             # the entries after the first are the coefficients of higher powers of the velocity
-            joint.damping[0] = _added(joint, "damping", joint.damping[0], self.damping)
+            joint.damping[0] = added(joint, "damping", joint.damping[0], self.damping)
 
 
 @dataclass(frozen=True)
@@ -115,7 +89,7 @@ class JointFrictionLoss(ModelEffect):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         for joint in selection.joints(spec, self.joints):
-            joint.frictionloss = _added(joint, "frictionloss", joint.frictionloss, self.torque)
+            joint.frictionloss = added(joint, "frictionloss", joint.frictionloss, self.torque)
 
 
 @dataclass(frozen=True)
@@ -140,10 +114,10 @@ class Armature(ModelEffect):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         for joint in selection.joints(spec, self.joints):
-            joint.armature = _added(joint, "armature", joint.armature, self.inertia)
+            joint.armature = added(joint, "armature", joint.armature, self.inertia)
 
 
-def _those_with(attribute: str, joints: list) -> list:
+def those_with(attribute: str, joints: list) -> list:
     """Of the joints, those whose attribute is not zero, which no factor could change."""
     chosen = [joint for joint in joints if any(getattr(joint, attribute))]
     if not chosen:
@@ -152,7 +126,8 @@ def _those_with(attribute: str, joints: list) -> list:
     return chosen
 
 
-def _added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
+def added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
+    """The sum; raises ValueError where more is taken away than there is."""
     if value + addend < 0.0:
         raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, {-addend:g} cannot be taken away")
     return value + addend

@@ -5,8 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from torchrl_h2o.effects.effect import ObservationEffect, Process, parameter
+from torchrl_h2o.effects.delay_line import advanced, delay_line
+from torchrl_h2o.effects.effect import ObservationEffect, Process
 from torchrl_h2o.effects.entries import Indices, entry_mask
+from torchrl_h2o.effects.parameter import parameter
 
 
 @dataclass(frozen=True)
@@ -60,3 +62,66 @@ class ObservationBias(ObservationEffect):
             return observation + entry_mask(observation, self.entries) * self.bias
 
         return biased
+
+    def restore(self, observations: np.ndarray, dt: float) -> np.ndarray:
+        return observations - entry_mask(observations, self.entries) * self.bias
+
+
+@dataclass(frozen=True)
+class ObservationGain(ObservationEffect):
+    """Sensors that read too much or too little, in proportion.
+
+    Args:
+        scale: factor on the observation.
+        entries: indices of the scaled entries of the observation, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> ObservationGain(1.5, entries=(1,)).process(0.05, np.random.default_rng(0))(np.ones(2))
+        array([1. , 1.5])
+    """
+
+    wording: ClassVar[str] = "{entries} of the observation × {scale}"
+    scale: float = parameter(unit="1", bounds=(-100.0, 100.0), neutral=1.0)
+    entries: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        def scaled(observation: np.ndarray) -> np.ndarray:
+            return np.where(entry_mask(observation, self.entries), self.scale * observation, observation)
+
+        return scaled
+
+    def restore(self, observations: np.ndarray, dt: float) -> np.ndarray:
+        inverse = 1.0 / self.scale if self.scale else np.nan
+        return np.where(entry_mask(observations, self.entries), inverse * observations, observations)
+
+
+@dataclass(frozen=True)
+class ObservationDelay(ObservationEffect):
+    """Sensors that are late, by any time, also a fraction of a control step.
+
+    Between two readings the observation is taken to change evenly. Until the first reading has
+    arrived it is reported already.
+
+    Args:
+        delay: the delay, in s.
+        entries: indices of the late entries of the observation, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> late = ObservationDelay(0.015).process(dt=0.01, rng=np.random.default_rng(0))
+        >>> [float(late(np.array([reading]))[0]) for reading in (1.0, 2.0, 3.0, 4.0)]
+        [1.0, 1.0, 1.5, 2.5]
+    """
+
+    wording: ClassVar[str] = "{entries} of the observation late by {delay}"
+    delay: float = parameter(unit="s", bounds=(0.0, 1.0), neutral=0.0)
+    entries: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        late = delay_line(self.delay / dt, before=np.array)
+        return lambda reading: np.where(entry_mask(reading, self.entries), late(reading), reading)
+
+    def restore(self, observations: np.ndarray, dt: float) -> np.ndarray:
+        ahead = advanced(observations, self.delay / dt)
+        return np.where(entry_mask(observations, self.entries), ahead, observations)

@@ -11,7 +11,8 @@ from torchrl_h2o.effects.action import ActionNoise
 from torchrl_h2o.effects.effect import Effect
 from torchrl_h2o.effects.geom import GeomFriction, GeomLength, GeomSize
 from torchrl_h2o.effects.gravity import Gravity
-from torchrl_h2o.effects.joint import JointRange, JointStiffness
+from torchrl_h2o.effects.joint import JointRange
+from torchrl_h2o.effects.joint_spring import JointStiffness
 
 
 @dataclass(frozen=True)
