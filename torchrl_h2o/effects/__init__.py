@@ -8,6 +8,8 @@ from torchrl_h2o.effects.action import ActionBias, ActionGain, ActionNoise
 from torchrl_h2o.effects.actuator_dynamics import ActionDelay, ActionLag
 from torchrl_h2o.effects.actuator_play import ActionBacklash, ActionDeadBand, ActionSaturation
 from torchrl_h2o.effects.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
+from torchrl_h2o.effects.catalogue import catalogue
+from torchrl_h2o.effects.catalogue_entry import CatalogueEntry
 from torchrl_h2o.effects.contact import ContactSoftness, RollingResistance
 from torchrl_h2o.effects.effect import (
     ActionEffect,
@@ -17,6 +19,7 @@ from torchrl_h2o.effects.effect import (
     ObservationEffect,
     compile_model,
 )
+from torchrl_h2o.effects.effect_dict import effect_from_dict, effect_to_dict
 from torchrl_h2o.effects.entries import Indices
 from torchrl_h2o.effects.force import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.geom import GeomFriction, GeomLength, GeomSize
@@ -31,6 +34,7 @@ from torchrl_h2o.effects.joint_spring import JointRest, JointSpring, JointStiffn
 from torchrl_h2o.effects.observation import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
 from torchrl_h2o.effects.parameter import Parameter, parameter
+from torchrl_h2o.effects.residual_force import ResidualForce
 from torchrl_h2o.effects.selection import Names
 from torchrl_h2o.effects.timestep import Timestep
 
@@ -49,6 +53,7 @@ __all__ = [
     "BodyCentreOfMass",
     "BodyInertia",
     "BodyMass",
+    "CatalogueEntry",
     "ContactSoftness",
     "Effect",
     "ForceEffect",
@@ -77,9 +82,13 @@ __all__ = [
     "Parameter",
     "Payload",
     "QuadraticDrag",
+    "ResidualForce",
     "RollingResistance",
     "Timestep",
+    "catalogue",
     "compile_model",
+    "effect_from_dict",
+    "effect_to_dict",
     "paper_gap",
     "parameter",
 ]

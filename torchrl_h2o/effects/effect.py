@@ -7,7 +7,7 @@ touches is one of four kinds: the model, the actions, the forces or the observat
 import dataclasses
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -98,6 +98,14 @@ class Effect(ABC):
     def is_neutral(self) -> bool:
         """Whether every parameter stands at its neutral value."""
         return all(p.value == p.neutral for p in self.parameters.values())
+
+    def with_parameters(self, values: Mapping[str, float]) -> "Effect":
+        """The effect with other values of its parameters, some or all, by name.
+
+        Raises:
+            ValueError: if a value is not a number within the parameter's bounds.
+        """
+        return dataclasses.replace(self, **values)
 
     def describe(self) -> str:
         """What the effect does, in words with units."""
