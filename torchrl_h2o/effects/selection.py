@@ -27,25 +27,25 @@ def checked_names(value: Any) -> Names:
 
 def joints(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsJoint]:
     """The joints of a specification that match; raises ValueError where a pattern matches none."""
-    return [spec.joints[i] for i in _matching(_paths(spec.joints), patterns, "joint")]
+    return [spec.joints[i] for i in matching(_paths(spec.joints), patterns, "joint")]
 
 
 def geoms(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsGeom]:
     """The geoms of a specification that match; raises ValueError where a pattern matches none."""
-    return [spec.geoms[i] for i in _matching(_paths(spec.geoms), patterns, "geom")]
+    return [spec.geoms[i] for i in matching(_paths(spec.geoms), patterns, "geom")]
 
 
 def bodies(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsBody]:
     """The bodies but the world that match; raises ValueError where a pattern matches none."""
     moving = spec.bodies[1:]
-    return [moving[i] for i in _matching(_paths(moving), patterns, "body")]
+    return [moving[i] for i in matching(_paths(moving), patterns, "body")]
 
 
 def joint_dofs(model: mujoco.MjModel, patterns: Names) -> list[int]:
     """The degrees of freedom of a compiled model's joints that match."""
     views = [model.joint(i) for i in range(model.njnt)]
     paths = [(model.body(model.jnt_bodyid[joint.id]).name, joint.name) for joint in views]
-    chosen = _matching(paths, patterns, "joint")
+    chosen = matching(paths, patterns, "joint")
     return [dof for dof in range(model.nv) if model.dof_jntid[dof] in chosen]
 
 
@@ -53,14 +53,14 @@ def body_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:
     """The ids of a compiled model's bodies, but the world, that match."""
     views = [model.body(i) for i in range(1, model.nbody)]
     paths = [(model.body(view.parentid[0]).name, view.name) for view in views]
-    return [1 + i for i in _matching(paths, patterns, "body")]
+    return [1 + i for i in matching(paths, patterns, "body")]
 
 
 def _paths(elements: Sequence) -> list[tuple[str, str]]:
     return [(element.parent.name, element.name) for element in elements]
 
 
-def _matching(paths: Sequence[tuple[str, str]], patterns: Names, kind: str) -> list[int]:
+def matching(paths: Sequence[tuple[str, str]], patterns: Names, kind: str) -> list[int]:
     """The indices of the (body, name) pairs that match at least one of the patterns."""
     chosen = set()
     for pattern in (patterns,) if isinstance(patterns, str) else patterns:
