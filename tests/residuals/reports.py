@@ -1,0 +1,125 @@
+"""Made-up reports for the tests: one with something of everything, and two that name no effect."""
+
+import dataclasses
+
+import numpy as np
+
+from torchrl_h2o.effects import ActionGain, BodyMass, Gravity, JointFrictionLoss, LinearDrag
+from torchrl_h2o.residuals.report import (
+    DataSummary,
+    DimensionError,
+    ErrorSummary,
+    FoundEffect,
+    HorizonError,
+    IndistinguishableGroup,
+    Interval,
+    RejectedEffect,
+    Report,
+    TwoSample,
+)
+from torchrl_h2o.residuals.residual_trace import ResidualTrace
+
+DATA = DataSummary("swing_up.csv", 5000, 1500, {"a gap in time": 12, "velocity clipped at ±10 rad/s": 3})
+
+
+def full_report() -> Report:
+    """Two effects, one of them undeclared and one that cannot be told from another, and all pictures."""
+    gravity = FoundEffect(Gravity(0.500123), True, {"scale": (0.4991, 0.5012)}, 0.011)
+    mass = FoundEffect(BodyMass(1.2, "pole"), True, {"scale": (1.15, 1.26)}, 0.006)
+    friction = FoundEffect(JointFrictionLoss(0.0412, "elbow"), False, {"torque": (0.0391, 0.0433)}, 0.004)
+    return Report(
+        simulator="double_pendulum.xml",
+        data=DATA,
+        error=error(),
+        found=(gravity, mass, friction),
+        rejected=(
+            RejectedEffect(LinearDrag(0.02, "pole"), 0.00399, 0.41, "explains no more than chance"),
+            RejectedEffect(ActionGain(0.83), 0.0061, 0.003, "not on the list of the best"),
+            RejectedEffect(ActionGain(-9.0, (1,)), float("inf"), None, "diverges"),
+        ),
+        indistinguishable=(
+            IndistinguishableGroup(
+                (BodyMass(1.21, "pole"), ActionGain(0.83, (0,))), (0.006, 0.0061), "motion without any torque"
+            ),
+        ),
+        two_sample=TwoSample(0.93, 0.52),
+        unexplained_intervals=(Interval(14.2, 14.9, 70, 38.0, "a push from outside"),),
+        stop_test="a permutation test of the held-out residual, at 1 %",
+        wall_s=84.2,
+        trace=trace(),
+    )
+
+
+def error() -> ErrorSummary:
+    """The errors of two angles and their two velocities, up to half a second ahead."""
+    per_dimension = (
+        DimensionError("shoulder angle", "rad", 0.0021, 0.00031, 0.00028),
+        DimensionError("elbow angle", "rad", 0.0034, 0.00042, None),
+        DimensionError("shoulder velocity", "rad/s", 0.031, 0.004, 0.003),
+        DimensionError("elbow velocity", "rad/s", 0.054, 0.0061, 0.0049),
+    )
+    horizons = tuple(
+        HorizonError(
+            steps,
+            steps * 0.01,
+            {d.name: d.before * steps**0.9 for d in per_dimension},
+            {d.name: d.after * steps**0.6 for d in per_dimension},
+        )
+        for steps in (1, 5, 10, 20, 50)
+    )
+    return ErrorSummary("held-out one-step RMSE", "rad/s", 0.031, 0.004, 0.003, per_dimension, horizons)
+
+
+def trace(rows: int = 5000) -> ResidualTrace:
+    """A residual of sin and sign before and of noise after, and a push."""
+    rng = np.random.default_rng(0)
+    time = np.arange(rows) * 0.01
+    q = np.stack([2.0 * np.sin(time), np.sin(2.3 * time + 1.0)], -1)
+    v = np.stack([2.0 * np.cos(time), 2.3 * np.cos(2.3 * time + 1.0)], -1)
+    after = rng.normal(size=(rows, 4)) * [0.0003, 0.0004, 0.004, 0.006]
+    missing = np.concatenate([0.05 * np.sin(q), 0.04 * np.sin(q) + 0.03 * np.sign(v)], -1) * [0.06, 0.06, 1.0, 1.0]
+    after[1420:1490, 2:] += 0.4
+    return ResidualTrace(
+        time,
+        ("shoulder angle", "elbow angle", "shoulder velocity", "elbow velocity"),
+        ("rad", "rad", "rad/s", "rad/s"),
+        after + missing,
+        after,
+        np.concatenate([q, v], -1),
+        np.arange(rows) >= 3500,
+    )
+
+
+def nothing_missing() -> Report:
+    """Only noise: the error stands at its floor."""
+    summary = ErrorSummary("held-out one-step RMSE", "rad/s", 0.0041, 0.0041, 0.004)
+    return Report(simulator="HalfCheetah-v5", data=DATA, error=summary, two_sample=TwoSample(0.5, 0.5))
+
+
+def no_conclusion() -> Report:
+    """Too few rows for any error."""
+    return Report(simulator="HalfCheetah-v5", data=DataSummary("short.csv", 7, 0), conclusion="7 rows are too few.")
+
+
+def renamed(report: Report, text: str) -> Report:
+    """The report with a text of its reader's in every place that takes one."""
+    summary = report.error
+    dimensions = [dataclasses.replace(d, name=f"{text}{d.name}", unit=text) for d in summary.per_dimension]
+    horizons = [
+        HorizonError(h.steps, h.seconds, *({f"{text}{k}": v for k, v in e.items()} for e in (h.before, h.after)))
+        for h in summary.horizons
+    ]
+    names = tuple(f"{text}{name}" for name in report.trace.names)
+    return dataclasses.replace(
+        report,
+        simulator=text,
+        data=DataSummary(text, 5000, 1500, {text: 1}),
+        error=dataclasses.replace(
+            summary, metric=text, unit=text, per_dimension=tuple(dimensions), horizons=tuple(horizons)
+        ),
+        rejected=tuple(dataclasses.replace(rejected, reason=text) for rejected in report.rejected),
+        indistinguishable=tuple(dataclasses.replace(g, separated_by=text) for g in report.indistinguishable),
+        unexplained_intervals=tuple(dataclasses.replace(i, set_aside=text) for i in report.unexplained_intervals),
+        stop_test=text,
+        trace=dataclasses.replace(report.trace, names=names, units=(text,) * len(names)),
+    )

@@ -1,0 +1,249 @@
+"""The report as data: what it says in one sentence, and what of it a file keeps."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.residuals.reports import DATA, full_report, no_conclusion, nothing_missing, trace
+from torchrl_h2o.data import DataError
+from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, paper_gap
+from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.residuals.report import (
+    ErrorSummary,
+    FoundEffect,
+    IndistinguishableGroup,
+    RejectedEffect,
+    Report,
+    TwoSample,
+)
+from torchrl_h2o.residuals.report_json import report_from_json, report_to_json
+from torchrl_h2o.residuals.report_words import effect_words, interval
+
+NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])
+
+
+def same(value, other):
+    """Equality by which NaN equals NaN, in dataclasses too."""
+    if isinstance(value, float) and isinstance(other, float):
+        return value == other or (math.isnan(value) and math.isnan(other))
+    if dataclasses.is_dataclass(value):
+        return type(value) is type(other) and all(
+            same(getattr(value, field.name), getattr(other, field.name)) for field in dataclasses.fields(value)
+        )
+    if isinstance(value, dict):
+        return value.keys() == other.keys() and all(same(value[key], other[key]) for key in value)
+    if isinstance(value, tuple):
+        return type(other) is tuple and len(value) == len(other) and all(map(same, value, other))
+    return value == other
+
+
+def without_trace(report):
+    return dataclasses.replace(report, trace=None)
+
+
+def test_the_sentence_names_what_is_lacking_and_what_that_pays():
+    found = FoundEffect(Gravity(0.500123), True, {}, 0.004)
+    report = Report(simulator="a", data=DATA, error=ErrorSummary("RMSE", "rad/s", 0.031, 0.004, 0.003), found=(found,))
+    assert report.sentence() == (
+        "Your simulator lacks: gravity × 0.5; one-step error 0.031 → 0.004 rad/s (−87 %), floor 0.003."
+    )
+
+
+def test_the_sentence_names_a_group_as_a_group_and_marks_what_is_on_no_list():
+    sentence = full_report().sentence()
+    assert "either mass of bodies pole × 1.2 or actuators 0 × 0.83 (these data cannot tell them apart)" in sentence
+    assert "not on any list: dry friction of joints elbow + 0.0412 N·m" in sentence
+    assert sentence.count("not on any list") == 1
+    assert sentence.count("either") == 1
+
+
+def test_a_report_without_effects_says_whether_nothing_is_missing_or_nothing_can_be_said():
+    assert nothing_missing().sentence() == (
+        "Nothing is missing: what was tried explains no more than chance would; "
+        "one-step error 0.0041 rad/s, floor 0.004."
+    )
+    assert no_conclusion().sentence() == "No conclusion: 7 rows are too few."
+
+
+def test_an_error_that_is_not_known_is_left_out_of_the_sentence():
+    error = ErrorSummary("RMSE", "rad/s", math.nan, math.inf)
+    assert "error" not in dataclasses.replace(nothing_missing(), error=error).sentence()
+
+
+def test_names_without_a_conclusion_are_refused():
+    with pytest.raises(ValueError, match="no conclusion"):
+        dataclasses.replace(full_report(), conclusion="7 rows are too few")
+
+
+def test_a_group_needs_an_error_for_each_effect():
+    with pytest.raises(ValueError, match="2 effects has 1 errors"):
+        IndistinguishableGroup((Gravity(2.0), ActionGain(2.0)), (0.1,), "more data")
+
+
+def test_the_effects_of_a_report_make_a_dynamics_gap():
+    assert DynamicsGap(*full_report().effects).effects == full_report().effects
+
+
+@pytest.mark.parametrize("value", [1.56676, -1.56676])
+def test_a_value_rounded_for_reading_stays_within_its_bounds(value):
+    @dataclasses.dataclass(frozen=True)
+    class Narrow(Gravity):
+        scale: float = dataclasses.field(
+            default=0.0, metadata={"unit": "1", "bounds": (-1.56676, 1.56676), "neutral": 0.0}
+        )
+
+    assert effect_words(Narrow(value)) == f"gravity × {value:g}"
+
+
+@given(low=st.floats(-1e6, 1e6), share=st.floats(1e-5, 1.0))
+def test_an_interval_in_words_tells_its_ends_apart(low, share):
+    high = low + share * max(abs(low), 1e-3)
+    start, end = interval(low, high, "1").removeprefix("between ").split(" and ")
+    assert start != end
+
+
+def test_a_saved_report_is_loaded_as_it_was(tmp_path):
+    for report in (full_report(), nothing_missing(), no_conclusion()):
+        path = report.save(tmp_path / report.simulator)
+        assert {file.name for file in path.parent.iterdir()} == {"report.json", "report.html"}
+        for place in (path, path.parent, str(path)):
+            loaded = Report.load(place)
+            assert loaded.sentence() == report.sentence()
+            assert loaded.to_json() == report.to_json()
+            assert loaded.effects == report.effects
+
+
+@given(number=NUMBERS, optional=st.none() | NUMBERS, low=NUMBERS)
+def test_the_file_is_strict_json_and_reads_back_what_it_was_given(number, optional, low):
+    full = without_trace(full_report())
+    dimension = dataclasses.replace(full.error.per_dimension[0], before=number, floor=optional)
+    horizon = dataclasses.replace(full.error.horizons[0], after={dimension.name: number})
+    report = dataclasses.replace(
+        full,
+        found=(FoundEffect(Gravity(2.0), False, {"scale": (low, number)}, number),),
+        rejected=(RejectedEffect(paper_gap("soft_feet"), number, optional, "diverges"),),
+        indistinguishable=(IndistinguishableGroup((Gravity(2.0), BodyMass(1.5)), (number, low), "more data"),),
+        error=ErrorSummary("RMSE", "1", low, number, optional, (dimension,), (horizon,)),
+        two_sample=TwoSample(optional, None),
+        wall_s=optional,
+    )
+    text = json.dumps(report_to_json(report), allow_nan=False)
+    assert same(report_from_json(json.loads(text)), expected(report))
+
+
+def expected(value):
+    """What JSON can keep of a report: a float that is not finite is NaN, or None where None may stand."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else math.nan
+    if isinstance(value, dict):
+        return {key: expected(entry) for key, entry in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(expected, value))
+    if not dataclasses.is_dataclass(value) or isinstance(value, Effect):
+        return value
+    kept = {}
+    for field in dataclasses.fields(value):
+        entry = getattr(value, field.name)
+        lost = isinstance(entry, float) and not math.isfinite(entry) and field.type == float | None
+        kept[field.name] = None if lost else expected(entry)
+    return dataclasses.replace(value, **kept)
+
+
+def test_the_file_holds_what_a_reader_of_it_looks_for():
+    entries = full_report().to_json()
+    assert set(entries) == {
+        *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "two_sample"),
+        *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "trace"),
+    }
+    assert {"name", "declared", "parameters", "error_after"} <= set(entries["effects"][0])
+    assert entries["effects"][2]["name"] == "JointFrictionLoss[elbow]"
+    assert entries["effects"][2]["declared"] is False
+    assert entries["effects"][2]["parameters"] == {"torque": {"value": 0.0412, "unit": "N·m", "ci95": [0.0391, 0.0433]}}
+    assert {"metric", "before", "after", "floor", "per_dimension", "horizons"} <= set(entries["error"])
+    assert set(entries["two_sample"]) == {"auc_before", "auc_after"}
+    assert {"source", "transitions", "held_out"} <= set(entries["data"])
+
+
+def test_numpy_numbers_are_written_as_numbers(tmp_path):
+    found = FoundEffect(Gravity(2.0), np.True_, {"scale": (np.float32(1.5), np.float64(2.5))}, np.float32(0.25))
+    loaded = Report.load(Report(simulator="a", data=DATA, found=(found,), wall_s=np.float64(2.0)).save(tmp_path))
+    assert loaded.found[0] == FoundEffect(Gravity(2.0), True, {"scale": (1.5, 2.5)}, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        ("", "is no report"),
+        ("{", "is no report"),
+        ("[1, 2]", "is no report"),
+        ('{"simulator": "a"}', "it has no 'effects'"),
+    ],
+)
+def test_a_file_that_is_no_report_is_refused(tmp_path, content, problem):
+    path = tmp_path / "report.json"
+    path.write_text(content)
+    with pytest.raises(DataError, match=problem) as caught:
+        Report.load(path)
+    assert "report.json" in str(caught.value)
+
+
+def test_a_report_of_an_effect_that_is_none_is_refused(tmp_path):
+    path = full_report().save(tmp_path)
+    path.write_text(path.read_text(encoding="utf-8").replace("Gravity", "Levity"), encoding="utf-8")
+    with pytest.raises(DataError, match="Levity"):
+        Report.load(path)
+
+
+def test_a_part_of_a_report_that_lacks_something_is_named(tmp_path):
+    path = full_report().save(tmp_path)
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    del entries["data"]["held_out"]
+    path.write_text(json.dumps(entries), encoding="utf-8")
+    with pytest.raises(DataError, match="it has no 'held_out'"):
+        Report.load(path)
+
+
+def test_a_report_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(DataError, match="cannot be read"):
+        Report.load(tmp_path)
+
+
+def test_the_trace_is_kept_thinned(tmp_path):
+    whole = trace(rows=4000)
+    whole.before[0, 0] = np.nan
+    report = dataclasses.replace(full_report(), trace=whole)
+    kept = Report.load(report.save(tmp_path)).trace
+    thinned = whole.thinned()
+    assert len(kept.time) == 1500
+    assert (kept.time[0], kept.time[-1]) == (whole.time[0], whole.time[-1])
+    assert (kept.names, kept.units) == (whole.names, whole.units)
+    np.testing.assert_array_equal(kept.held_out, thinned.held_out)
+    for name in ("time", "before", "after", "states"):
+        np.testing.assert_allclose(getattr(kept, name), getattr(thinned, name), rtol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_a_trace_of_next_to_nothing_is_kept(tmp_path, rows):
+    report = dataclasses.replace(full_report(), trace=trace(rows=5000).thinned(rows))
+    assert len(Report.load(report.save(tmp_path)).trace.time) == rows
+
+
+def test_a_trace_that_does_not_fit_itself_is_refused():
+    whole = trace(rows=100)
+    with pytest.raises(ValueError, match=r"before has the shape \(100, 3\)"):
+        dataclasses.replace(whole, before=whole.before[:, :3])
+    with pytest.raises(ValueError, match="4 names and 1 units"):
+        dataclasses.replace(whole, units=("rad",))
+    with pytest.raises(ValueError, match="time decreases"):
+        dataclasses.replace(whole, time=whole.time[::-1])
+
+
+def test_an_undeclared_effect_is_marked_in_words_and_a_declared_one_is_not():
+    effect = JointFrictionLoss(0.1)
+    assert FoundEffect(effect, True, {}, 0.1).words == effect.describe()
+    assert FoundEffect(effect, False, {}, 0.1).words == f"not on any list: {effect.describe()}"

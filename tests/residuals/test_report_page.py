@@ -1,0 +1,181 @@
+"""The report as a page: all there, all escaped, nothing fetched."""
+
+import dataclasses
+import html
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from tests.residuals.reports import full_report, no_conclusion, nothing_missing, renamed, trace
+from torchrl_h2o.effects import Gravity
+from torchrl_h2o.residuals import report_plots
+from torchrl_h2o.residuals.report import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
+from torchrl_h2o.residuals.report_page import report_page
+
+HOSTILE = "<script>alert(1)</script>\"'$x_1$&{{ 7 * 7 }}"
+
+
+class Page(HTMLParser):
+    """The tags of a page, their attributes, and its text."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.open, self.texts = [], [], []
+        self.feed(page)
+        self.text = " ".join(" ".join(self.texts).split())
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in {"meta", "br"}:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.texts.append(data)
+
+    def count(self, tag):
+        return sum(name == tag for name, _ in self.tags)
+
+
+@pytest.fixture(scope="module")
+def full():
+    return Page(report_page(full_report()))
+
+
+def test_the_page_opens_with_the_sentence(full):
+    assert full.count("h1") == 1
+    assert full.text.index(full_report().sentence()) < full.text.index("What the simulator lacks")
+
+
+def test_the_page_names_every_effect_that_was_tried(full):
+    report = full_report()
+    for tried in (*report.found, *report.rejected):
+        assert tried.words in full.text
+    for rejected in report.rejected:
+        assert rejected.reason in full.text
+    for group in report.indistinguishable:
+        assert group.separated_by in full.text
+        assert "actuators 0 × 0.83" in full.text
+
+
+def test_the_page_gives_values_with_units_and_intervals(full):
+    assert "torque 0.0412 N·m between 0.0391 and 0.0433 N·m" in full.text
+    assert "scale 0.5001 between 0.4991 and 0.5012" in full.text
+    assert full.text.count("undeclared") == 1
+
+
+def test_the_page_tells_of_the_data_and_of_the_test(full):
+    report = full_report()
+    for text in ("swing_up.csv", "5000", "1500", "left out: a gap in time", report.stop_test, "84.2 s", "0.93", "0.52"):
+        assert text in full.text
+    assert "14.2 s 14.9 s 70 38 a push from outside" in full.text
+
+
+def test_every_dimension_is_drawn(full):
+    # errors by unit, each dimension ahead and in time, twelve against the states
+    assert full.count("svg") == 2 + 4 + 4 + 12
+    for name in full_report().trace.names:
+        assert f"residual of {name} (" in full.text
+
+
+@pytest.mark.parametrize("make", [full_report, nothing_missing, no_conclusion])
+def test_the_page_is_whole_and_asks_for_nothing(make):
+    page = report_page(make())
+    parsed = Page(page)
+    assert not parsed.open
+    assert {tag for tag, _ in parsed.tags}.isdisjoint({"script", "link", "iframe", "object", "embed", "base"})
+    links = [attributes.get(key) for _, attributes in parsed.tags for key in ("src", "href", "xlink:href")]
+    assert all(link.startswith(("#", "data:")) for link in links if link)
+    assert "@import" not in page
+    assert all(target.startswith(("#", "'#", '"#')) for target in re.findall(r"url\(([^)]*)", page))
+
+
+@pytest.mark.filterwarnings("ignore:constrained_layout not applied")
+def test_hostile_texts_are_shown_and_not_obeyed():
+    page = report_page(renamed(full_report(), HOSTILE))
+    parsed = Page(page)
+    assert not parsed.open
+    assert parsed.count("script") == 0
+    assert "<script" not in page
+    for place in (f"against {HOSTILE}", f"left out: {HOSTILE}", f"{HOSTILE}elbow angle", f"apart: {HOSTILE}"):
+        assert place in parsed.text
+    labels = [attributes["aria-label"] for tag, attributes in parsed.tags if tag == "svg"]
+    assert any(HOSTILE in label for label in labels)
+
+
+@pytest.mark.parametrize("make", [nothing_missing, no_conclusion])
+def test_a_page_without_effects_says_why_and_leaves_out_what_is_not_known(make):
+    parsed = Page(report_page(make()))
+    assert make().sentence() in parsed.text
+    assert parsed.count("svg") == 0
+    for heading in ("What the simulator lacks", "What was tried", "Set aside", "The residual"):
+        assert heading not in parsed.text
+
+
+def test_a_report_without_a_trace_has_no_residual_pictures():
+    parsed = Page(report_page(dataclasses.replace(full_report(), trace=None)))
+    assert "The residual in time" not in parsed.text
+    assert "The error further ahead" in parsed.text
+
+
+def test_numbers_that_are_not_known_are_dashes_on_the_page():
+    dimensions = (DimensionError("v", "m/s", math.nan, math.inf), DimensionError("w", "m/s", 0.0, 0.0, 0.0))
+    report = dataclasses.replace(
+        full_report(),
+        error=ErrorSummary("RMSE", "1", math.nan, math.nan, math.nan, dimensions),
+        found=(FoundEffect(Gravity(2.0), True, {}, math.nan),),
+        two_sample=TwoSample(None, math.nan),
+        wall_s=None,
+    )
+    text = Page(report_page(report)).text
+    assert "scale 2 not known" in text
+    assert "Traced in" not in text
+    assert not re.search(r"\b(nan|inf|None)\b", text)
+
+
+def test_residuals_that_are_not_numbers_are_not_drawn():
+    gappy = trace(rows=200)
+    gappy.before[:] = np.nan
+    gappy.after[::2] = np.inf
+    assert Page(report_page(dataclasses.replace(full_report(), trace=gappy))).count("svg") == 22
+
+
+def test_the_same_report_gives_the_same_page():
+    report = dataclasses.replace(full_report(), trace=trace(rows=50))
+    assert report_page(report) == report_page(report)
+
+
+def test_each_state_is_drawn_against_the_residual_that_depends_on_it():
+    made = trace(rows=2000)
+    rng = np.random.default_rng(0)
+    made.before[:] = rng.normal(size=made.before.shape)
+    made.states[:] = rng.normal(size=made.states.shape)
+    made.before[:, 3] += 2.0 * made.states[:, 0] ** 2
+    assert report_plots.telling_pairs(made, pictures=4)[0] == (3, 0)
+    assert [state for _, state in report_plots.telling_pairs(made, pictures=4)] == [0, 1, 2, 3]
+
+
+def test_what_was_set_aside_does_not_stretch_the_pictures():
+    made, (pushed,) = trace(), full_report().unexplained_intervals
+
+    def ticks(aside):
+        svg = report_plots.residual_in_time(made, 2, aside)
+        texts = [html.unescape(text).replace("−", "-") for text in re.findall(r"<text[^>]*>([^<]*)</text>", svg)]
+        return [float(text) for text in texts if re.fullmatch(r"-0\.\d+", text)]
+
+    assert min(ticks([pushed])) > -0.2 > min(ticks([]))
+
+
+def test_a_long_name_of_the_source_is_kept_whole():
+    source = "a" * 300
+    report = dataclasses.replace(full_report(), trace=None, data=DataSummary(source, 1, 1))
+    assert source in Page(report_page(report)).text
