@@ -1,0 +1,96 @@
+"""An MJCF file as a simulation: names of coordinates, control steps, and errors that say what there is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchrl_h2o.effects import JointDamping
+from torchrl_h2o.residuals import Simulation, StateMap
+
+PENDULUM = Path(__file__).parents[2] / "recipes" / "models" / "simple_pendulum.xml"
+COLUMNS = {"position": "hinge", "velocity": "hinge_velocity"}
+
+
+def test_the_pendulum_swings_with_its_own_period():
+    simulation = Simulation.from_mjcf(PENDULUM, ["hinge", "hinge_velocity"], 0.005)
+    period = 2.0 * np.pi * np.sqrt(0.5 / 9.81)
+    steps = round(period / 2 / 0.005)
+    reached = simulation.rollout(np.array([[0.01, 0.0]]), np.zeros((1, steps, 1)))
+    assert reached[0, -1, 0] == pytest.approx(-0.01, rel=1e-3)
+
+
+def test_a_torque_turns_the_pendulum_by_its_inertia_alone():
+    simulation = Simulation.from_mjcf(PENDULUM, ["hinge", "hinge_velocity"], 0.005)
+    reached = simulation.rollout(np.zeros((1, 2)), np.ones((1, 1, 1)))
+    assert reached[0, 0, 1] == pytest.approx(0.005 / (0.6755 * 0.25), rel=1e-3)
+
+
+def test_both_rates_of_the_logs_fit_the_timestep():
+    assert Simulation.from_mjcf(PENDULUM, COLUMNS, 0.00500035).frame_skip == 3
+    assert Simulation.from_mjcf(PENDULUM, COLUMNS, 0.0033338).frame_skip == 2
+
+
+def test_columns_keep_their_own_names_and_get_the_coordinates_units():
+    simulation = Simulation.from_mjcf(PENDULUM, {"velocity": "hinge_velocity", "position": "hinge"}, 0.005)
+    assert simulation.state_map.names == ("velocity", "position")
+    assert simulation.state_map.units == ("rad/s", "rad")
+    np.testing.assert_array_equal(simulation.state_map.states(np.array([3.0, 0.5])), [0.5, 3.0])
+
+
+def test_a_state_map_is_taken_as_it_is_and_effects_are_put_in():
+    own = StateMap.of_coordinates(("q", "w"), ("rad", "rad/s"), (0, 1), num_states=2)
+    simulation = Simulation.from_mjcf(PENDULUM, own, 0.005, [JointDamping(0.1)])
+    assert simulation.state_map.names == ("q", "w")
+    assert simulation.model.dof_damping[0] == pytest.approx(0.1)
+
+
+def test_what_is_not_observed_stands_as_in_the_models_own_pose(tmp_path):
+    path = tmp_path / "lift.xml"
+    path.write_text(
+        '<mujoco><worldbody><body><joint name="lift" type="slide" ref="0.3"/><geom size="0.1"/>'
+        '<body><joint name="turn"/><geom size="0.1"/></body></body></worldbody></mujoco>'
+    )
+    simulation = Simulation.from_mjcf(path, ["turn", "turn_velocity"], 0.01)
+    assert simulation.state_map.states(np.zeros(2))[0] == pytest.approx(0.3)
+
+
+def test_a_velocity_that_matters_and_that_nobody_observes_is_hidden():
+    assert Simulation.from_mjcf(PENDULUM, ["hinge"], 0.005).state_map.hidden == (1,)
+    assert Simulation.from_mjcf(PENDULUM, COLUMNS, 0.005).state_map.hidden == ()
+
+
+@pytest.mark.parametrize("names", [["theta"], {"position": "theta"}])
+def test_an_unknown_coordinate_is_named_beside_those_that_there_are(names):
+    with pytest.raises(ValueError, match=r"no coordinate 'theta'.*hinge, hinge_velocity"):
+        Simulation.from_mjcf(PENDULUM, names, 0.005)
+
+
+def test_a_misspelt_coordinate_is_answered_with_the_right_one():
+    with pytest.raises(ValueError, match="but 'hinge_velocity'"):
+        Simulation.from_mjcf(PENDULUM, ["hinge", "hinge_velocit"], 0.005)
+
+
+def test_one_coordinate_twice_is_refused():
+    with pytest.raises(ValueError, match="hinge is named twice"):
+        Simulation.from_mjcf(PENDULUM, ["hinge", "hinge"], 0.005)
+
+
+def test_a_state_map_of_another_model_is_refused():
+    with pytest.raises(ValueError, match=r"4 coordinates.*1 positions and 1 velocities"):
+        Simulation.from_mjcf(PENDULUM, StateMap.of_coordinates(("q",), ("rad",), (0,), num_states=4), 0.005)
+
+
+@pytest.mark.parametrize("step", [0.004, 0.0005, 0.0, -0.005])
+def test_a_control_step_that_is_no_multiple_is_refused_with_advice(step):
+    advice = "set timestep=" if step > 0 else "give the time"
+    with pytest.raises(ValueError, match=f"no multiple of the timestep.*{advice}"):
+        Simulation.from_mjcf(PENDULUM, COLUMNS, step)
+
+
+def test_a_file_that_is_not_there_or_no_model_is_named(tmp_path):
+    with pytest.raises(ValueError, match="there is no file"):
+        Simulation.from_mjcf(tmp_path / "robot.xml", COLUMNS, 0.005)
+    (tmp_path / "robot.xml").write_text("<mujoco><worldbody><geom/></mujoco>")
+    with pytest.raises(ValueError, match=r"cannot make a model of .*robot\.xml"):
+        Simulation.from_mjcf(tmp_path / "robot.xml", COLUMNS, 0.005)
