@@ -236,7 +236,13 @@ class ForceEffect(Effect):
 
 
 class ObservationEffect(Effect):
-    """An effect on the way out: what is observed of the simulator's state."""
+    """An effect on the way out: what is observed of the simulator's state.
+
+    ``memoryless`` is whether an observation reported depends on nothing but the true one at the same time, so that one
+    process can alter any number of observations at once, (..., n).
+    """
+
+    memoryless: ClassVar[bool] = False
 
     @abstractmethod
     def process(self, dt: float, rng: np.random.Generator) -> Process:

@@ -27,6 +27,7 @@ class ObservationNoise(ObservationEffect):
     """
 
     wording: ClassVar[str] = "noise of standard deviation {std} on {entries} of the observation"
+    memoryless: ClassVar[bool] = True
     random: ClassVar[bool] = True
     std: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
     entries: Indices = None
@@ -54,6 +55,7 @@ class ObservationBias(ObservationEffect):
     """
 
     wording: ClassVar[str] = "bias of {bias} on {entries} of the observation"
+    memoryless: ClassVar[bool] = True
     bias: float = parameter(unit="1", bounds=(-100.0, 100.0), neutral=0.0)
     entries: Indices = None
 
@@ -82,6 +84,7 @@ class ObservationGain(ObservationEffect):
     """
 
     wording: ClassVar[str] = "{entries} of the observation × {scale}"
+    memoryless: ClassVar[bool] = True
     scale: float = parameter(unit="1", bounds=(-100.0, 100.0), neutral=1.0)
     entries: Indices = None
 

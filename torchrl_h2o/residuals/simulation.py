@@ -20,7 +20,7 @@ from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEf
 from torchrl_h2o.residuals.state_map import StateMap
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
-_CTRL_AND_FORCE = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED
+_CTRL_AND_FORCE = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 _CHUNK = 2**24  # numbers that a rollout may return at once: 128 MB
 
 
@@ -155,11 +155,11 @@ class Simulation:
 
     def _free(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
         """Without forces that depend on the state: one rollout."""
-        control, spec = actions, mujoco.mjtState.mjSTATE_CTRL
+        control, spec = actions, int(mujoco.mjtState.mjSTATE_CTRL)
         if applied is not None:
             control, spec = np.concatenate([actions, applied], -1), _CTRL_AND_FORCE
         control = np.repeat(control, self.frame_skip, axis=1)
-        states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=spec.value)
+        states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=spec)
         return states[:, self.frame_skip - 1 :: self.frame_skip]
 
     def _forced(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
@@ -174,7 +174,7 @@ class Simulation:
                     total += force(full[:, 1 : 1 + nq], full[:, 1 + nq : 1 + nq + nv], ctrl, full[:, 0])
                 control = np.concatenate([ctrl, total], -1)[:, None]
                 states, _ = self._pool.rollout(
-                    self.model, self._data, full, control, control_spec=_CTRL_AND_FORCE.value
+                    self.model, self._data, full, control, control_spec=_CTRL_AND_FORCE
                 )
                 full = states[:, 0]
             reached.append(full)

@@ -1,0 +1,28 @@
+"""Whether one explanation beats another by more than chance would: a paired test on held-out data."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import t as student
+
+BLOCKS = 30  # of neighbouring windows, whose residuals depend on each other
+IN_WORDS = (
+    "a one-sided t-test on the held-out loss, paired over {blocks} blocks of neighbouring windows, at 1 % divided by the "
+    "number of effects tried"
+)
+
+
+def p_value(gain: np.ndarray) -> float:
+    """The chance to see such a gain where there is none.
+
+    Args:
+        gain: (W), how much lower the loss of each held-out window is, in their order in time.
+
+    Returns:
+        The p-value of a one-sided t-test on the means of blocks.
+    """
+    blocks = np.array([part.mean() for part in np.array_split(gain, min(BLOCKS, len(gain))) if len(part)])
+    spread = blocks.std(ddof=1) / np.sqrt(len(blocks))
+    if spread == 0.0:
+        return 0.0 if blocks.mean() > 0.0 else 1.0
+    return float(student.sf(blocks.mean() / spread, len(blocks) - 1))
