@@ -9,16 +9,24 @@ from hypothesis import strategies as st
 from tests.effects.models import CART, FILES, as_bytes, spec
 from torchrl_h2o.effects import (
     Armature,
+    BodyCentreOfMass,
+    BodyInertia,
     BodyMass,
+    ContactSoftness,
     GeomFriction,
     GeomLength,
     GeomSize,
     Gravity,
+    GravityTilt,
     JointDamping,
     JointFrictionLoss,
     JointRange,
+    JointRest,
+    JointSpring,
     JointStiffness,
+    Payload,
     RollingResistance,
+    Timestep,
     compile_model,
 )
 
@@ -31,8 +39,15 @@ EVERYWHERE = [
     JointFrictionLoss(),
     Armature(),
     BodyMass(),
+    BodyInertia(),
+    BodyCentreOfMass(),
+    Payload(),
+    GravityTilt(),
+    JointSpring(),
+    ContactSoftness(),
+    Timestep(),
 ]
-CHEETAH_ONLY = [GeomLength(), JointStiffness(), JointRange()]
+CHEETAH_ONLY = [GeomLength(), JointStiffness(), JointRest(), JointRange()]
 
 
 @given(

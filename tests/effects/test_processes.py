@@ -9,12 +9,19 @@ from hypothesis.extra.numpy import arrays
 
 from tests.effects.models import CART, spec
 from torchrl_h2o.effects import (
+    ActionBacklash,
+    ActionBias,
+    ActionDeadBand,
     ActionDelay,
     ActionGain,
+    ActionLag,
     ActionNoise,
+    ActionSaturation,
     JointForce,
     LinearDrag,
     ObservationBias,
+    ObservationDelay,
+    ObservationGain,
     ObservationNoise,
     compile_model,
 )
@@ -26,6 +33,13 @@ ALTERING = [
     ActionGain(2.0),
     ObservationNoise(0.5),
     ObservationBias(0.5),
+    ActionBias(0.5),
+    ActionDeadBand(0.5),
+    ActionSaturation(0.5),
+    ActionBacklash(0.5),
+    ActionLag(0.01),
+    ObservationGain(0.5),
+    ObservationDelay(0.0125),
 ]
 vectors = arrays(np.float64, 3, elements=st.floats(-1, 1, allow_subnormal=False))
 
@@ -92,6 +106,13 @@ def test_noise_has_its_standard_deviation_and_repeats_with_its_seed(effect):
         ActionGain(2.0, actuators=(1,)),
         ObservationNoise(1.0, entries=(1,)),
         ObservationBias(1.0, entries=(1,)),
+        ActionBias(1.0, actuators=(1,)),
+        ActionDeadBand(0.5, actuators=(1,)),
+        ActionSaturation(0.5, actuators=(1,)),
+        ActionBacklash(0.5, actuators=(1,)),
+        ActionLag(0.01, actuators=(1,)),
+        ActionDelay(0.01, actuators=(1,)),
+        ObservationGain(0.5, entries=(1,)),
     ],
 )
 def test_an_effect_on_named_entries_leaves_the_others(effect):

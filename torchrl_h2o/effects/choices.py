@@ -37,7 +37,8 @@ def named_choices(
     if groups and eligible:
         for word, members in families([paths[i][1] for i in eligible]).items():
             indices = tuple(eligible[i] for i in members)
-            wanted.append((indices, (f"*{word}*", tuple(labels[i] for i in indices))))
+            everything = ("*",) if len(indices) == len(eligible) else ()
+            wanted.append((indices, (*everything, f"*{word}*", tuple(labels[i] for i in indices))))
         wanted.append((tuple(eligible), ("*", tuple(labels.values()))))
     chosen = {}
     for indices, patterns in wanted:
@@ -72,5 +73,5 @@ def indexed_choices(names: Sequence[str], *, groups: bool = False, singles: bool
     if singles and len(everything) > 1:
         chosen |= {(i,): (i,) for i in everything}
     if groups:
-        chosen |= {members: members for members in families(names).values()}
+        chosen |= {members: members for members in families(names).values() if members != everything}
     return chosen

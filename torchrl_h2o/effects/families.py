@@ -7,7 +7,7 @@ _SIDES = "bflr"  # back, front, left, right: bthigh and fthigh are thighs
 
 
 def families(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """Groups of at least two names that share a word, and are not all of them.
+    """Groups of at least two names that share a word.
 
     Words are what stands between digits, underscores and other marks; a letter for the side in front
     of a word is taken off too, where that makes a group. A group that several words make is there
@@ -23,7 +23,7 @@ def families(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
         >>> families(["torso", "bthigh", "bfoot", "fthigh", "ffoot"])
         {'thigh': (1, 3), 'foot': (2, 4)}
         >>> families(["thigh_joint", "leg_joint", "thigh_left_joint", "leg_left_joint"])
-        {'thigh': (0, 2), 'leg': (1, 3), 'left': (2, 3)}
+        {'thigh': (0, 2), 'joint': (0, 1, 2, 3), 'leg': (1, 3), 'left': (2, 3)}
     """
     words = [re.findall(r"[^\W\d_]+", name) for name in names]
     sided = [[word[1:] for word in own if word[0].lower() in _SIDES and len(word) > 3] for own in words]
@@ -32,6 +32,6 @@ def families(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
     for candidates in (words, [own + bare for own, bare in zip(words, sided, strict=True)]):
         for word in dict.fromkeys(word for own in candidates for word in own):
             members = tuple(i for i, own in enumerate(candidates) if word in own)
-            if 1 < len(members) < len(names) and members not in groups.values():
+            if len(members) > 1 and members not in groups.values():
                 groups.setdefault(word, members)
     return groups
