@@ -65,7 +65,9 @@ class Problem:
         """How large a residual, (n), the rounding of single precision in the states that windows start from makes."""
         measured, rng = self.measured, np.random.default_rng(0)
         rounded = measured.observation * (1.0 + _ROUNDING * rng.uniform(-1.0, 1.0, measured.observation.shape))
-        moved = replace(self, states=self.states + (rounded - measured.observation) @ self.simulation.state_map.restore.T)
+        moved = replace(
+            self, states=self.states + (rounded - measured.observation) @ self.simulation.state_map.restore.T
+        )
         made = np.abs(moved.residual((), starts) - found).mean((0, 1))
         return made + _ROUNDING * np.abs(measured.observation).max(0) + 1e-12
 
@@ -152,9 +154,7 @@ def fit(
         The fit.
     """
     variables = [
-        _Variable(index, name, effect.parameters[name])
-        for index, effect in enumerate(effects)
-        for name in free[index]
+        _Variable(index, name, effect.parameters[name]) for index, effect in enumerate(effects) for name in free[index]
     ]
 
     def put(z: np.ndarray) -> list[Effect]:

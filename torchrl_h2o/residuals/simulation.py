@@ -16,7 +16,16 @@ import numpy as np
 from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect, compile_model
+from torchrl_h2o.effects import (
+    ActionEffect,
+    CatalogueEntry,
+    Effect,
+    ForceEffect,
+    ModelEffect,
+    ObservationEffect,
+    catalogue,
+    compile_model,
+)
 from torchrl_h2o.residuals.state_map import StateMap
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -96,6 +105,14 @@ class Simulation:
     def _data(self) -> list[mujoco.MjData]:
         return [mujoco.MjData(self.model) for _ in range(max(1, self._pool.nthread))]
 
+    def catalogue(self) -> tuple[CatalogueEntry, ...]:
+        """The effects that the simulator, with the effects that are in it, could lack."""
+        spec = self.spec()
+        for effect in self.effects:
+            if isinstance(effect, ModelEffect):
+                effect.edit(spec)
+        return catalogue(spec, num_observations=len(self.state_map.names), dt=self.control_step)
+
     def with_effects(self, *effects: Effect) -> Simulation:
         """The simulation with more effects in it, behind those that are in it."""
         return replace(self, effects=(*self.effects, *effects))
@@ -145,7 +162,9 @@ class Simulation:
         step = self._forced if forces else self._free
         chunk = max(1, _CHUNK // (horizon * self.frame_skip * size))
         parts = [
-            step(full[i : i + chunk], actions[i : i + chunk], None if applied is None else applied[i : i + chunk], forces)
+            step(
+                full[i : i + chunk], actions[i : i + chunk], None if applied is None else applied[i : i + chunk], forces
+            )
             for i in range(0, batch, chunk)
         ]
         reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
@@ -162,7 +181,9 @@ class Simulation:
         states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=spec)
         return states[:, self.frame_skip - 1 :: self.frame_skip]
 
-    def _forced(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
+    def _forced(
+        self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence
+    ) -> np.ndarray:
         """Under forces: physics step by physics step, each under the forces of the state that it starts from."""
         nq, nv = self.model.nq, self.model.nv
         reached = []
@@ -173,9 +194,7 @@ class Simulation:
                 for force in forces:
                     total += force(full[:, 1 : 1 + nq], full[:, 1 + nq : 1 + nq + nv], ctrl, full[:, 0])
                 control = np.concatenate([ctrl, total], -1)[:, None]
-                states, _ = self._pool.rollout(
-                    self.model, self._data, full, control, control_spec=_CTRL_AND_FORCE
-                )
+                states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=_CTRL_AND_FORCE)
                 full = states[:, 0]
             reached.append(full)
         return np.stack(reached, axis=1)

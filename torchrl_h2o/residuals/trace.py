@@ -10,8 +10,10 @@ from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.fit import Fit, Problem, fit, losses
+from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.simulation import Simulation
 
 _LEVEL = 0.01  # of the whole search, divided by the number of entries
 _PAYS = 0.01  # share of the held-out loss that an effect must take away to be worth a word
@@ -59,6 +61,29 @@ class Trace:
     attempts: tuple[Attempt, ...]
     groups: tuple[tuple[Attempt, ...], ...]
     problem: Problem
+
+
+def trace_effects(
+    simulation: Simulation,
+    measured: Measured,
+    catalogue: Sequence[CatalogueEntry],
+    *,
+    rng: np.random.Generator,
+    progress: tqdm,
+) -> Trace:
+    """Traces the residual between data and a simulation to effects of a catalogue.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        catalogue: the effects that it could lack.
+        rng: draws the windows that are screened.
+        progress: shows how far the search is.
+
+    Returns:
+        What was found, what was tried, and what cannot be told apart.
+    """
+    return Search(Problem.pose(simulation, measured), catalogue, rng, progress).run()
 
 
 @dataclass
@@ -169,7 +194,9 @@ class Search:
         kept = [effect for i, effect in enumerate(best.effects) if i != index]
         self._weigh_by(kept)
         with_it, without = self._held_out(best.effects), self._held_out(kept).mean()
-        few_with_it, few_without = (losses(self.problem.residual(e, self.screened)).mean() for e in (best.effects, kept))
+        few_with_it, few_without = (
+            losses(self.problem.residual(e, self.screened)).mean() for e in (best.effects, kept)
+        )
         leads = screen(self.problem, kept, self._others(entries), self.screened, self.progress.update)
         as_good = []
         for lead in leads[:_FITTED]:

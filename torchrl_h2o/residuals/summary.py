@@ -1,0 +1,146 @@
+"""From what a search found to the report: errors before and after, on data that no fit has seen."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.report import (
+    DataSummary,
+    DimensionError,
+    ErrorSummary,
+    FoundEffect,
+    HorizonError,
+    IndistinguishableGroup,
+    RejectedEffect,
+    Report,
+    TwoSample,
+)
+from torchrl_h2o.residuals.residual import residuals
+from torchrl_h2o.residuals.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.significance import IN_WORDS
+from torchrl_h2o.residuals.simulation import Simulation
+from torchrl_h2o.residuals.trace import Trace
+from torchrl_h2o.residuals.two_sample import two_sample_auc
+
+_METRIC = "held-out one-step RMSE, each dimension over the spread of its one-step change"
+_HORIZONS = (1, 2, 5, 10, 20, 50)  # control steps
+_RANKED = 30  # rejected effects that the report lists
+
+
+def summarise(simulation: Simulation, measured: Measured, trace: Trace, *, seed: int, start: float) -> Report:
+    """The report of a search.
+
+    Args:
+        simulation: without the effects found.
+        measured: the data.
+        trace: what the search found.
+        seed: of the classifiers.
+        start: of the wall clock, by ``time.perf_counter``.
+    """
+    effects = trace.fit.effects
+    mended = simulation.with_effects(*effects)
+    names = {entry.name for group in trace.groups for entry in (attempt.entry for attempt in group)}
+    return Report(
+        simulator=simulation.name,
+        data=DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out),
+        error=error_summary(simulation, mended, measured),
+        found=tuple(
+            FoundEffect(
+                effect, True, trace.fit.ci95(index), _error(simulation.with_effects(*effects[: index + 1]), measured)
+            )
+            for index, effect in enumerate(effects)
+        ),
+        rejected=tuple(
+            RejectedEffect(
+                attempt.effect,
+                _error(simulation.with_effects(attempt.effect), measured),
+                attempt.p_value,
+                "as good as one that was put in"
+                if attempt.entry.name in names
+                else "explains less, or no more than chance",
+            )
+            for attempt in trace.attempts[:_RANKED]
+        ),
+        indistinguishable=tuple(
+            _group(simulation, measured, effects, index, [attempt.effect for attempt in group])
+            for index, group in enumerate(trace.groups)
+            if group
+        ),
+        two_sample=TwoSample(
+            two_sample_auc(simulation, measured, seed=seed), two_sample_auc(mended, measured, seed=seed)
+        ),
+        stop_test=IN_WORDS,
+        wall_s=time.perf_counter() - start,
+        trace=_residual_trace(simulation, mended, measured),
+    )
+
+
+def error_summary(simulation: Simulation, mended: Simulation, measured: Measured) -> ErrorSummary:
+    """The held-out error before and after, over all, by dimension and by horizon."""
+    names, units = simulation.state_map.names, simulation.state_map.units
+    before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
+    horizons = []
+    for steps in _HORIZONS:
+        if len(measured.windows(steps, steps, held_out=True)) < 2:
+            break
+        ahead = [
+            dict(zip(names, _rmse(which, measured, steps).tolist(), strict=True)) for which in (simulation, mended)
+        ]
+        horizons.append(HorizonError(steps, steps * simulation.control_step, *ahead))
+    return ErrorSummary(
+        metric=_METRIC,
+        unit="1",
+        before=_error(simulation, measured),
+        after=_error(mended, measured),
+        per_dimension=tuple(map(DimensionError, names, units, before.tolist(), after.tolist())),
+        horizons=tuple(horizons),
+    )
+
+
+def spread(measured: Measured) -> np.ndarray:
+    """The standard deviation of each dimension's one-step change, (n), in the part that fits see."""
+    change = (measured.following - measured.observation)[measured.usable & ~measured.held_out]
+    return np.maximum(change.std(0), 1e-12)
+
+
+def _rmse(simulation: Simulation, measured: Measured, horizon: int) -> np.ndarray:
+    """Held-out error at the end of windows, (n), in units."""
+    starts = measured.windows(horizon, max(1, horizon // 2), held_out=True)
+    missed = residuals(simulation, measured, starts, horizon)[:, -1]
+    return np.sqrt(np.nanmean(missed**2, axis=0))
+
+
+def _error(simulation: Simulation, measured: Measured) -> float:
+    return float(np.sqrt(np.mean((_rmse(simulation, measured, 1) / spread(measured)) ** 2)))
+
+
+def _group(
+    simulation: Simulation, measured: Measured, effects: tuple[Effect, ...], index: int, others: list[Effect]
+) -> IndistinguishableGroup:
+    alike = (effects[index], *others)
+    errors = [
+        _error(simulation.with_effects(*effects[:index], other, *effects[index + 1 :]), measured) for other in alike
+    ]
+    return IndistinguishableGroup(
+        alike,
+        tuple(errors),
+        "data in which their predictions differ: other speeds, loads or parts of the range, or a measurement of one of them",
+    )
+
+
+def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:
+    rows = measured.windows(1)
+    before, after = (residuals(which, measured, rows)[:, 0] for which in (simulation, mended))
+    return ResidualTrace(
+        time=rows * simulation.control_step,
+        names=simulation.state_map.names,
+        units=simulation.state_map.units,
+        before=before,
+        after=after,
+        states=measured.observation[rows],
+        held_out=measured.held_out[rows],
+    )
