@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.residuals.reports import DATA, full_report, no_conclusion, nothing_missing, trace
 from torchrl_h2o.data import DataError
-from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, paper_gap
+from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, ResidualForce, paper_gap
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals.report import (
     ErrorSummary,
@@ -98,6 +98,14 @@ def test_a_value_rounded_for_reading_stays_within_its_bounds(value):
         )
 
     assert effect_words(Narrow(value)) == f"gravity × {value:g}"
+
+
+def test_a_force_made_from_the_residual_is_named_by_its_joint_and_told_in_round_numbers(tmp_path):
+    force = ResidualForce(("torque on elbow: 0.412345 · sin(7.00012 q)",))
+    report = Report(simulator="a", data=DATA, found=(FoundEffect(force, False, {"coefficient_1": (0.4, 0.42)}, 0.1),))
+    assert report.found[0].name == "ResidualForce[elbow]"
+    assert report.sentence() == ("Your simulator lacks: not on any list: torque on joint elbow: 0.412 N·m · sin(7 q).")
+    assert Report.load(report.save(tmp_path)) == report
 
 
 @given(low=st.floats(-1e6, 1e6), share=st.floats(1e-5, 1.0))

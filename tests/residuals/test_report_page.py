@@ -112,6 +112,11 @@ def test_hostile_texts_are_shown_and_not_obeyed():
     assert any(HOSTILE in label for label in labels)
 
 
+def test_a_name_in_a_picture_is_no_formula():
+    made = dataclasses.replace(trace(rows=50), names=("$x_1$", "b", "c", "d"))
+    assert "residual of $x_1$ (rad)" in report_plots.residual_in_time(made, 0)
+
+
 @pytest.mark.parametrize("make", [nothing_missing, no_conclusion])
 def test_a_page_without_effects_says_why_and_leaves_out_what_is_not_known(make):
     parsed = Page(report_page(make()))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import Effect, ResidualForce
 
 if TYPE_CHECKING:
     from torchrl_h2o.residuals.report import ErrorSummary, FoundEffect, Report
@@ -98,13 +98,17 @@ def effect_name(effect: Effect) -> str:
         >>> effect_name(Gravity(2.0)), effect_name(BodyMass(1.2, "torso")), effect_name(ActionGain(2.0, (0, 2)))
         ('Gravity', 'BodyMass[torso]', 'ActionGain[0, 2]')
     """
-    chosen = []
-    for field in dataclasses.fields(effect):
-        value = getattr(effect, field.name)
-        entries = value if isinstance(value, tuple) else (value,)
-        if "unit" not in field.metadata and value != "*":
-            chosen += [str(entry) for entry in entries if isinstance(entry, str | int)]
+    chosen = [str(entry) for entry in _selected(effect)]
     return type(effect).__name__ + (f"[{', '.join(chosen)}]" if chosen else "")
+
+
+def _selected(effect: Effect) -> list[str | int]:
+    """What an effect acts on, where that is not all that there is."""
+    if isinstance(effect, ResidualForce):  # its terms, unlike other selections, hold values
+        return list(dict.fromkeys(term.joint for term in effect.parsed))
+    fields = [getattr(effect, field.name) for field in dataclasses.fields(effect) if "unit" not in field.metadata]
+    entries = [entry for value in fields if value != "*" for entry in (value if isinstance(value, tuple) else (value,))]
+    return [entry for entry in entries if isinstance(entry, str | int)]
 
 
 def effect_words(effect: Effect) -> str:
@@ -115,14 +119,10 @@ def effect_words(effect: Effect) -> str:
         >>> effect_words(Gravity(0.500123))
         'gravity × 0.5'
     """
-    rounded = {
-        # a bound may have more digits than three
-        name: min(max(float(f"{parameter.value:.3g}"), parameter.bounds[0]), parameter.bounds[1])
-        for name, parameter in effect.parameters.items()
-    }
+    rounded = {name: float(f"{parameter.value:.3g}") for name, parameter in effect.parameters.items()}
     try:
-        return dataclasses.replace(effect, **rounded).describe()
-    except ValueError:  # values that depend on each other need not be legal once rounded
+        return effect.with_parameters(rounded).describe()
+    except ValueError:  # a bound may have more digits than three
         return effect.describe()
 
 
