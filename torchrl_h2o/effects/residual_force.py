@@ -37,8 +37,8 @@ class ResidualForce(ForceEffect):
     """A generalised force that is a sum of terms in position, velocity, action and time.
 
     Every term is a text, ``"torque on elbow: 0.41 · sin(7 q)"``, see
-    :class:`~torchrl_h2o.effects.force_term.ForceTerm`. Its parameters are the terms' coefficients (neutral: zero) and the
-    frequencies, phases and starts in them; of the second term, ``coefficient_2``, ``frequency_2`` and so on.
+    :class:`~torchrl_h2o.effects.force_term.ForceTerm`. Its parameters are the terms' coefficients (neutral: zero) and
+    the frequencies, phases and starts in them; of the second term, ``coefficient_2``, ``frequency_2`` and so on.
 
     Args:
         terms: the terms.
