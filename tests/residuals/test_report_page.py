@@ -114,7 +114,7 @@ def test_hostile_texts_are_shown_and_not_obeyed():
 
 def test_a_name_in_a_picture_is_no_formula():
     made = dataclasses.replace(trace(rows=50), names=("$x_1$", "b", "c", "d"))
-    assert "residual of $x_1$ (rad)" in report_plots.residual_in_time(made, 0)
+    assert ">residual of $x_1$ (rad)</text>" in report_plots.residual_in_time(made, 0)
 
 
 @pytest.mark.parametrize("make", [nothing_missing, no_conclusion])
@@ -156,7 +156,8 @@ def test_residuals_that_are_not_numbers_are_not_drawn():
 
 def test_the_same_report_gives_the_same_page():
     report = dataclasses.replace(full_report(), trace=trace(rows=50))
-    assert report_page(report) == report_page(report)
+    equal = report_page(report) == report_page(report)
+    assert equal  # a difference of a megabyte is nothing to print
 
 
 def test_each_state_is_drawn_against_the_residual_that_depends_on_it():
