@@ -94,3 +94,9 @@ def test_a_scaled_timestep_is_all_that_changes():
     assert after.opt.timestep == 1.5 * before.opt.timestep
     after.opt.timestep = before.opt.timestep
     assert as_bytes(after) == as_bytes(before)
+
+
+def test_gravity_that_is_not_tilted_keeps_even_the_signs_of_its_zeros():
+    xml = '<mujoco><option gravity="-0.0 -0.0 -9.81"/></mujoco>'
+    before, after = (compile_model(mujoco.MjSpec.from_string(xml), tilt) for tilt in ([], [GravityTilt()]))
+    assert as_bytes(after) == as_bytes(before)

@@ -42,6 +42,7 @@ ON_ACTIONS = [
     ActionDelay(30.25 * DT),
     ActionLag(0.01 * DT),
     ActionLag(1e-300),
+    ActionLag(5e-324),
     ActionLag(3.0 * DT),
     ActionLag(10.0),
 ]

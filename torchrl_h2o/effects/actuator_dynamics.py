@@ -94,6 +94,4 @@ class ActionLag(ActionEffect):
         if self.time_constant == 0.0:
             return 0.0, 0.0
         ratio = dt / self.time_constant
-        if math.isinf(ratio):  # a time constant so small that it is none
-            return 0.0, 0.0
         return math.exp(-ratio), -math.expm1(-ratio) / ratio

@@ -55,7 +55,7 @@ class GravityTilt(ModelEffect):
     roll: float = parameter(unit="rad", bounds=(-pi, pi), neutral=0.0)
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        if self.is_neutral:  # a product with the identity would still turn zeros to -0.0
+        if self.is_neutral:  # to turn by nothing would still make a -0.0 a 0.0
             return
         x, y, z = spec.option.gravity
         y, z = cos(self.roll) * y - sin(self.roll) * z, sin(self.roll) * y + cos(self.roll) * z
