@@ -6,8 +6,9 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, ObservationNorm, TransformedEnv
 
-from torchrl_h2o.effects import paper_gap
+from torchrl_h2o.effects import Effect, paper_gap
 from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.residuals import Report
 
 
 def make_reality(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
@@ -22,11 +23,26 @@ def make_reality(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
 
 
 def make_simulator(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
-    """The imperfect simulator: the effects of ``env.simulator`` and the paper's gap, if one is named."""
+    """The imperfect simulator: the effects of ``env.simulator``, the paper's gap and what mends it, if these are named.
+
+    Raises:
+        ValueError: for a report that mends nothing.
+        torchrl_h2o.data.DataError: for a report that cannot be read.
+    """
     effects = [instantiate(effect) for effect in cfg.env.simulator]
     if cfg.gap is not None:
         effects.append(paper_gap(cfg.gap, cfg.gap_strength))
+    if cfg.get("gap_fix") is not None:  # a run of an earlier version says nothing of it
+        effects.extend(_missing_effects(cfg.gap_fix))
     return _make(cfg, effects, raw, kwargs)
+
+
+def _missing_effects(report: str) -> tuple[Effect, ...]:
+    """What a report of close_the_loop.py says that the simulator lacks."""
+    effects = Report.load(report).effects
+    if not effects:
+        raise ValueError(f"gap_fix={report}: this report found nothing to put into the simulator; leave gap_fix out")
+    return effects
 
 
 def _make(cfg: DictConfig, effects: list, raw: bool, kwargs: dict) -> EnvBase:

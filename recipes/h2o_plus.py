@@ -3,6 +3,7 @@
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
+python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the simulator, mended
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # anything in config/ can be overridden
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # go on after an interruption
 """
@@ -140,7 +141,8 @@ def main(cfg: DictConfig) -> None:
 def run(cfg: DictConfig, directory: Path) -> None:
     """Trains, evaluates in reality, and leaves summary.json, metrics.csv, learning_curve.png and a film."""
     start = time.perf_counter()
-    make_value_loss(cfg, observation_dim=1)  # a backbone that there is not: said before the data are read
+    make_value_loss(cfg, observation_dim=1)  # what there is not, backbone, gap or report: said before the data are read
+    make_simulator(cfg, raw=True)
     real = read_real_data(cfg)
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)
@@ -164,6 +166,7 @@ def run(cfg: DictConfig, directory: Path) -> None:
         {
             "env": cfg.env.name,
             "gap": cfg.gap,
+            "gap_fix": cfg.get("gap_fix"),
             "data": cfg.data,
             "transitions": len(real),
             "backbone": cfg.backbone,

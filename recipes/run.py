@@ -45,7 +45,7 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
         raise ValueError(f"updates={cfg.updates}: train for at least one")
     if cfg.gap is None and cfg.gap_strength is not None:
         raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
-    for key in ("data", "columns"):  # a resumed run may start elsewhere
+    for key in ("data", "columns", "gap_fix"):  # a resumed run may start elsewhere
         if cfg[key] is not None and Path(cfg[key]).exists():
             cfg[key] = str(Path(cfg[key]).resolve())
     save_config(cfg, directory)
