@@ -87,7 +87,7 @@ def print_report(report: Report, directory: Path) -> None:
             label = found.name if row == 0 else ""
             print(f"{label:<48}{name:<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}")
     if report.error is not None:
-        print(f"\n{report.error.metric:<48}{'':<14}{'before':>12}{'after':>12}")
+        print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
         for dimension in report.error.per_dimension:
             print(f"{dimension.name:<48}{dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
     folder = os.path.relpath(directory)

@@ -1,0 +1,46 @@
+"""Measures how often close_the_loop finds the truth, blind: effects are drawn, it sees a simulator and data.
+
+python recipes/benchmarks/close_the_loop.py                                    # the whole table, some hours
+python recipes/benchmarks/close_the_loop.py cases=[paper16,nothing] draws=3
+python recipes/benchmarks/close_the_loop.py cases=[several] numbers=[7]        # one case again
+python recipes/benchmarks/close_the_loop.py logs=path/to/logs                  # with the two real robots
+
+Leaves results.json, results.csv (a row a case) and each case's report.html in the run's folder.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+import hydra
+from families import choose_families
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from results_table import print_speed, print_table
+from running import Job, run_all
+from speed import steps_per_second
+from systems import SYSTEMS
+
+from torchrl_h2o.residuals import Simulation, close_the_loop
+
+
+@hydra.main(config_path="../config", config_name="close_the_loop_benchmark", version_base=None)
+def main(cfg: DictConfig) -> None:
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    logs = None if cfg.logs is None else Path(cfg.logs).resolve()
+    families = choose_families(cfg.cases, logs)
+    jobs = [
+        Job(name, number, cfg.seed, directory, logs)
+        for name, family in families.items()
+        for number in (cfg.numbers if cfg.numbers is not None else range(min(family.size, cfg.draws or family.size)))
+        if number < family.size
+    ]
+    rows = run_all(jobs, cfg.processes, close_the_loop)
+    print_table(families, rows, directory)
+    print_speed(rows, steps_per_second(Simulation.from_env(SYSTEMS["HalfCheetah"].env())))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""The lines of the benchmark's table, by name."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from cases import Family
+from drawn_cases import DECOY, NOTHING, SEVERAL, UNDECLARED_FORCE
+from log_cases import log_families
+from paper_cases import PAPER, PAPER_WITH_NOISE
+
+FAMILIES: Mapping[str, Family] = MappingProxyType(
+    {
+        "paper16": PAPER,
+        "paper16_noise": PAPER_WITH_NOISE,
+        "several": SEVERAL,
+        "undeclared": UNDECLARED_FORCE,
+        "nothing": NOTHING,
+        "decoy": DECOY,
+    }
+)
+
+
+def all_families(logs: Path | None = None) -> dict[str, Family]:
+    """All families, with those of the real logs if their folder is given."""
+    return {**FAMILIES, **(log_families(logs) if logs is not None else {})}
+
+
+def choose_families(names: Iterable[str], logs: Path | None = None) -> dict[str, Family]:
+    """The families of these names, and those of the real logs if their folder is given.
+
+    Raises:
+        ValueError: for a name that there is not.
+        FileNotFoundError: if there is no such folder.
+    """
+    if logs is not None and not logs.is_dir():
+        raise FileNotFoundError(f"logs={logs}: there is no such folder")
+    there = all_families(logs)
+    names = [*names, *(there.keys() - FAMILIES.keys())]
+    for name in names:
+        if name not in there:
+            raise ValueError(f"cases={name}: choose of {', '.join(there)}")
+    return {name: family for name, family in there.items() if name in names}

@@ -1,0 +1,120 @@
+"""The logs of two real robots, which are not part of this repository: where they are is an option."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from cases import Case, Family
+from pendulum import MODEL_PATH
+from tensordict import TensorDict
+
+from torchrl_h2o.data import load
+from torchrl_h2o.effects import ActionDelay, ActionLag, JointDamping, JointFrictionLoss, RollingResistance
+from torchrl_h2o.envs import WheelLeggedEnv
+from torchrl_h2o.residuals import Measured, Report, Simulation, residuals
+
+# RMSE 100 ms ahead of a direct linear predictor, in m/s, rad and rad/s, and what multiple of it is to be reached
+LINEAR_FLOOR = {"x_velocity": 0.067, "pitch": 0.021, "pitch_velocity": 0.27}
+TO_REACH = {"x_velocity": 1.2, "pitch": 1.7, "pitch_velocity": 1.45}
+AHEAD = 0.1  # s
+LATE = (0.010, 0.020)  # s
+WINDOW = 0.2  # s
+CONTROL_STEP = 0.005  # s, of both logs
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogCase(Case):
+    """A case whose data are a log.
+
+    Args:
+        path: of the log.
+        columns: the name of its layout.
+    """
+
+    path: Path
+    columns: str
+
+    def simulation(self) -> Simulation:
+        if self.system == "wheel_legged":
+            return Simulation.from_env(WheelLeggedEnv())
+        return Simulation.from_mjcf(MODEL_PATH, ["pivot", "pivot_velocity"], CONTROL_STEP)
+
+    def measure(self) -> TensorDict:
+        return load(self.path, columns=self.columns)
+
+    @property
+    def truth_in_words(self) -> str:
+        return "not known"
+
+
+def log_families(folder: Path) -> dict[str, Family]:
+    """The two lines of the table that stand on logs in a folder."""
+    wheel_legged = LogCase(
+        name="standing_still",
+        system="wheel_legged",
+        judge=judge_wheel_legged,
+        path=folder / "wheel_legged" / "standing_still.txt",
+        columns="wheel_legged_standing_still",
+    )
+    pendulum = LogCase(
+        name="swing_up_sac",
+        system="pendulum",
+        judge=judge_pendulum,
+        path=folder / "simple_pendulum" / "swing_up_sac.csv",
+        columns="simple_pendulum",
+        held_out=0.5,
+    )
+    return {
+        "log_wheel_legged": Family(lambda number, rng: wheel_legged, 1, 1, "late, dry friction beside viscous, 100 ms"),
+        "log_pendulum": Family(lambda number, rng: pendulum, 1, 1, "Coulomb friction, pushes set aside, error halved"),
+    }
+
+
+def judge_wheel_legged(report: Report, case: LogCase) -> dict:
+    """Late actuation of 10 to 20 ms, dry friction beside viscous, and the error 100 ms ahead."""
+    ahead = _nearest_horizon(report)
+    multiples = {name: ahead.get(name, np.inf) / floor for name, floor in LINEAR_FLOOR.items()}
+    lateness = [_seconds(effect) for effect in report.effects if isinstance(effect, ActionDelay | ActionLag)]
+    dry = any(isinstance(effect, JointFrictionLoss | RollingResistance) for effect in report.effects)
+    viscous = any(isinstance(effect, JointDamping) for effect in report.effects)
+    late = LATE[0] <= sum(lateness) <= LATE[1]
+    close = all(multiples[name] <= limit for name, limit in TO_REACH.items())
+    return {"ok": late and dry and viscous and close, "lateness": sum(lateness), "dry": dry, "viscous": viscous} | {
+        f"{name}_over_floor": multiple for name, multiple in multiples.items()
+    }
+
+
+def _seconds(effect: ActionDelay | ActionLag) -> float:
+    return effect.delay if isinstance(effect, ActionDelay) else effect.time_constant
+
+
+def _nearest_horizon(report: Report) -> dict[str, float]:
+    """The error after mending by dimension, at the horizon that is nearest to 100 ms."""
+    if report.error is None or not report.error.horizons:
+        return {}
+    return dict(min(report.error.horizons, key=lambda horizon: abs(horizon.seconds - AHEAD)).after)
+
+
+def judge_pendulum(report: Report, case: LogCase) -> dict:
+    """Coulomb friction named, pushes set aside, the median error of a window halved on the second half."""
+    simulation = case.simulation()
+    measured = Measured.from_ted(case.measure(), simulation, held_out=case.held_out)
+    before = median_window_error(simulation, measured)
+    after = median_window_error(simulation.with_effects(*report.effects), measured)
+    friction = any(isinstance(effect, JointFrictionLoss) for effect in report.effects)
+    pushes = len(report.unexplained_intervals)
+    return {
+        "ok": friction and pushes > 0 and after <= 0.5 * before,
+        "friction": friction,
+        "pushes": pushes,
+        "window_before": before,
+        "window_after": after,
+    }
+
+
+def median_window_error(simulation: Simulation, measured: Measured, seconds: float = WINDOW) -> float:
+    """The median over held-out windows of the angle's RMS error within a window, in rad."""
+    horizon = round(seconds / simulation.control_step)
+    starts = measured.windows(horizon, horizon // 2, held_out=True)
+    errors = residuals(simulation, measured, starts, horizon)[:, :, 0]
+    return float(np.median(np.sqrt((errors**2).mean(1))))

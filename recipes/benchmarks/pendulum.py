@@ -1,0 +1,36 @@
+"""The benchmark's pendulum, the smallest of its systems, as a Gymnasium task."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.spaces import Box
+
+MODEL_PATH = Path(__file__).with_name("pendulum.xml")
+CONTROL_STEP = 0.01  # s
+FRAME_SKIP = 4
+NO_REWARD = 0.0  # there is nothing to be learned here
+
+
+class PendulumEnv(MujocoEnv):
+    """Observes angle (rad, 0 hangs down) and angular velocity (rad/s); the action is the torque on the axis, in N·m."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own attribute)
+        "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
+        "render_fps": round(1.0 / CONTROL_STEP),
+    }
+
+    def __init__(self) -> None:
+        super().__init__(str(MODEL_PATH), FRAME_SKIP, Box(-np.inf, np.inf, (2,), np.float64))
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        self.do_simulation(action, self.frame_skip)
+        return self._get_obs(), NO_REWARD, False, False, {}
+
+    def reset_model(self) -> np.ndarray:
+        self.set_state(self.np_random.uniform(-np.pi, np.pi, 1), self.np_random.uniform(-1.0, 1.0, 1))
+        return self._get_obs()
+
+    def _get_obs(self) -> np.ndarray:
+        return np.concatenate([self.data.qpos, self.data.qvel])

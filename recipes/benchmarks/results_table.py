@@ -1,0 +1,40 @@
+"""What the benchmark prints: reached beside asked, what failed, and how fast."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from cases import Family
+
+
+def table(families: Mapping[str, Family], rows: Sequence[dict]) -> str:
+    """A line a family: how many cases passed, how many are asked for, and what of each."""
+    lines = [f"{'cases':<18}{'reached':>10}{'asked':>10}  of each"]
+    for name, family in families.items():
+        passed = [row["ok"] for row in rows if row["family"] == name]
+        reached, asked = f"{sum(passed)} of {len(passed)}", f"{family.asked} of {family.size}"
+        lines.append(f"{name:<18}{reached:>10}{asked:>10}  {family.what}")
+    return "\n".join(lines)
+
+
+def print_table(families: Mapping[str, Family], rows: Sequence[dict], directory: Path) -> None:
+    """The table, the cases that were missed, and where the rest lies."""
+    print(f"\n{table(families, rows)}")
+    missed = [row for row in rows if not row["ok"]]
+    if missed:
+        print("\nmissed")
+    for row in missed:
+        name = row.get("name", "")
+        print(f"  {row['family']} {row['number']}  {name}: {row.get('truth', '')} -> {row['found']}")
+    print(f"\nresults    {os.path.relpath(directory)}/results.json, results.csv, reports/")
+
+
+def print_speed(rows: Sequence[dict], rates: Mapping[str, float]) -> None:
+    """Control steps a second, in tracing and on their own, beside bare ``mujoco.rollout``."""
+    bare = rates["mujoco.rollout"]
+    print("speed      HalfCheetah, control steps a second")
+    for name, rate in rates.items():
+        print(f"           {name:<16}{rate:>10,.0f}{rate / bare:>8.0%}")
+    seconds = [row["wall_s"] for row in rows if row.get("system") == "HalfCheetah"]
+    if seconds:
+        print(f"           a HalfCheetah case took {sum(seconds) / len(seconds):.0f} s on average")

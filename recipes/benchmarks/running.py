@@ -1,0 +1,129 @@
+"""Runs the cases of a benchmark, several at once; one that fails is a row that says so."""
+
+import csv
+import json
+import multiprocessing
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from cases import draw_case
+from families import all_families
+from tqdm import tqdm
+
+from torchrl_h2o.residuals import Report
+
+COLUMNS = ("family", "number", "name", "system", "truth", "found", "ok")
+MEASURED = ("error_before", "error_after", "error_floor", "auc_before", "auc_after", "wall_s")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One case to be run.
+
+    Args:
+        family: its family.
+        number: its number in the family.
+        seed: of the benchmark.
+        directory: where to save its report.
+        logs: the folder of the real logs, None for none.
+    """
+
+    family: str
+    number: int
+    seed: int
+    directory: Path
+    logs: Path | None = None
+
+
+def run_case(job: Job, trace: Callable[..., Report]) -> dict:
+    """Draws a case, measures, traces and judges it.
+
+    Args:
+        job: the case.
+        trace: the code under test.
+
+    Returns:
+        What was true, what was found, and what that is worth.
+    """
+    torch.set_num_threads(1)
+    case = draw_case(all_families(job.logs), job.family, job.number, job.seed)
+    simulation = case.simulation()
+    report = trace(
+        simulation, case.measure(), source=case.system, held_out=case.held_out, seed=job.seed, progress=False
+    )
+    report.save(job.directory / "reports" / f"{job.family}_{job.number}")
+    error, two_sample = report.error, report.two_sample
+    return {
+        "family": job.family,
+        "number": job.number,
+        "name": case.name,
+        "system": case.system,
+        "truth": case.truth_in_words,
+        "found": ", ".join(effect.describe() for effect in report.effects) or report.conclusion or "nothing",
+        "error_before": None if error is None else error.before,
+        "error_after": None if error is None else error.after,
+        "error_floor": None if error is None else error.floor,
+        "auc_before": two_sample.auc_before,
+        "auc_after": two_sample.auc_after,
+        "wall_s": report.wall_s,
+        **case.judge(report, case),
+    }
+
+
+def run_all(jobs: Sequence[Job], processes: int, trace: Callable[..., Report], *, progress: bool = True) -> list[dict]:
+    """Runs all cases, and saves what there is after each.
+
+    Args:
+        jobs: the cases.
+        processes: how many at once; 1 runs them in this process.
+        trace: the code under test.
+        progress: whether to show a progress bar.
+
+    Returns:
+        A row a case, in the order of the jobs.
+    """
+    rows: dict[Job, dict] = {}
+    with tqdm(total=len(jobs), unit=" cases", disable=not progress) as bar:
+        for job, outcome in _outcomes(jobs, processes, trace):
+            rows[job] = _row(job, outcome)
+            passed = sum(row["ok"] for row in rows.values())
+            bar.set_postfix_str(f"{passed} of {len(rows)} passed; {job.family} {job.number}")
+            bar.update()
+            save_rows([rows[job] for job in jobs if job in rows], job.directory)
+    return [rows[job] for job in jobs]
+
+
+def _outcomes(jobs: Sequence[Job], processes: int, trace: Callable[..., Report]):
+    """Each job with a function that returns its row, or raises what went wrong, as they come in."""
+    if processes == 1:
+        for job in jobs:
+            yield job, lambda job=job: run_case(job, trace)
+        return
+    spawn = multiprocessing.get_context("spawn")  # MuJoCo's and torch's threads do not survive a fork
+    with ProcessPoolExecutor(processes, mp_context=spawn) as pool:
+        futures: dict[Future, Job] = {pool.submit(run_case, job, trace): job for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result
+
+
+def _row(job: Job, outcome: Callable[[], dict]) -> dict:
+    try:
+        return outcome()
+    except Exception as error:  # whatever it is, the other cases go on
+        failure = "".join(traceback.format_exception(error))
+        found = f"failed: {type(error).__name__}: {error}"
+        return {"family": job.family, "number": job.number, "ok": False, "found": found, "traceback": failure}
+
+
+def save_rows(rows: Sequence[dict], directory: Path) -> None:
+    """results.json with all that is known, results.csv with what fits into a table."""
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / "results.json").write_text(json.dumps(rows, indent=1, default=float, ensure_ascii=False) + "\n")
+    with open(directory / "results.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*COLUMNS, *MEASURED], extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)

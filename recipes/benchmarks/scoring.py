@@ -1,0 +1,97 @@
+"""How a report is scored against the truth: small questions, each with a plain answer."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+from torchrl_h2o.effects import Effect, selection
+from torchrl_h2o.residuals import Report, Simulation
+
+
+def elements(effect: Effect, simulation: Simulation) -> frozenset:
+    """The names or indices of what an effect acts on; empty for one that acts on the world.
+
+    Two effects that select the same elements by other patterns are the same.
+    """
+    spec = simulation.spec()
+    by_name = {"bodies": selection.bodies, "joints": selection.joints, "geoms": selection.geoms}
+    sizes = {"actuators": simulation.model.nu, "entries": len(simulation.state_map.names)}
+    for field in dataclasses.fields(effect):
+        chosen = getattr(effect, field.name)
+        if field.name in by_name:
+            return frozenset(element.name for element in by_name[field.name](spec, chosen))
+        if field.name in sizes:
+            return frozenset(range(sizes[field.name]) if chosen is None else chosen)
+    return frozenset()
+
+
+def part_of(effect: Effect, truth: Effect, simulation: Simulation) -> bool:
+    """Whether an effect is the true one, on all of its elements or on some."""
+    return type(effect) is type(truth) and elements(effect, simulation) <= elements(truth, simulation)
+
+
+def is_named_first(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
+    """Whether the first effect found is one of the true ones, or stands in one group with it."""
+    if not report.found:
+        return False
+    return any(part_of(e, true, simulation) for e in _alternatives(report, report.effects[0]) for true in truth)
+
+
+def is_exact_set(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
+    """Whether all true effects were found, each itself or by its group, and no other."""
+    found = [_alternatives(report, effect) for effect in report.effects]
+    no_other = all(any(part_of(e, true, simulation) for e in group for true in truth) for group in found)
+    return no_other and all(_is_found(true, found, simulation) for true in truth)
+
+
+def _is_found(true: Effect, found: Sequence[Sequence[Effect]], simulation: Simulation) -> bool:
+    """Whether the found effects cover all elements of a true one: one of them does, or several together."""
+    parts = [[elements(e, simulation) for e in group if part_of(e, true, simulation)] for group in found]
+    parts = [max(group, key=len) for group in parts if group]
+    return bool(parts) and frozenset().union(*parts) == elements(true, simulation)
+
+
+def _alternatives(report: Report, effect: Effect) -> list[Effect]:
+    """An effect that was found, and those that the data cannot tell from it."""
+    groups = [group.effects for group in report.indistinguishable if effect in group.effects]
+    return [effect, *(other for group in groups for other in group if other != effect)]
+
+
+def parameter_error(report: Report, truth: Sequence[Effect], simulation: Simulation) -> float:
+    """The largest relative error of a parameter of the true effects; infinite if one was not found."""
+    # what stands in a group has a value of its own, fitted in the place of the one that was put in
+    in_groups = [e for effect in report.effects for e in _alternatives(report, effect)]
+    errors = []
+    for true in truth:
+        found = [e for e in report.effects if part_of(e, true, simulation)]
+        found = found or [e for e in in_groups if part_of(e, true, simulation)]
+        errors += [_relative_error(e, true) for e in found] or [math.inf]
+    return max(errors, default=0.0)
+
+
+def _relative_error(effect: Effect, true: Effect) -> float:
+    pairs = [(effect.parameters[name].value, p.value) for name, p in true.parameters.items() if p.value != p.neutral]
+    return max(abs(found - value) / abs(value) if value else abs(found) for found, value in pairs)
+
+
+def reduction(report: Report, floor: float = 0.0) -> float:
+    """The share of the held-out error that is gone, of what lies above a floor; NaN where nothing was measured."""
+    if report.error is None or not report.error.before > floor:
+        return math.nan
+    return (report.error.before - report.error.after) / (report.error.before - floor)
+
+
+def is_marked_undeclared(report: Report) -> bool:
+    """Whether the report holds an effect that no catalogue entry is."""
+    return any(not found.declared for found in report.found)
+
+
+def says_nothing_is_missing(report: Report) -> bool:
+    """Whether the report concludes that nothing is missing; to conclude nothing is not that."""
+    return not report.found and report.conclusion is None
+
+
+def is_reported_as_group(report: Report, alike: Sequence[Effect]) -> bool:
+    """Whether effects of all these classes stand in one group."""
+    classes = {type(effect) for effect in alike}
+    return any(classes <= {type(effect) for effect in group.effects} for group in report.indistinguishable)

@@ -1,0 +1,39 @@
+"""How fast states are simulated: by the library beside bare ``mujoco.rollout``, on the same states and threads."""
+
+import time
+from os import cpu_count
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+
+from torchrl_h2o.residuals import Simulation
+
+BATCH, HORIZON = 4096, 20
+
+
+def steps_per_second(simulation: Simulation, seed: int = 0) -> dict[str, float]:
+    """Control steps a second of the library and of ``mujoco.rollout`` alone, the better of two tries each."""
+    model = simulation.model
+    rng = np.random.default_rng(seed)
+    states = simulation.state_map.offset + 0.01 * rng.standard_normal((BATCH, model.nq + model.nv))
+    actions = rng.uniform(-1.0, 1.0, (BATCH, HORIZON, model.nu))
+
+    full = np.zeros((BATCH, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    full[:, 1 : 1 + states.shape[1]] = states
+    control = np.repeat(actions, simulation.frame_skip, axis=1)
+    threads = [mujoco.MjData(model) for _ in range(cpu_count())]
+    with Rollout(nthread=len(threads)) as bare:
+        return {
+            "library": _rate(lambda: simulation.rollout(states, actions)),
+            "mujoco.rollout": _rate(lambda: bare.rollout(model, threads, full, control)),
+        }
+
+
+def _rate(simulate) -> float:
+    seconds = []
+    for _ in range(2):
+        start = time.perf_counter()
+        simulate()
+        seconds.append(time.perf_counter() - start)
+    return BATCH * HORIZON / min(seconds)

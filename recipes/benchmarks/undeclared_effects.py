@@ -1,0 +1,99 @@
+"""Effects that no catalogue holds: forces that the code under test has never heard of."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from math import pi
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects import ForceEffect, Names, parameter, selection
+from torchrl_h2o.effects.effect import BatchedForce, Force
+
+_TORQUE = {"unit": "N·m", "bounds": (-1000.0, 1000.0), "neutral": 0.0}
+_SLOW = 0.05  # rad/s, below which dry friction fades, so that nothing rattles
+
+
+@dataclass(frozen=True)
+class _TorqueOnJoint(ForceEffect):
+    """A torque on one joint, a function of its angle, its velocity and the time since the start."""
+
+    torque: float = parameter(**_TORQUE)
+    joint: Names = "*"
+
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
+        force = self.batched(model, rng)
+        return lambda data: force(data.qpos[None], data.qvel[None], data.ctrl[None], np.array([data.time]))[0]
+
+    def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
+        (dof,) = selection.joint_dofs(model, self.joint)
+        angle = model.jnt_qposadr[model.dof_jntid[dof]]
+
+        def force(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
+            forces = np.zeros_like(qvel)
+            forces[:, dof] = self.torque_at(qpos[:, angle], qvel[:, dof], time)
+            return forces
+
+        return force
+
+    @abstractmethod
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """The torque, (B,), in N·m, at angles (rad), velocities (rad/s) and times (s), each (B,)."""
+
+
+@dataclass(frozen=True)
+class TorqueRipple(_TorqueOnJoint):
+    """What the teeth of a gear or the poles of a motor do: a torque that goes with sin(k q)."""
+
+    wording: ClassVar[str] = "ripple of {torque}, sin({waves} q), on {joint}"
+    waves: float = parameter(unit="1", bounds=(1.0, 100.0), neutral=1.0)
+
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        return self.torque * np.sin(self.waves * q)
+
+
+@dataclass(frozen=True)
+class CubicWind(_TorqueOnJoint):
+    """A resistance that grows with the velocity cubed; ``torque`` is what it comes to at ``speed``."""
+
+    wording: ClassVar[str] = "wind of {torque} at {speed}, with v³, on {joint}"
+    speed: float = parameter(unit="rad/s", bounds=(0.01, 1000.0), neutral=1.0)
+
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        return -self.torque * (v / self.speed) ** 3
+
+
+@dataclass(frozen=True)
+class MovingSpring(_TorqueOnJoint):
+    """A spring to a point that swings to and fro; ``torque`` is what it comes to at a distance of ``swing``."""
+
+    wording: ClassVar[str] = "spring of {torque} to a point that swings by {swing} in {period}, on {joint}"
+    swing: float = parameter(unit="rad", bounds=(0.01, 10.0), neutral=1.0)
+    period: float = parameter(unit="s", bounds=(0.1, 1000.0), neutral=1.0)
+
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        point = self.swing * np.sin(2.0 * pi * time / self.period)
+        return self.torque * (point - q) / self.swing
+
+
+@dataclass(frozen=True)
+class LateForce(_TorqueOnJoint):
+    """A torque that is there from some time on, as of a hose that came loose."""
+
+    wording: ClassVar[str] = "{torque} from {start} on, on {joint}"
+    start: float = parameter(unit="s", bounds=(0.0, 10000.0), neutral=0.0)
+
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        return np.where(time >= self.start, self.torque, 0.0)
+
+
+@dataclass(frozen=True)
+class PlaceFriction(_TorqueOnJoint):
+    """Dry friction that depends on the position, as of a bent axle: most at one angle, none at the opposite one."""
+
+    wording: ClassVar[str] = "friction of {torque} · (1 + sin({waves} q)) / 2 on {joint}"
+    waves: float = parameter(unit="1", bounds=(0.1, 100.0), neutral=1.0)
+
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        return -0.5 * self.torque * (1.0 + np.sin(self.waves * q)) * np.tanh(v / _SLOW)
