@@ -31,6 +31,7 @@ from torchrl_h2o.effects.joint import (
     JointRange,
 )
 from torchrl_h2o.effects.joint_spring import JointRest, JointSpring, JointStiffness
+from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
 from torchrl_h2o.effects.parameter import Parameter, parameter
@@ -85,6 +86,7 @@ __all__ = [
     "ResidualForce",
     "RollingResistance",
     "Timestep",
+    "balanced",
     "catalogue",
     "compile_model",
     "effect_from_dict",

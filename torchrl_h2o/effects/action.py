@@ -17,8 +17,13 @@ class ActionNoise(ActionEffect):
     The noisy action may leave the bounds of the action; MuJoCo clamps the controls that are
     limited.
 
+    What mends a simulator that is noisier than reality is noise taken away: a negative ``std``. It
+    has no process of its own. :func:`balanced` reduces the noise of the effects before it instead,
+    as :class:`~torchrl_h2o.envs.DynamicsGap` does for all gaps on an env.
+
     Args:
-        std: standard deviation, in units of the action.
+        std: standard deviation, in units of the action; below zero it takes away noise that effects
+            before it add. Variances add: 1 and then -0.6 leave 0.8.
         actuators: indices of the noisy entries of the action, all by default.
 
     Examples:
@@ -26,6 +31,8 @@ class ActionNoise(ActionEffect):
         >>> noisy = ActionNoise(1.0).process(dt=0.05, rng=np.random.default_rng(0))
         >>> noisy(np.zeros(2)).round(3)
         array([ 0.126, -0.132])
+        >>> ActionNoise(-1.0).describe()
+        'noise of standard deviation 1 taken off all actuators'
 
     Source: H2O+ (arXiv 2309.12716), the gap ``joint_noise``.
     """
@@ -33,10 +40,22 @@ class ActionNoise(ActionEffect):
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"
     random: ClassVar[bool] = True
     memoryless: ClassVar[bool] = True
-    std: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=0.0)
+    std: float = parameter(unit="1", bounds=(-10.0, 10.0), neutral=0.0)
     actuators: Indices = None
 
+    def describe(self) -> str:
+        if self.std >= 0.0:
+            return super().describe()
+        added = self.with_parameters({"std": -self.std})
+        return added.describe().replace(" on ", " taken off ")
+
     def process(self, dt: float, rng: np.random.Generator) -> Process:
+        if self.std < 0.0:
+            raise ValueError(
+                f"ActionNoise: std = {self.std:g} cannot be executed by itself: it takes away noise that effects "
+                "before it add; pass all effects together through balanced(effects) first"
+            )
+
         def noisy(action: np.ndarray) -> np.ndarray:
             noise = self.std * rng.standard_normal(action.shape)
             return action + entry_mask(action, self.actuators) * noise
