@@ -10,6 +10,14 @@ from torchrl_h2o.envs import DynamicsGap
 CHEETAH = "HalfCheetah-v5"
 
 
+class Executed(GymEnv):
+    """Remembers the actions that reach the simulator."""
+
+    def read_action(self, action):
+        self.executed = [*getattr(self, "executed", []), action.clone()]
+        return super().read_action(action)
+
+
 def gapped(*effects: Effect) -> TransformedEnv:
     return TransformedEnv(GymEnv(CHEETAH), DynamicsGap(*effects))
 

@@ -21,7 +21,7 @@ from torchrl.envs import (
 )
 
 from tests.envs.own_effects import ForgetfulNoise
-from tests.envs.rollouts import CHEETAH, gapped, rollout
+from tests.envs.rollouts import CHEETAH, Executed, gapped, rollout
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionGain,
@@ -32,14 +32,6 @@ from torchrl_h2o.effects import (
     ObservationNoise,
 )
 from torchrl_h2o.envs import DynamicsGap, dynamics_gap
-
-
-class Executed(GymEnv):
-    """Remembers the actions that reach the simulator."""
-
-    def read_action(self, action):
-        self.executed = [*getattr(self, "executed", []), action.clone()]
-        return super().read_action(action)
 
 
 def test_the_simulator_executes_the_altered_action_and_the_data_keep_the_one_asked_for():

@@ -1,6 +1,7 @@
 """DynamicsGap, the TorchRL transform that puts effects into a simulator."""
 
 from collections.abc import Sequence
+from itertools import islice
 
 import mujoco
 import numpy as np
@@ -8,10 +9,11 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform, TransformedEnv
 
-from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, paper_gap
+from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, balanced, paper_gap
 from torchrl_h2o.effects.effect import Process
 from torchrl_h2o.envs.episode import Episode
 from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.simulator import Simulator
 
 
 class DynamicsGap(Transform):
@@ -27,6 +29,9 @@ class DynamicsGap(Transform):
     effects first to last, forces summed, observation effects first to last. Of several gaps on one
     env, the one put on first edits first; actions pass through the outermost first, as through any
     transforms of TorchRL.
+
+    Negative :class:`~torchrl_h2o.effects.ActionNoise` takes away noise that the effects before it add:
+    those of the same gap, and all of the gaps nearer to the simulator.
 
     A gap is for one simulator and for its life: taking the transform off the env does not mend the
     simulator, and another gap needs a new env. Put it directly on the env, before other transforms,
@@ -46,7 +51,8 @@ class DynamicsGap(Transform):
     Raises:
         TypeError: if one of them is not an effect.
         ValueError: when put on an env that is batched, does not run on MuJoCo, had another gap, or
-            whose model has nothing that one of the effects could act on; or, with action or
+            whose model has nothing that one of the effects could act on, or that has less noise than
+            one of them takes away; or, with action or
             observation effects, after transforms of other kinds.
 
     Examples:
@@ -91,7 +97,7 @@ class DynamicsGap(Transform):
         self._check_place(env)
         simulator = find_simulator(env)
         # Before the model is changed: does everything that an effect names exist?
-        rehearsal = Episode.begin(self.effects, simulator, np.random.default_rng(0))
+        rehearsal = Episode.begin(self._balanced_effects(simulator), simulator, np.random.default_rng(0))
         example = simulator.env.fake_tensordict()
         _alter(example, rehearsal.action_keys, rehearsal.actions)
         _alter(example, rehearsal.observation_keys, rehearsal.observations)
@@ -136,11 +142,19 @@ class DynamicsGap(Transform):
         if self._identity not in episodes:
             # Without random effects torch's generator is left alone: runs with and without the gap
             # then sample the same actions.
-            rng = None
-            if any(effect.random and not effect.is_neutral for effect in self.effects):
+            rng, effects = None, self._balanced_effects(simulator)
+            if any(effect.random and not effect.is_neutral for effect in effects):
                 rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
-            episodes[self._identity] = Episode.begin(self.effects, simulator, rng)
+            episodes[self._identity] = Episode.begin(effects, simulator, rng)
         return episodes[self._identity]
+
+    def _balanced_effects(self, simulator: Simulator) -> tuple[Effect, ...]:
+        """This gap's own of all gaps' effects, once the noise that some take away is off the others."""
+        # the simulator knows those on envs around this one too; one that is just being put on, it does not yet
+        of_gap = {gap._identity: gap.effects for gap in self._gaps_on(_env_of(self))} | simulator.gaps
+        everything = iter(balanced([effect for effects in of_gap.values() for effect in effects]))
+        shares = {identity: tuple(islice(everything, len(effects))) for identity, effects in of_gap.items()}
+        return shares[self._identity]
 
     def _gaps_on(self, env: EnvBase) -> list["DynamicsGap"]:
         return [transform for transform in _transforms_of(self, env) if isinstance(transform, DynamicsGap)]

@@ -29,7 +29,7 @@ class Episode(NamedTuple):
         """Begins an episode.
 
         Args:
-            effects: those of the gap.
+            effects: those of the gap, with no noise left to take away: see :func:`balanced`.
             simulator: where the episode takes place.
             rng: for the random effects; None where there is none among them.
 

@@ -72,6 +72,11 @@ class Simulator(ABC):
         """Makes every physics step from now on apply the forces of the present episodes."""
 
     @property
+    def gaps(self) -> Mapping[object, Sequence[Effect]]:
+        """What every gap that is in consists of, under what stands for the gap, the one put in first first."""
+        return getattr(self.owner, "_dynamics_gaps", {})
+
+    @property
     def episodes(self) -> Episodes:
         """The present episode of every gap, under what stands for the gap."""
         return self.owner.__dict__.setdefault("_dynamics_gap_episodes", Episodes())
@@ -88,7 +93,7 @@ class Simulator(ABC):
             ValueError: if the model has nothing that an effect could act on, or has a gap in it that
                 the env has not. Nothing is changed.
         """
-        applied = getattr(self.owner, "_dynamics_gaps", {})
+        applied = self.gaps
         if gap in applied:
             return
         if not applied.keys() <= on_env.keys():
@@ -155,7 +160,7 @@ class Simulator(ABC):
     def _forces(self) -> list[Force]:
         # in the order of the gaps, not of their resets, because a sum is rounded in its order
         episodes = self.episodes
-        return [force for gap in self.owner._dynamics_gaps if gap in episodes for force in episodes[gap].forces]
+        return [force for gap in self.gaps if gap in episodes for force in episodes[gap].forces]
 
 
 def _bytes(model: mujoco.MjModel) -> np.ndarray:
