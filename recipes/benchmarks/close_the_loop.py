@@ -39,7 +39,7 @@ def main(cfg: DictConfig) -> None:
     ]
     rows = run_all(jobs, cfg.processes, close_the_loop)
     print_table(families, rows, directory)
-    print_speed(rows, steps_per_second(Simulation.from_env(SYSTEMS["HalfCheetah"].env())))
+    print_speed(rows, steps_per_second(Simulation.from_env(SYSTEMS["HalfCheetah"].env())), cfg.processes)
 
 
 if __name__ == "__main__":

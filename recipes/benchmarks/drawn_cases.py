@@ -154,7 +154,8 @@ def drawn_undeclared(
     speed = float(measured.observation[:, names.index(f"{joint}_velocity")].std())
     duration = Case.transitions * simulation.control_step
     drawn = {
-        TorqueRipple: lambda: {"waves": rng.uniform(2.0, 6.0) / swing},
+        # several waves a turn at least: one is what gravity does
+        TorqueRipple: lambda: {"waves": rng.uniform(2.0, 6.0) / min(swing, 0.6)},
         CubicWind: lambda: {"speed": rng.uniform(1.0, 2.0) * speed},
         MovingSpring: lambda: {"swing": rng.uniform(1.0, 2.0) * swing, "period": rng.uniform(0.02, 0.1) * duration},
         LateForce: lambda: {"start": rng.uniform(0.2, 0.5) * duration},

@@ -29,12 +29,15 @@ def print_table(families: Mapping[str, Family], rows: Sequence[dict], directory:
     print(f"\nresults    {os.path.relpath(directory)}/results.json, results.csv, reports/")
 
 
-def print_speed(rows: Sequence[dict], rates: Mapping[str, float]) -> None:
+def print_speed(rows: Sequence[dict], rates: Mapping[str, float], processes: int) -> None:
     """Control steps a second, in tracing and on their own, beside bare ``mujoco.rollout``."""
-    bare = rates["mujoco.rollout"]
+    traced = [row for row in rows if row.get("system") == "HalfCheetah"]
+    if traced:
+        simulated = sum(row["steps"] for row in traced) / sum(row["simulating_s"] for row in traced)
+        rates = {f"in tracing, {processes} at once": simulated, **rates}
     print("speed      HalfCheetah, control steps a second")
     for name, rate in rates.items():
-        print(f"           {name:<16}{rate:>10,.0f}{rate / bare:>8.0%}")
-    seconds = [row["wall_s"] for row in rows if row.get("system") == "HalfCheetah"]
-    if seconds:
-        print(f"           a HalfCheetah case took {sum(seconds) / len(seconds):.0f} s on average")
+        print(f"           {name:<24}{rate:>10,.0f}{rate / rates['mujoco.rollout']:>8.0%}")
+    if traced:
+        seconds = [row["wall_s"] for row in traced]
+        print(f"           a case took {sum(seconds) / len(seconds):.0f} s on average, {max(seconds):.0f} s at most")

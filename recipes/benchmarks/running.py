@@ -12,12 +12,13 @@ from pathlib import Path
 import torch
 from cases import draw_case
 from families import all_families
+from speed import CountingSimulation
 from tqdm import tqdm
 
 from torchrl_h2o.residuals import Report
 
 COLUMNS = ("family", "number", "name", "system", "truth", "found", "ok")
-MEASURED = ("error_before", "error_after", "error_floor", "auc_before", "auc_after", "wall_s")
+MEASURED = ("error_before", "error_after", "error_floor", "auc_before", "auc_after", "wall_s", "steps", "simulating_s")
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ def run_case(job: Job, trace: Callable[..., Report]) -> dict:
     """
     torch.set_num_threads(1)
     case = draw_case(all_families(job.logs), job.family, job.number, job.seed)
-    simulation = case.simulation()
+    simulation = CountingSimulation.of(case.simulation())
     report = trace(
         simulation, case.measure(), source=case.system, held_out=case.held_out, seed=job.seed, progress=False
     )
@@ -70,6 +71,8 @@ def run_case(job: Job, trace: Callable[..., Report]) -> dict:
         "auc_before": two_sample.auc_before,
         "auc_after": two_sample.auc_after,
         "wall_s": report.wall_s,
+        "steps": simulation.count.steps,
+        "simulating_s": simulation.count.seconds,
         **case.judge(report, case),
     }
 

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals import Report, Simulation
 
+TINY = 1e-9  # a value so small is a rounded zero, of which nothing is a share
+
 
 def elements(effect: Effect, simulation: Simulation) -> frozenset:
     """The names or indices of what an effect acts on; empty for one that acts on the world.
@@ -71,7 +73,7 @@ def parameter_error(report: Report, truth: Sequence[Effect], simulation: Simulat
 
 def _relative_error(effect: Effect, true: Effect) -> float:
     pairs = [(effect.parameters[name].value, p.value) for name, p in true.parameters.items() if p.value != p.neutral]
-    return max(abs(found - value) / abs(value) if value else abs(found) for found, value in pairs)
+    return max(abs(found - value) / (abs(value) if abs(value) > TINY else 1.0) for found, value in pairs)
 
 
 def reduction(report: Report, floor: float = 0.0) -> float:

@@ -1,6 +1,9 @@
-"""How fast states are simulated: by the library beside bare ``mujoco.rollout``, on the same states and threads."""
+"""How fast states are simulated: in tracing, and by the library beside bare ``mujoco.rollout`` on the same states."""
 
+import dataclasses
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from os import cpu_count
 
 import mujoco
@@ -10,6 +13,33 @@ from mujoco.rollout import Rollout
 from torchrl_h2o.residuals import Simulation
 
 BATCH, HORIZON = 4096, 20
+
+
+@dataclass
+class Count:
+    """Control steps that were simulated, and the seconds that this took."""
+
+    steps: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CountingSimulation(Simulation):
+    """A simulation that counts what it and those made of it, with more effects, are asked to simulate."""
+
+    count: Count = field(default_factory=Count)
+
+    @classmethod
+    def of(cls, simulation: Simulation) -> "CountingSimulation":
+        """The same simulation, counting from zero."""
+        return cls(**{part.name: getattr(simulation, part.name) for part in dataclasses.fields(simulation)})
+
+    def rollout(self, states: np.ndarray, actions: np.ndarray, **options: np.ndarray) -> np.ndarray:
+        start = time.perf_counter()
+        reached = super().rollout(states, actions, **options)
+        self.count.steps += actions.shape[0] * actions.shape[1]
+        self.count.seconds += time.perf_counter() - start
+        return reached
 
 
 def steps_per_second(simulation: Simulation, seed: int = 0) -> dict[str, float]:
@@ -30,7 +60,7 @@ def steps_per_second(simulation: Simulation, seed: int = 0) -> dict[str, float]:
         }
 
 
-def _rate(simulate) -> float:
+def _rate(simulate: Callable[[], object]) -> float:
     seconds = []
     for _ in range(2):
         start = time.perf_counter()

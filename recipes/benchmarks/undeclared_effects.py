@@ -47,7 +47,7 @@ class TorqueRipple(_TorqueOnJoint):
     """What the teeth of a gear or the poles of a motor do: a torque that goes with sin(k q)."""
 
     wording: ClassVar[str] = "ripple of {torque}, sin({waves} q), on {joint}"
-    waves: float = parameter(unit="1", bounds=(1.0, 100.0), neutral=1.0)
+    waves: float = parameter(unit="1", bounds=(0.1, 100.0), neutral=1.0)
 
     def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
         return self.torque * np.sin(self.waves * q)

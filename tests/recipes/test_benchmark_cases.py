@@ -21,6 +21,7 @@ from scoring import (
     reduction,
     says_nothing_is_missing,
 )
+from speed import CountingSimulation
 from systems import SYSTEMS, with_sensor_noise
 from torchrl.envs import GymEnv, TransformedEnv
 from undeclared_effects import CubicWind, LateForce, MovingSpring, PlaceFriction, TorqueRipple
@@ -306,6 +307,18 @@ def test_the_code_under_test_is_shown_neither_the_truth_nor_the_case(tmp_path):
     assert set(data.keys()) == {"observation", "action", "done", "terminated", "truncated", "next"}
     assert options.keys() == {"source", "held_out", "seed", "progress"}
     assert "gravity" not in options["source"]
+
+
+def test_steps_are_counted_in_all_that_is_made_of_a_simulation():
+    simulation, measured = plain("pendulum", 0)
+    counting = CountingSimulation.of(simulation)
+    mended = counting.with_effects(Gravity(0.5))
+    starts = np.arange(7)
+    expected = residuals(simulation.with_effects(Gravity(0.5)), measured, starts, 3)
+    before = counting.count.steps
+    assert (residuals(mended, measured, starts, 3) == expected).all()
+    assert counting.count.steps - before == 21
+    assert counting.count.seconds > 0.0
 
 
 def test_families_are_chosen_by_name_and_logs_by_their_folder(tmp_path):
