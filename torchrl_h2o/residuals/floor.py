@@ -23,9 +23,10 @@ def explainable_floor(
 ) -> np.ndarray:
     """The held-out one-step error that remains when a network has explained what it can of the residual.
 
-    A network with two hidden layers maps observation and action, this row's and the previous row's, to the residual. It is
-    fitted to the rows that may be fitted and stopped early on blocks of them. A dimension in which it does not help there
-    is left alone.
+    A network with two hidden layers maps the observation, the action and the action before to the residual. It is
+    fitted to the rows that may be fitted and stopped early on blocks of them. A dimension in which it does not help
+    there is left alone. It does not see the observation before: with that it would learn to smooth the sensors' noise,
+    which no effect can do for the simulator.
 
     Args:
         simulation: the simulator.
@@ -56,10 +57,11 @@ def explainable_floor(
 
 
 def _inputs(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """Observation and action of each row and of the row before it in its run, (T, 2 n + 2 nu)."""
-    now = np.hstack([measured.observation, executed_actions(simulation, measured)])
-    before = np.concatenate([np.vstack([now[run][:1], now[run][:-1]]) for run in measured.runs])
-    return np.hstack([now, now - before])
+    """Observation, with sine and cosine of its angles, action, and action before in the same run, (T, inputs)."""
+    angles = measured.observation[:, [unit == "rad" for unit in simulation.state_map.units]]
+    actions = executed_actions(simulation, measured)
+    before = np.concatenate([np.vstack([actions[run][:1], actions[run][:-1]]) for run in measured.runs])
+    return np.hstack([measured.observation, np.sin(angles), np.cos(angles), actions, before])
 
 
 def _standard(values: np.ndarray, rows: np.ndarray) -> np.ndarray:

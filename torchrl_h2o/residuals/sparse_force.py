@@ -48,7 +48,7 @@ def sparse_force(library: TermLibrary, force: np.ndarray, weight: np.ndarray) ->
         The terms, none if none pays.
     """
     known = weight > 0.0
-    if known.sum() < 10 * _BLOCKS:
+    if known.sum() < 10 * _BLOCKS or not force[known].any():
         return SparseForce()
     candidates = list(dict.fromkeys([*library.fixed(), *library.scanned(force, weight)]))
     columns = np.stack([library.column(factors) for factors in candidates], axis=1)

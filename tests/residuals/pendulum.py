@@ -1,0 +1,70 @@
+"""A motored pendulum with forces that the code under test does not know of, and data recorded from it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects import ForceEffect, parameter
+from torchrl_h2o.residuals import Measured, Simulation, StateMap
+
+XML = """
+<mujoco model="pendulum">
+  <option timestep="0.01"/>
+  <worldbody>
+    <body>
+      <joint name="elbow" type="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.5"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="elbow" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+Law = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class UnknownForce(ForceEffect):
+    """A law of nature: a torque as a function of position, velocity and time."""
+
+    wording: ClassVar[str] = "{size} of what nobody knows"
+    size: float = parameter(unit="N·m", bounds=(-10.0, 10.0), neutral=0.0)
+    law: Law = lambda q, v, t: 0.0 * q
+
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Callable:
+        return lambda data: self.size * self.law(data.qpos, data.qvel, data.time)
+
+    def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> Callable:
+        return lambda qpos, qvel, ctrl, time: self.size * self.law(qpos, qvel, time[:, None])
+
+
+def pendulum() -> Simulation:
+    state_map = StateMap.of_coordinates(("elbow", "elbow_velocity"), ("rad", "rad/s"), (0, 1), num_states=2)
+    return Simulation(lambda: mujoco.MjSpec.from_string(XML), 2, state_map, name="pendulum")
+
+
+def recorded(real: Simulation, transitions: int = 1500, noise: float = 0.0, seed: int = 0) -> Measured:
+    """One run under smooth random torques; noise is a share of each dimension's standard deviation."""
+    rng = np.random.default_rng(seed)
+    action = np.zeros((transitions, 1))
+    for t in range(1, transitions):
+        action[t] = 0.9 * action[t - 1] + 0.4 * rng.standard_normal()
+    action = np.clip(0.8 * action, -1.0, 1.0)
+    reached = real.rollout(np.zeros((1, 2)), action[None])[0]
+    observed = np.vstack([np.zeros(2), reached])
+    observed += noise * observed.std(0) * rng.standard_normal(observed.shape)
+    rows = np.arange(transitions)
+    return Measured(
+        observed[:-1],
+        action,
+        observed[1:],
+        run=np.zeros(transitions, int),
+        time=rows * real.control_step,
+        usable=np.ones(transitions, bool),
+        held_out=rows >= 0.7 * transitions,
+        left_out={},
+        source="pendulum",
+    )

@@ -1,0 +1,59 @@
+"""A force that nobody declared is found from data, put into words, and only where it pays."""
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import UnknownForce, pendulum, recorded
+from torchrl_h2o.residuals import residuals
+from torchrl_h2o.residuals.undeclared import find_undeclared
+
+LAWS = {
+    "torque ripple": (0.2, lambda q, v, t: np.sin(7.0 * q + 0.5)),
+    "wind": (-0.002, lambda q, v, t: v**3),
+    "a spring to a moving point": (-0.5, lambda q, v, t: q - 0.4 * np.sin(2.3 * t)),
+    "a force that starts late": (0.2, lambda q, v, t: (t >= 13.7) + 0.0 * q),
+    "friction that depends on position": (-0.08, lambda q, v, t: np.sign(v) * (1.0 + 0.8 * np.cos(5.0 * q))),
+}
+
+
+@pytest.mark.parametrize(("name", "noise"), [*((name, 0.01) for name in LAWS), ("torque ripple", 0.0)])
+def test_force_that_no_catalogue_holds_is_found(name, noise):
+    size, law = LAWS[name]
+    simulation, truth = pendulum(), UnknownForce(size, law)
+    measured = recorded(simulation.with_effects(truth), noise=noise)
+    found = find_undeclared(simulation, measured)
+    left = residuals(simulation.with_effects(truth), measured, measured.windows(1, held_out=True))[:, 0]
+    least = np.sqrt((left**2).mean(0))
+    explained = (found.error_before - found.error_after) / (found.error_before - least)
+    assert explained[1] > 0.8
+
+
+def test_ripple_is_described_with_its_frequency_and_interval():
+    simulation = pendulum()
+    truth = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
+    measured = recorded(simulation.with_effects(truth), noise=0.002)
+    found = find_undeclared(simulation, measured)
+    (term,) = found.effect.parsed
+    assert term.factors[-1].function == "sin"
+    low, high = found.ci95["frequency_1"]
+    assert low < 7.0 < high
+    assert high - low < 0.2
+    assert found.effect.describe().startswith("torque on joint elbow: ")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_alone_is_no_effect(seed):
+    simulation = pendulum()
+    assert find_undeclared(simulation, recorded(simulation, noise=0.01, seed=seed)) is None
+
+
+def test_perfect_simulator_lacks_nothing():
+    simulation = pendulum()
+    assert find_undeclared(simulation, recorded(simulation)) is None
+
+
+def test_force_that_ceases_before_the_held_out_data_is_not_kept():
+    """It explains the rows that were fitted, but would only harm what comes after."""
+    simulation = pendulum()
+    burst = UnknownForce(0.1, lambda q, v, t: (np.abs(t - 20.0) < 1.0) * np.sin(5.0 * q))
+    assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None
