@@ -55,5 +55,5 @@ def test_perfect_simulator_lacks_nothing():
 def test_force_that_ceases_before_the_held_out_data_is_not_kept():
     """It explains the rows that were fitted, but would only harm what comes after."""
     simulation = pendulum()
-    burst = UnknownForce(0.1, lambda q, v, t: (np.abs(t - 20.0) < 1.0) * np.sin(5.0 * q))
+    burst = UnknownForce(0.2, lambda q, v, t: (t < 21.0) * np.sin(5.0 * q))
     assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None
