@@ -73,7 +73,7 @@ class Simulator(ABC):
 
     @property
     def gaps(self) -> Mapping[object, Sequence[Effect]]:
-        """What every gap that is in consists of, under what stands for the gap, the one put in first first."""
+        """What every gap that is in consists of, under what stands for the gap, in the order in which they came in."""
         return getattr(self.owner, "_dynamics_gaps", {})
 
     @property
