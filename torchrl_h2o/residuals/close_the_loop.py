@@ -11,11 +11,11 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.residuals.explanation import explain
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.report import DataSummary, Report
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.summary import summarise
-from torchrl_h2o.residuals.trace import trace_effects
 
 
 def close_the_loop(
@@ -67,6 +67,6 @@ def close_the_loop(
         return Report(simulator=simulation.name, data=summary, conclusion=reason)
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
-        trace = trace_effects(simulation, measured, entries, rng=np.random.default_rng(seed), progress=bar)
+        explanation = explain(simulation, measured, entries, rng=np.random.default_rng(seed), progress=bar)
         bar.set_description("reporting")
-        return summarise(simulation, measured, trace, seed=seed, start=start)
+        return summarise(simulation, measured, explanation, seed=seed, start=start)

@@ -12,6 +12,7 @@ import numpy as np
 from mujoco import sysid
 
 from torchrl_h2o.effects import Effect, ObservationEffect, Parameter
+from torchrl_h2o.residuals.initial_states import estimate_states
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.residual import residuals, start_states
 from torchrl_h2o.residuals.simulation import Simulation
@@ -21,6 +22,7 @@ Free = tuple[str, ...]  # the names of the parameters of one effect that a fit m
 _ROUNDING = 2e-7  # of what is measured: data are single precision
 _WORST = 1e3  # of a residual, in scales: where a simulation diverges
 _ORIGIN = 10.0  # a fit's variables start here, so that relative steps are steps of their own size
+_DRAWS = 4  # of sensor noise, for what it makes of each window
 _STEP = 1e-5  # relative, of finite differences: 1e-4 of a parameter's typical size
 
 
@@ -32,9 +34,9 @@ class Problem:
         simulation: without the effects to be fitted.
         measured: the data.
         horizon: control steps of the windows that residuals are taken over.
-        scale: (n), of the residual of each dimension, in its units.
+        scale: (T, H, n) or (1, 1, n), the size of residual to be expected of each window, in units.
         states: (T, nq + nv), where windows start from.
-        estimated: whether ``states`` were given, and are kept also where sensors are hypothesised.
+        estimated: whether those states were estimated, and not read from the sensors as they are.
     """
 
     simulation: Simulation
@@ -46,20 +48,48 @@ class Problem:
 
     @classmethod
     def pose(
-        cls, simulation: Simulation, measured: Measured, horizon: int = 1, states: np.ndarray | None = None
+        cls,
+        simulation: Simulation,
+        measured: Measured,
+        horizon: int = 1,
+        *,
+        sensor_std: np.ndarray | None = None,
+        estimated: bool = False,
     ) -> Problem:
-        """The problem at a simulation: states to start from are found and residuals weighed by their own size."""
-        estimated = states is not None
-        if states is None:
-            states = start_states(simulation, measured)
-        problem = cls(simulation, measured, horizon, np.ones(measured.observation.shape[1]), states, estimated)
-        return replace(problem, scale=problem._mean_size())
+        """The problem at a simulation: states to start from are found and residuals weighed by the size they have.
 
-    def _mean_size(self) -> np.ndarray:
-        """The mean size of each dimension's residual, but no less than what the data's own rounding makes of it."""
-        starts = self.measured.windows(self.horizon, self.horizon, held_out=False)
-        found = self.residual((), starts)
-        return np.maximum(np.abs(found).mean((0, 1)), self._rounding(found, starts))
+        Args:
+            simulation: the simulator.
+            measured: the data.
+            horizon: control steps of the windows.
+            sensor_std: (n), noise of the readings. What it makes of a residual differs from window to window: where a
+                contact is near, little noise in a position is a large force.
+            estimated: whether windows start from estimated states.
+        """
+        states = (estimate_states if estimated else start_states)(simulation, measured)
+        one = np.ones((1, 1, measured.observation.shape[1]))
+        problem = cls(simulation, measured, horizon, one, states, estimated)
+        starts = measured.windows(horizon, horizon, held_out=False)
+        found = problem.residual((), starts)
+        rounding = problem._rounding(found, starts)
+        if sensor_std is None:
+            return replace(problem, scale=np.maximum(np.abs(found).mean((0, 1), keepdims=True), rounding))
+        by_noise = problem._made_by_noise(sensor_std)
+        trust = 1.0 / (1.0 + by_noise[starts] / (np.median(by_noise[starts], axis=0) + 1e-300))
+        size = (trust * np.abs(found)).sum((0, 1)) / trust.sum((0, 1))
+        return replace(problem, scale=np.maximum(np.sqrt(size**2 + by_noise), rounding))
+
+    def _made_by_noise(self, sensor_std: np.ndarray) -> np.ndarray:
+        """The mean square, (T, H, n), that sensor noise makes of the residual of each window."""
+        measured, rng = self.measured, np.random.default_rng(0)
+        starts = np.concatenate([measured.windows(self.horizon, self.horizon, held_out=part) for part in (False, True)])
+        base = self.residual((), starts)
+        squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
+        for _ in range(_DRAWS):
+            noise = sensor_std * rng.standard_normal(measured.observation.shape)
+            moved = replace(self, states=self.states + noise @ self.simulation.state_map.restore.T)
+            squares[starts] += (moved.residual((), starts) - base) ** 2 / _DRAWS
+        return squares + sensor_std**2
 
     def _rounding(self, found: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """How large a residual, (n), the rounding of single precision in the states that windows start from makes."""
@@ -75,8 +105,9 @@ class Problem:
     def within_rounding(self) -> bool:
         """Whether nothing is left to explain but that data are single precision."""
         starts = self.measured.windows(self.horizon, self.horizon, held_out=False)
-        found = self.residual((), starts)
-        return bool((np.abs(found).mean((0, 1)) < 3.0 * self._rounding(found, starts)).all())
+        plain = replace(self, scale=np.ones_like(self.scale[:1, :1]))
+        found = plain.residual((), starts)
+        return bool((np.abs(found).mean((0, 1)) < 3.0 * plain._rounding(found, starts)).all())
 
     def residual(self, effects: Sequence[Effect], starts: np.ndarray) -> np.ndarray:
         """Residuals in scales, (W, H, n), with effects put into the simulation.
@@ -89,8 +120,12 @@ class Problem:
         states = self.states
         if sensors and not self.estimated:
             states = self._sensed(simulation)
-        found = residuals(simulation, self.measured, starts, self.horizon, states=states) / self.scale
+        found = residuals(simulation, self.measured, starts, self.horizon, states=states) / self.scale_of(starts)
         return np.nan_to_num(np.clip(found, -_WORST, _WORST), nan=_WORST)
+
+    def scale_of(self, starts: np.ndarray) -> np.ndarray:
+        """The size of residual to be expected of windows, (W, H, n) or (1, 1, n), in units."""
+        return self.scale[starts] if len(self.scale) > 1 else self.scale
 
     def _sensed(self, simulation: Simulation) -> np.ndarray:
         """The states behind other sensors; what is hidden stays as it is, for its sake no sensor was read."""
@@ -167,7 +202,7 @@ def fit(
         try:
             return [problem.residual(put(z), starts).ravel()], None, None
         except ValueError:  # values that the model cannot have, such as damping below zero
-            return [np.full(len(starts) * problem.horizon * len(problem.scale), _WORST)], None, None
+            return [np.full(len(starts) * problem.horizon * problem.scale.shape[-1], _WORST)], None, None
 
     unknown = sysid.ParameterDict(
         {str(i): sysid.Parameter(str(i), _ORIGIN, *variable.bounds) for i, variable in enumerate(variables)}
@@ -198,7 +233,7 @@ def _half_widths(problem: Problem, result) -> np.ndarray:
     Residuals of one window belong together, so they count as one observation.
     """
     jacobian, residual = result.jac, result.fun
-    size = problem.horizon * len(problem.scale)
+    size = problem.horizon * problem.scale.shape[-1]
     weight = 1.0 / np.sqrt(1.0 + np.clip(residual, -_WORST, _WORST) ** 2)
     curvature = np.linalg.pinv(jacobian.T @ (weight[:, None] * jacobian))
     pulls = (jacobian * (weight * residual)[:, None]).reshape(-1, size, jacobian.shape[1]).sum(1)

@@ -19,6 +19,7 @@ def residuals(
     *,
     states: np.ndarray | None = None,
     applied: np.ndarray | None = None,
+    rng: np.random.Generator | None = None,
 ) -> np.ndarray:
     """Residuals over windows that each start from their own measured state.
 
@@ -29,6 +30,7 @@ def residuals(
         horizon: control steps a window.
         states: (T, nq + nv), to start from instead of the measured ones.
         applied: (W, H, nv), generalised forces in N or N·m beside those of the effects.
+        rng: draws the noise of random effects of the action, which are left out without it.
 
     Returns:
         (W, H, n), in the units of the observations; NaN where the simulation diverges.
@@ -37,13 +39,13 @@ def residuals(
         states = start_states(simulation, measured)
     rows = starts[:, None] + np.arange(horizon)
     reached = simulation.rollout(
-        states[starts], executed_actions(simulation, measured)[rows], time=measured.time[starts], applied=applied
+        states[starts], executed_actions(simulation, measured, rng)[rows], time=measured.time[starts], applied=applied
     )
     observed = simulation.state_map.observations(reached)
     for effect in simulation.effects:
         if isinstance(effect, ObservationEffect) and effect.memoryless and not effect.is_neutral and not effect.random:
             observed = effect.process(simulation.control_step, None)(observed)
-    return _without_delay(simulation, measured)[rows] - observed
+    return _undelayed(simulation, measured)[rows] - observed
 
 
 def start_states(simulation: Simulation, measured: Measured) -> np.ndarray:
@@ -72,20 +74,14 @@ def _settled(simulation: Simulation, measured: Measured, states: np.ndarray) -> 
     return carried
 
 
-def executed_actions(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """What is executed of the measured actions, (T, nu), run by run."""
-    return np.concatenate([simulation.executed(measured.action[run]) for run in measured.runs])
+def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:
+    """What is executed of the measured actions, (T, nu), run by run; without a generator, of random effects nothing."""
+    return np.concatenate([simulation.executed(measured.action[run], rng) for run in measured.runs])
 
 
-def _without_delay(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """The following observations, (T, n), at the time at which they were true: sensors that remember are undone."""
-    remember = [
-        effect
-        for effect in simulation.effects
-        if isinstance(effect, ObservationEffect) and not effect.memoryless and not effect.is_neutral
-    ]
-    following = measured.following
-    for effect in reversed(remember):
-        whole = [np.vstack([measured.observation[run][:1], following[run]]) for run in measured.runs]
-        following = np.concatenate([effect.restore(part, simulation.control_step)[1:] for part in whole])
-    return following
+def _undelayed(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """The following observations, (T, n), at the time at which they were true."""
+    observation, following = measured.observation, measured.following
+    return np.concatenate(
+        [simulation.undelayed(np.vstack([observation[run][:1], following[run]]))[1:] for run in measured.runs]
+    )

@@ -5,7 +5,8 @@ Everything runs through ``mujoco.rollout``; one control step is ``frame_skip`` p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import cpu_count
@@ -17,12 +18,15 @@ from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
 from torchrl_h2o.effects import (
+    ActionDelay,
     ActionEffect,
     CatalogueEntry,
     Effect,
     ForceEffect,
     ModelEffect,
+    ObservationDelay,
     ObservationEffect,
+    balanced,
     catalogue,
     compile_model,
 )
@@ -120,17 +124,29 @@ class Simulation:
     def executed(self, actions: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """What is executed of the actions of one recorded run, (T, nu), after the action effects.
 
-        Random effects are left out without a generator.
+        Random effects are left out without a generator. Sensors that are all late by the same time show a run as it
+        would be if its actions were late, and are taken so.
         """
-        for effect in self.effects:
-            if isinstance(effect, ActionEffect) and not effect.is_neutral and (rng or not effect.random):
+        for effect in balanced(self.effects):
+            if effect.is_neutral or (effect.random and rng is None):
+                continue
+            if isinstance(effect, ActionEffect):
                 actions = effect.run(actions, self.control_step, rng)
+            elif _all_late(effect):
+                actions = ActionDelay(effect.delay).run(actions, self.control_step, rng)
         return actions
 
     def true_observations(self, observations: np.ndarray) -> np.ndarray:
         """What the sensors of one run, (T, n), saw before the observation effects; NaN where that cannot be told."""
         for effect in reversed(self.effects):
-            if isinstance(effect, ObservationEffect) and not effect.is_neutral:
+            if isinstance(effect, ObservationEffect) and not effect.is_neutral and not _all_late(effect):
+                observations = effect.restore(observations, self.control_step)
+        return observations
+
+    def undelayed(self, observations: np.ndarray) -> np.ndarray:
+        """The observations of one run, (T, n), at the time at which they were true, where some sensors are late."""
+        for effect in reversed(self.effects):
+            if isinstance(effect, ObservationDelay) and not effect.is_neutral and not _all_late(effect):
                 observations = effect.restore(observations, self.control_step)
         return observations
 
@@ -161,15 +177,16 @@ class Simulation:
         forces = [e.batched(self.model) for e in self.effects if isinstance(e, ForceEffect) and not e.is_neutral]
         step = self._forced if forces else self._free
         chunk = max(1, _CHUNK // (horizon * self.frame_skip * size))
-        parts = [
-            step(
-                full[i : i + chunk], actions[i : i + chunk], None if applied is None else applied[i : i + chunk], forces
-            )
-            for i in range(0, batch, chunk)
-        ]
+        parts = []
+        with _no_warnings():
+            for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
+                parts.append(step(full[rows], actions[rows], None if applied is None else applied[rows], forces))
         reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
-        reached = reached[:, :, 1 : 1 + states.shape[1]]
-        # MuJoCo starts anew from the model's own pose where a state is not finite or far too large
+        # MuJoCo starts anew, and its clock with it, where a state is not finite or far too large
+        expected = full[:, :1] + self.control_step * np.arange(1, horizon + 1)
+        diverged = np.maximum.accumulate(np.abs(reached[:, :, 0] - expected) > 0.5 * self.control_step, axis=1)
+        reached = reached[:, :, 1 : 1 + states.shape[1]].copy()
+        reached[diverged] = np.nan
         return reached
 
     def _free(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
@@ -198,3 +215,18 @@ class Simulation:
                 full = states[:, 0]
             reached.append(full)
         return np.stack(reached, axis=1)
+
+
+@contextmanager
+def _no_warnings() -> Iterator[None]:
+    """Keeps MuJoCo from writing to console and file that a simulation diverged: whoever tries values sees NaN."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _all_late(effect: Effect) -> bool:
+    return isinstance(effect, ObservationDelay) and effect.entries is None

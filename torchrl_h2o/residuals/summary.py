@@ -7,6 +7,9 @@ import time
 import numpy as np
 
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.chance import sensor_noise
+from torchrl_h2o.residuals.explanation import Explanation
+from torchrl_h2o.residuals.floor import explainable_floor
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.report import (
     DataSummary,
@@ -23,7 +26,6 @@ from torchrl_h2o.residuals.residual import residuals
 from torchrl_h2o.residuals.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.significance import IN_WORDS
 from torchrl_h2o.residuals.simulation import Simulation
-from torchrl_h2o.residuals.trace import Trace
 from torchrl_h2o.residuals.two_sample import two_sample_auc
 
 _METRIC = "held-out one-step RMSE, each dimension over the spread of its one-step change"
@@ -31,28 +33,34 @@ _HORIZONS = (1, 2, 5, 10, 20, 50)  # control steps
 _RANKED = 30  # rejected effects that the report lists
 
 
-def summarise(simulation: Simulation, measured: Measured, trace: Trace, *, seed: int, start: float) -> Report:
-    """The report of a search.
+def summarise(
+    simulation: Simulation, measured: Measured, explanation: Explanation, *, seed: int, start: float
+) -> Report:
+    """The report of an explanation.
 
     Args:
         simulation: without the effects found.
         measured: the data.
-        trace: what the search found.
+        explanation: what was found.
         seed: of the classifiers.
         start: of the wall clock, by ``time.perf_counter``.
     """
-    effects = trace.fit.effects
+    effects, trace = explanation.effects, explanation.trace
     mended = simulation.with_effects(*effects)
-    names = {entry.name for group in trace.groups for entry in (attempt.entry for attempt in group)}
+    sensor_std = sensor_noise(mended, measured)
+    alike = {attempt.entry.name for group in trace.groups for attempt in group}
     return Report(
         simulator=simulation.name,
         data=DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out),
         error=error_summary(simulation, mended, measured),
         found=tuple(
             FoundEffect(
-                effect, True, trace.fit.ci95(index), _error(simulation.with_effects(*effects[: index + 1]), measured)
+                part.effect,
+                part.declared,
+                part.ci95,
+                _error(simulation.with_effects(*effects[: index + 1]), measured),
             )
-            for index, effect in enumerate(effects)
+            for index, part in enumerate(explanation.parts)
         ),
         rejected=tuple(
             RejectedEffect(
@@ -60,18 +68,20 @@ def summarise(simulation: Simulation, measured: Measured, trace: Trace, *, seed:
                 _error(simulation.with_effects(attempt.effect), measured),
                 attempt.p_value,
                 "as good as one that was put in"
-                if attempt.entry.name in names
+                if attempt.entry.name in alike
                 else "explains less, or no more than chance",
             )
             for attempt in trace.attempts[:_RANKED]
+            if attempt.entry.name not in {entry.name for entry in trace.entries}
         ),
         indistinguishable=tuple(
-            _group(simulation, measured, effects, index, [attempt.effect for attempt in group])
-            for index, group in enumerate(trace.groups)
-            if group
+            _group(simulation, measured, effects, index, part.alike)
+            for index, part in enumerate(explanation.parts)
+            if part.alike
         ),
         two_sample=TwoSample(
-            two_sample_auc(simulation, measured, seed=seed), two_sample_auc(mended, measured, seed=seed)
+            two_sample_auc(simulation, measured, sensor_std=sensor_std, seed=seed),
+            two_sample_auc(mended, measured, sensor_std=sensor_std, seed=seed),
         ),
         stop_test=IN_WORDS,
         wall_s=time.perf_counter() - start,
@@ -83,6 +93,7 @@ def error_summary(simulation: Simulation, mended: Simulation, measured: Measured
     """The held-out error before and after, over all, by dimension and by horizon."""
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
+    floor = explainable_floor(mended, measured)
     horizons = []
     for steps in _HORIZONS:
         if len(measured.windows(steps, steps, held_out=True)) < 2:
@@ -96,7 +107,8 @@ def error_summary(simulation: Simulation, mended: Simulation, measured: Measured
         unit="1",
         before=_error(simulation, measured),
         after=_error(mended, measured),
-        per_dimension=tuple(map(DimensionError, names, units, before.tolist(), after.tolist())),
+        floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
+        per_dimension=tuple(map(DimensionError, names, units, before.tolist(), after.tolist(), floor.tolist())),
         horizons=tuple(horizons),
     )
 
@@ -110,7 +122,8 @@ def spread(measured: Measured) -> np.ndarray:
 def _rmse(simulation: Simulation, measured: Measured, horizon: int) -> np.ndarray:
     """Held-out error at the end of windows, (n), in units."""
     starts = measured.windows(horizon, max(1, horizon // 2), held_out=True)
-    missed = residuals(simulation, measured, starts, horizon)[:, -1]
+    # with the simulator's own noise, if it has any: that is an error too
+    missed = residuals(simulation, measured, starts, horizon, rng=np.random.default_rng(0))[:, -1]
     return np.sqrt(np.nanmean(missed**2, axis=0))
 
 
@@ -119,7 +132,7 @@ def _error(simulation: Simulation, measured: Measured) -> float:
 
 
 def _group(
-    simulation: Simulation, measured: Measured, effects: tuple[Effect, ...], index: int, others: list[Effect]
+    simulation: Simulation, measured: Measured, effects: tuple[Effect, ...], index: int, others: tuple[Effect, ...]
 ) -> IndistinguishableGroup:
     alike = (effects[index], *others)
     errors = [

@@ -1,4 +1,4 @@
-"""Traces a residual to effects of a catalogue: forward selection, backward elimination, and what cannot be told apart."""
+"""Traces a residual to effects of a catalogue: forward selection, backward elimination, what cannot be told apart."""
 
 from __future__ import annotations
 
@@ -9,18 +9,21 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.chance import sensor_noise, stand_in
 from torchrl_h2o.residuals.fit import Fit, Problem, fit, losses
+from torchrl_h2o.residuals.horizon import choose_horizon
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.significance import p_value
 from torchrl_h2o.residuals.simulation import Simulation
 
 _LEVEL = 0.01  # of the whole search, divided by the number of entries
-_PAYS = 0.01  # share of the held-out loss that an effect must take away to be worth a word
-_SCREENED = 1000  # windows
+_PAYS = 0.002  # share of the held-out loss that an effect must take away to be worth a word
+_SCREENED = 600  # windows
 _FITTED = 12  # leads that are fitted on the screened windows
 _FINALISTS = 4  # leads that are fitted on all windows
 _MOST = 6  # effects
+_BEYOND_NOISE = 2.0  # times what an effect explains where there is nothing but noise
 _SAME = 1e-6  # of what an effect explains: less is a matter of rounding
 _ALIKE = 0.1  # of what an effect explains: another one that misses more of it is no alternative
 
@@ -31,15 +34,22 @@ class Attempt:
 
     Args:
         entry: of the catalogue.
-        effect: at its best fit.
-        loss: on held-out windows, with those found before it.
+        fit: of it and the others.
+        index: which effect of the fit it is.
+        loss: on held-out windows.
         p_value: of its gain.
     """
 
     entry: CatalogueEntry
-    effect: Effect
+    fit: Fit
+    index: int
     loss: float
     p_value: float
+
+    @property
+    def effect(self) -> Effect:
+        """The effect at its best fit."""
+        return self.fit.effects[self.index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,18 +59,16 @@ class Trace:
     Args:
         entries: of the effects found, in the order in which they pay.
         fit: their joint fit.
-        losses: (W), of held-out windows, with all of them.
-        loss_before: mean loss of the held-out windows without any.
         attempts: what else was tried, the best first.
         groups: for each effect found, others that do as well in its place, the best first.
-        problem: with the scales of the last round.
+        exact: whether nothing is left but that data are single precision.
     """
 
     entries: tuple[CatalogueEntry, ...]
     fit: Fit
     attempts: tuple[Attempt, ...]
     groups: tuple[tuple[Attempt, ...], ...]
-    problem: Problem
+    exact: bool
 
 
 def trace_effects(
@@ -83,7 +91,9 @@ def trace_effects(
     Returns:
         What was found, what was tried, and what cannot be told apart.
     """
-    return Search(Problem.pose(simulation, measured), catalogue, rng, progress).run()
+    horizon = choose_horizon(simulation, measured, catalogue, rng)
+    problem = Problem.pose(simulation, measured, horizon)
+    return Search(problem, catalogue, rng, progress).run()
 
 
 @dataclass
@@ -102,6 +112,7 @@ class Search:
     rng: np.random.Generator
     progress: tqdm
     attempts: dict[str, Attempt] = field(default_factory=dict)
+    rivals: dict[str, list[Lead]] = field(default_factory=dict)
 
     def __post_init__(self):
         measured, horizon = self.problem.measured, self.problem.horizon
@@ -113,19 +124,22 @@ class Search:
     def run(self) -> Trace:
         """Adds the effect that explains most while one explains more than chance, and takes out what is not needed."""
         entries, best = [], self._fitted([])
-        leads = []
-        while self._weigh(best) and len(entries) < _MOST:
+        while (more := self._weigh(best)) and len(entries) < _MOST:
             leads = screen(self.problem, best.effects, self._others(entries), self.screened, self.progress.update)
             added = self._best_addition(entries, best, leads)
             if added is None:
                 break
+            self.rivals[added[0][-1].name] = leads
             entries, best = self._eliminated(*added)
             self.progress.set_postfix_str(", ".join(entry.name for entry in entries))
-        groups = tuple(self._as_good(entries, best, index) for index in range(len(entries)))
+        groups = []
+        for index in range(len(entries)):
+            entries, best, group = self._simplest(entries, best, index)
+            groups.append(group)
         tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
         found = {entry.name for entry in entries}
         attempts = tuple(attempt for attempt in tried if attempt.entry.name not in found)
-        return Trace(tuple(entries), best, attempts, groups, self.problem)
+        return Trace(tuple(entries), best, attempts, tuple(groups), exact=not more)
 
     def _others(self, entries: Sequence[CatalogueEntry]) -> list[CatalogueEntry]:
         names = {entry.name for entry in entries}
@@ -136,9 +150,16 @@ class Search:
         return not self._weigh_by(best.effects).within_rounding
 
     def _weigh_by(self, effects: Sequence[Effect]) -> Problem:
-        simulation = self.problem.simulation.with_effects(*effects)
-        posed = Problem.pose(simulation, self.problem.measured, self.problem.horizon)
-        self.problem = replace(self.problem, scale=posed.scale)
+        """Weighs residuals by the size that they, and what sensor noise makes of them, have with some effects in."""
+        simulation, measured = self.problem.simulation.with_effects(*effects), self.problem.measured
+        posed = Problem.pose(
+            simulation,
+            measured,
+            self.problem.horizon,
+            sensor_std=sensor_noise(simulation, measured),
+            estimated=self.problem.estimated,
+        )
+        self.problem = replace(self.problem, scale=posed.scale, states=posed.states)
         return posed
 
     def _fitted(self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = (), few: bool = False) -> Fit:
@@ -165,11 +186,30 @@ class Search:
             candidate = self._fitted([*entries, lead.entry], start.effects)
             after = self._held_out(candidate.effects)
             p = p_value(before - after)
-            self.attempts[lead.entry.name] = Attempt(lead.entry, candidate.effects[-1], float(after.mean()), p)
+            self.attempts[lead.entry.name] = Attempt(lead.entry, candidate, len(entries), float(after.mean()), p)
             pays = after.mean() < (1.0 - _PAYS) * before.mean()
             if pays and p < _LEVEL / len(self.catalogue) and after.mean() < lowest:
                 winner, lowest = ([*entries, lead.entry], candidate), after.mean()
-        return winner
+        if winner is None:
+            return None
+        explained = 1.0 - lowest / before.mean()
+        return winner if explained > _BEYOND_NOISE * self._explained_by_noise(entries, best, winner) else None
+
+    def _explained_by_noise(
+        self, entries: Sequence[CatalogueEntry], best: Fit, winner: tuple[list[CatalogueEntry], Fit]
+    ) -> float:
+        """The share of the loss that the last entry would explain if nothing but noise were there."""
+        simulation, measured = self.problem.simulation.with_effects(*best.effects), self.problem.measured
+        sensor_std = sensor_noise(simulation, measured)
+        if sensor_std is None:
+            return 0.0
+        horizon = self.problem.horizon
+        data = stand_in(simulation, measured, sensor_std, self.rng, horizon, self.problem.states)
+        posed = Problem.pose(simulation, data, horizon, sensor_std=sensor_std)
+        # from the values that the data gave, and that noise might give too
+        refitted = fit(posed, winner[1].effects[-1:], [free_parameters(winner[0][-1])], self.fitted)
+        before = losses(posed.residual((), self.judged)).mean()
+        return 1.0 - float(losses(posed.residual(refitted.effects, self.judged)).mean() / before)
 
     def _eliminated(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit]:
         """Takes out, one by one, what the others make up for."""
@@ -188,25 +228,44 @@ class Search:
                     break
         return entries, best
 
+    def _simplest(
+        self, entries: list[CatalogueEntry], best: Fit, index: int
+    ) -> tuple[list[CatalogueEntry], Fit, tuple[Attempt, ...]]:
+        """Puts in the place of an effect, of those that do as well, one with the fewest parameters; the rest beside it."""
+        own = Attempt(entries[index], best, index, float(self._held_out(best.effects).mean()), 1.0)
+        group = [own, *self._as_good(entries, best, index)]
+        simplest = min(group, key=lambda attempt: len(free_parameters(attempt.entry)))
+        rest = tuple(attempt for attempt in group if attempt is not simplest)
+        instead = [simplest.entry if i == index else entry for i, entry in enumerate(entries)]
+        self.rivals[simplest.entry.name] = self.rivals[entries[index].name]
+        return instead, simplest.fit, rest
+
+    def _rivals(self, entries: Sequence[CatalogueEntry], index: int) -> list[Lead]:
+        """The entries that promised about as much as one of those found did when it was added."""
+        leads = self.rivals[entries[index].name]
+        promise = next(lead.promise for lead in leads if lead.entry == entries[index])
+        others = [lead for lead in leads if lead.entry not in entries]
+        return sorted(others, key=lambda lead: abs(lead.promise - promise))[:_FITTED]
+
     def _as_good(self, entries: Sequence[CatalogueEntry], best: Fit, index: int) -> tuple[Attempt, ...]:
         """Which other entries do as well as one of those found, in its place."""
-        rest = [entry for i, entry in enumerate(entries) if i != index]
         kept = [effect for i, effect in enumerate(best.effects) if i != index]
         self._weigh_by(kept)
         with_it, without = self._held_out(best.effects), self._held_out(kept).mean()
         few_with_it, few_without = (
             losses(self.problem.residual(e, self.screened)).mean() for e in (best.effects, kept)
         )
-        leads = screen(self.problem, kept, self._others(entries), self.screened, self.progress.update)
         as_good = []
-        for lead in leads[:_FITTED]:
-            start = self._fitted([*rest, lead.entry], [*kept, lead.effect], few=True)
+        for lead in self._rivals(entries, index):
+            instead = [lead.entry if i == index else entry for i, entry in enumerate(entries)]
+            effects = [*kept[:index], lead.effect, *kept[index:]]
+            start = self._fitted(instead, effects, few=True)
             if few_without - start.loss < 0.7 * (few_without - few_with_it):
                 continue
-            candidate = self._fitted([*rest, lead.entry], start.effects)
+            candidate = self._fitted(instead, start.effects)
             after = self._held_out(candidate.effects)
             p = p_value(after - with_it)
             worse = (after.mean() - with_it.mean()) / (without - with_it.mean())
             if worse < _SAME or (worse < _ALIKE and p > _LEVEL):
-                as_good.append(Attempt(lead.entry, candidate.effects[-1], float(after.mean()), p))
+                as_good.append(Attempt(lead.entry, candidate, index, float(after.mean()), p))
         return tuple(sorted(as_good, key=lambda attempt: attempt.loss))

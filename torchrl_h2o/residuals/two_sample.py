@@ -10,13 +10,15 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_h2o.objectives import DynamicsRatioLoss, make_dynamics_ratio_estimator
 from torchrl_h2o.residuals.measured import Measured
-from torchrl_h2o.residuals.residual import residuals
+from torchrl_h2o.residuals.residual import residuals, start_states
 from torchrl_h2o.residuals.simulation import Simulation
 
 _UPDATES, _BATCH, _CELLS = 600, 256, (64, 64)
 
 
-def two_sample_auc(simulation: Simulation, measured: Measured, *, seed: int = 0) -> float:
+def two_sample_auc(
+    simulation: Simulation, measured: Measured, *, sensor_std: np.ndarray | None = None, seed: int = 0
+) -> float:
     """How well real and simulated outcomes of the same state and action can be told apart.
 
     The discriminators of Eq. (9) learn on the fit part and are judged on the held-out part by their log dynamics ratio.
@@ -25,6 +27,8 @@ def two_sample_auc(simulation: Simulation, measured: Measured, *, seed: int = 0)
     Args:
         simulation: the simulator.
         measured: the data.
+        sensor_std: (n), noise of the readings, which simulated outcomes then have too, as do the states that they
+            start from.
         seed: of the networks and the batches.
 
     Returns:
@@ -35,8 +39,8 @@ def two_sample_auc(simulation: Simulation, measured: Measured, *, seed: int = 0)
     fitted, judged = (measured.windows(1, held_out=part) for part in (False, True))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        train = _real_and_simulated(simulation, measured, fitted, fitted)
-        test = _real_and_simulated(simulation, measured, judged, fitted)
+        train = _real_and_simulated(simulation, measured, fitted, fitted, sensor_std)
+        test = _real_and_simulated(simulation, measured, judged, fitted, sensor_std)
         estimator = make_dynamics_ratio_estimator(
             measured.observation.shape[1], measured.action.shape[1], _CELLS, logit_bound=None, clamp=None
         )
@@ -54,9 +58,16 @@ def two_sample_auc(simulation: Simulation, measured: Measured, *, seed: int = 0)
     return float(roc_auc_score(test["real"].numpy(), score.numpy()))
 
 
-def _real_and_simulated(simulation: Simulation, measured: Measured, rows: np.ndarray, like: np.ndarray) -> TensorDict:
+def _real_and_simulated(
+    simulation: Simulation, measured: Measured, rows: np.ndarray, like: np.ndarray, sensor_std: np.ndarray | None
+) -> TensorDict:
     """Measured transitions and, from the same states and actions, simulated ones: standardised as those of ``like``."""
-    missed = residuals(simulation, measured, rows)[:, 0]
+    rng, states = np.random.default_rng(len(rows)), start_states(simulation, measured)
+    noise = np.zeros((2, *measured.observation.shape))
+    if sensor_std is not None:
+        noise = sensor_std * rng.standard_normal(noise.shape)
+        states = states + noise[0] @ simulation.state_map.restore.T
+    missed = residuals(simulation, measured, rows, states=states, rng=rng)[:, 0] - noise[1][rows]
     whole = np.isfinite(missed).all(1)
     rows, missed = rows[whole], missed[whole]
     change = measured.following - measured.observation

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchrl_h2o.effects import ResidualForce
 from torchrl_h2o.effects.residual_force import degrees_of_freedom
+from torchrl_h2o.residuals.chance import sensor_noise
 from torchrl_h2o.residuals.fit import Fit, Problem, fit, losses
 from torchrl_h2o.residuals.forces import force_response, residual_forces, step_path
 from torchrl_h2o.residuals.measured import Measured
@@ -50,7 +51,6 @@ def find_undeclared(
     simulation: Simulation,
     measured: Measured,
     *,
-    states: np.ndarray | None = None,
     progress: Callable[[str], object] | None = None,
 ) -> Undeclared | None:
     """Finds a force that explains what the simulation, with all effects found so far, does not.
@@ -64,13 +64,12 @@ def find_undeclared(
     Args:
         simulation: with all effects found so far.
         measured: the data.
-        states: (T, nq + nv), to start from instead of the measured ones.
         progress: called with what has been found so far, in words, after each round.
 
     Returns:
         The effect, None if there is none that pays.
     """
-    problem = Problem.pose(simulation, measured, states=states)
+    problem = Problem.pose(simulation, measured, sensor_std=sensor_noise(simulation, measured))
     search = _Search(problem, measured.windows(1, held_out=False))
     if search.nothing_to_explain():
         return None
@@ -83,7 +82,8 @@ def find_undeclared(
     p = max(p_value(gain), search.chance_further((), found.effects, held_out=True))
     if p > _LEVEL or gain.mean() < _PAYS * losses(before).mean():
         return None
-    errors = [problem.scale * np.sqrt((residual[:, 0] ** 2).mean(0)) for residual in (before, after)]
+    size = problem.scale_of(judged)
+    errors = [np.sqrt(((size * residual)[:, 0] ** 2).mean(0)) for residual in (before, after)]
     return Undeclared(found.effects[0], found.ci95(0), *errors, p)
 
 
@@ -98,16 +98,14 @@ class _Search:
         simulation, measured, states = self.problem.simulation, self.problem.measured, self.problem.states
         self.path = step_path(simulation, measured, self.starts, states=states)
         self.response = force_response(simulation, measured, self.starts, states=states)
-        self.further = Problem.pose(
-            simulation, measured, _FURTHER, self.problem.states if self.problem.estimated else None
-        )
+        sensor_std = sensor_noise(simulation, measured)
+        self.further = Problem.pose(simulation, measured, _FURTHER, sensor_std=sensor_std)
         self.before = losses(self.problem.residual((), self.starts)).mean()
 
     def nothing_to_explain(self) -> bool:
         """Whether the residual is but rounding."""
-        measured = self.problem.measured
-        spread = np.maximum(measured.observation.std(0), 1e-12)
-        return bool((self.problem.scale < _NOTHING * spread).all())
+        spread = np.maximum(self.problem.measured.observation.std(0), 1e-12)
+        return bool((self.problem.scale_of(self.starts).mean((0, 1)) < _NOTHING * spread).all())
 
     def run(self, progress: Callable[[str], object]) -> Fit | None:
         """Adds terms while they pay, refits all of them together, and takes out what is not needed."""
@@ -137,7 +135,7 @@ class _Search:
     def _added(self, effect: ResidualForce, barred: set[str]) -> SparseForce:
         """The terms, on one degree of freedom, that explain most of what an effect leaves."""
         simulation = self.problem.simulation
-        residual = self.problem.residual((effect,), self.starts)[:, 0] * self.problem.scale
+        residual = (self.problem.residual((effect,), self.starts) * self.problem.scale_of(self.starts))[:, 0]
         forces = residual_forces(
             simulation, self.problem.measured, self.starts, residual=residual, response=self.response
         )

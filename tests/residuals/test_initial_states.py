@@ -1,0 +1,107 @@
+"""States estimated from noisy sensors: nearer to the truth, not from the future, and as measured without noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_h2o.effects import ActionDelay, JointFrictionLoss, ObservationGain
+from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
+from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals.initial_states import estimate_states, noise_levels, smoothed_states
+
+NOISE = np.array([0.005, 0.05, 0.001, 0.03])  # rad, rad/s, m, m/s
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return record(WheelLeggedEnv(), noisy_balance_controller(), 800, seed=0)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return Simulation.from_env(WheelLeggedEnv())
+
+
+def with_noise(measured, scale=1.0):
+    noise = scale * NOISE * np.random.default_rng(0).standard_normal((len(measured) + 1, 4))
+    return replace(measured, observation=measured.observation + noise[:-1], following=measured.following + noise[1:])
+
+
+def error(simulation, states, measured):
+    return np.sqrt(((simulation.state_map.observations(states) - measured.observation) ** 2).mean(0))
+
+
+def test_estimates_are_far_nearer_to_the_truth_than_what_was_measured(simulation, recorded):
+    true = Measured.from_ted(recorded, simulation)
+    estimate = estimate_states(simulation, with_noise(true))
+    assert (error(simulation, estimate, true) < 0.5 * NOISE).all()
+
+
+def test_smoothing_beats_looking_back_only(simulation, recorded):
+    true = Measured.from_ted(recorded, simulation)
+    noisy = with_noise(true)
+    smooth = error(simulation, smoothed_states(simulation, noisy), true)
+    assert (smooth < error(simulation, estimate_states(simulation, noisy), true)).all()
+
+
+def test_the_sensors_noise_is_found_beside_a_wrong_model(simulation, recorded):
+    lacking = simulation.with_effects(JointFrictionLoss(0.3, joints="axle"))
+    levels = noise_levels(lacking, with_noise(Measured.from_ted(recorded, simulation)))
+    np.testing.assert_allclose(levels.sensor, NOISE, rtol=0.25)
+
+
+def test_a_wrong_model_does_not_make_estimates_worse_than_what_was_measured(simulation, recorded):
+    lacking = simulation.with_effects(JointFrictionLoss(0.3, joints="axle"))
+    true = Measured.from_ted(recorded, simulation)
+    for scale in (0.1, 1.0):
+        estimate = estimate_states(lacking, with_noise(true, scale))
+        assert (error(simulation, estimate, true) < 1.1 * scale * NOISE).all()
+
+
+def test_without_noise_the_measured_states_come_out(simulation, recorded):
+    true = Measured.from_ted(recorded, simulation)
+    lacking = simulation.with_effects(JointFrictionLoss(0.3, joints="axle"))
+    assert (error(simulation, estimate_states(lacking, true), true) < 1e-3 * NOISE).all()
+
+
+def test_an_estimate_knows_nothing_of_the_rows_behind_it(simulation, recorded):
+    noisy = with_noise(Measured.from_ted(recorded, simulation))
+    levels = noise_levels(simulation, noisy)
+    other = replace(noisy, observation=noisy.observation.copy(), following=noisy.following.copy())
+    other.observation[401:] += 1.0
+    other.following[400:] += 1.0
+    first, second = (estimate_states(simulation, data, levels)[:401] for data in (noisy, other))
+    # the state map scales by the whole run's spread, which is rounding here
+    np.testing.assert_allclose(first, second, atol=1e-5)
+
+
+def test_hidden_and_related_coordinates_follow_the_estimate(simulation, recorded):
+    states = estimate_states(simulation, with_noise(Measured.from_ted(recorded, simulation)))
+    np.testing.assert_allclose(states[:, 7], states[:, 4] / 0.065 - states[:, 6])  # the wheels roll
+    assert np.abs(states[20:, 1] - states[400, 1]).max() < 1e-3  # and stay sunk into the floor
+
+
+def test_sensor_and_action_effects_of_the_simulation_are_respected(simulation, recorded):
+    true = Measured.from_ted(recorded, simulation)
+    scaled = replace(
+        true, observation=true.observation * [1.0, 0.7, 1.0, 1.0], following=true.following * [1.0, 0.7, 1.0, 1.0]
+    )
+    with_gain = simulation.with_effects(ObservationGain(0.7, entries=(1,)), ActionDelay(0.0))
+    assert (error(simulation, estimate_states(with_gain, scaled), true) < 1e-3 * NOISE).all()
+
+
+def test_every_run_is_estimated_by_itself(simulation, recorded):
+    half = recorded[:400].clone()
+    half["next", "truncated"][-1] = half["next", "done"][-1] = True
+    noisy = with_noise(Measured.from_ted(torch.cat([half, recorded[400:]]), simulation))
+    alone = replace(
+        noisy,
+        **{name: getattr(noisy, name)[400:] for name in ("observation", "action", "following", "run", "time")},
+        usable=noisy.usable[400:],
+        held_out=noisy.held_out[400:],
+    )
+    levels = noise_levels(simulation, noisy)
+    together = estimate_states(simulation, noisy, levels)[400:]
+    np.testing.assert_allclose(together, estimate_states(simulation, alone, levels), atol=1e-5)

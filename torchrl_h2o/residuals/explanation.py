@@ -1,0 +1,169 @@
+"""What explains a residual: effects of a catalogue, a force that nobody declared, and noise of the action."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from tqdm import tqdm
+
+from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Effect
+from torchrl_h2o.residuals.chance import sensor_noise, stand_in
+from torchrl_h2o.residuals.fit import Problem, fit, losses
+from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.noise import estimate_noise
+from torchrl_h2o.residuals.screening import free_parameters
+from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.simulation import Simulation
+from torchrl_h2o.residuals.trace import Trace, trace_effects
+from torchrl_h2o.residuals.undeclared import Undeclared, find_undeclared
+
+_LEVEL = 0.01
+_PAYS = 0.05  # share of the held-out loss that a force which nobody declared must take away
+_BEYOND_NOISE = 2.0  # times what such a force explains where there is nothing but noise
+_NOISE_CHANGE = 0.1  # of the simulator's own action noise: less is not worth a word
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """An effect that explains a part of the residual.
+
+    Args:
+        effect: with its values.
+        declared: whether it is an entry of the catalogue.
+        ci95: the 95 % interval of each parameter that was fitted.
+        alike: other effects that do as well in its place.
+    """
+
+    effect: Effect
+    declared: bool
+    ci95: Mapping[str, tuple[float, float]]
+    alike: tuple[Effect, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What explains a residual, in the order in which it was put in, and the search that it came from."""
+
+    parts: tuple[Part, ...]
+    trace: Trace
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects alone."""
+        return tuple(part.effect for part in self.parts)
+
+
+def explain(
+    simulation: Simulation,
+    measured: Measured,
+    catalogue: Sequence[CatalogueEntry],
+    *,
+    rng: np.random.Generator,
+    progress: tqdm,
+) -> Explanation:
+    """Explains the residual between data and a simulation.
+
+    Effects of the catalogue come first. Where they leave something, a force made from the residual may stand beside
+    them, or in their place: what fits the data better by itself is not called by the names of others.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        catalogue: the effects that it could lack.
+        rng: draws windows and noise.
+        progress: shows how far the search is.
+
+    Returns:
+        The explanation, without any parts if nothing is missing.
+    """
+    trace = trace_effects(simulation, measured, catalogue, rng=rng, progress=progress)
+    parts = [
+        Part(effect, True, trace.fit.ci95(index), tuple(attempt.effect for attempt in trace.groups[index]))
+        for index, effect in enumerate(trace.fit.effects)
+    ]
+    if not trace.exact:
+        progress.set_description("looking for forces that nobody declared")
+        parts = _with_undeclared(simulation, measured, trace, parts, rng)
+    progress.set_description("looking for noise")
+    return Explanation((*parts, *_noise(simulation, measured, [part.effect for part in parts])), trace)
+
+
+def _with_undeclared(
+    simulation: Simulation, measured: Measured, trace: Trace, parts: list[Part], rng: np.random.Generator
+) -> list[Part]:
+    """The parts, with a force that nobody declared beside them or in their place, if that pays."""
+    known = [part.effect for part in parts]
+    judged = measured.windows(1, held_out=True)
+    mended = simulation.with_effects(*known)
+    posed = Problem.pose(mended, measured, sensor_std=sensor_noise(mended, measured))
+    best, problem = parts, replace(posed, simulation=simulation)
+    lowest = losses(problem.residual(known, judged))
+    for base in ([], known) if known else ([],):
+        force = _pays_beyond_noise(simulation.with_effects(*base), measured, rng)
+        if force is None:
+            continue
+        candidate = [*(part for part in parts if base), Part(force.effect, False, force.ci95)]
+        if base:
+            candidate = _needed(problem, trace, candidate)
+        after = losses(problem.residual([part.effect for part in candidate], judged))
+        if after.mean() < (1.0 - _PAYS) * lowest.mean() and p_value(lowest - after) < _LEVEL:
+            best, lowest = candidate, after
+    return best
+
+
+def _pays_beyond_noise(simulation: Simulation, measured: Measured, rng: np.random.Generator) -> Undeclared | None:
+    """A force that nobody declared, unless noise alone would give one that explains about as much."""
+    force = find_undeclared(simulation, measured)
+    sensor_std = None if force is None else sensor_noise(simulation, measured)
+    if sensor_std is None:
+        return force
+    by_chance = find_undeclared(simulation, stand_in(simulation, measured, sensor_std, rng))
+    return force if by_chance is None or _explained(force) > _BEYOND_NOISE * _explained(by_chance) else None
+
+
+def _explained(force: Undeclared) -> float:
+    """The share of the held-out error that a force takes away, mean over the dimensions."""
+    return float(np.mean(1.0 - force.error_after / np.maximum(force.error_before, 1e-300)))
+
+
+def _needed(problem: Problem, trace: Trace, parts: list[Part]) -> list[Part]:
+    """The parts without those effects of the catalogue that the force, fitted anew with the rest, makes up for."""
+    free = {entry.name: free_parameters(entry) for entry in trace.entries}
+    fitted, judged = (problem.measured.windows(1, held_out=part) for part in (False, True))
+    names = [entry.name for entry in trace.entries]
+
+    def refitted(chosen: Sequence[int]) -> tuple[list[Part], np.ndarray]:
+        effects = [parts[i].effect for i in chosen]
+        moved = [free[names[i]] if parts[i].declared else tuple(parts[i].ci95) for i in chosen]
+        result = fit(problem, effects, moved, fitted)
+        new = [
+            Part(effect, parts[i].declared, result.ci95(k), parts[i].alike)
+            for k, (i, effect) in enumerate(zip(chosen, result.effects, strict=True))
+        ]
+        return new, losses(problem.residual(result.effects, judged))
+
+    chosen = list(range(len(parts)))
+    best, lowest = refitted(chosen)
+    for index in range(len(parts) - 1):
+        rest = [i for i in chosen if i != index]
+        candidate, after = refitted(rest)
+        if after.mean() < lowest.mean() / (1.0 - _PAYS) or p_value(after - lowest) > _LEVEL:
+            chosen, best, lowest = rest, candidate, after
+    return best
+
+
+def _noise(simulation: Simulation, measured: Measured, found: Sequence[Effect]) -> list[Part]:
+    """Noise of the action that the data have and the simulator has not, or the other way round."""
+    own = [effect for effect in simulation.effects if isinstance(effect, ActionNoise) and effect.actuators is None]
+    own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
+    noise = estimate_noise(simulation.with_effects(*found), measured)
+    variance = noise.action_std**2 if noise.p_value < _LEVEL else 0.0
+    missing = variance - own_variance
+    if abs(missing) <= _NOISE_CHANGE * own_variance:
+        return []
+    std = math.copysign(math.sqrt(abs(missing)), missing)
+    half = math.sqrt(abs(missing)) * noise.action_uncertainty if variance else 0.0
+    return [Part(ActionNoise(std), True, {"std": (std - half, std + half)})]
