@@ -15,12 +15,13 @@ from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.residual import executed_actions, start_states
 from torchrl_h2o.residuals.simulation import Simulation
 
+ENOUGH = 2000  # transitions, to estimate noise from
 NOISELESS = 1e-4  # of a dimension's spread: less noise biases nothing that could be seen
 
 
 def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
     """The standard deviations of the sensors' noise, (n), in their units; None where it could bias nothing."""
-    std = noise_levels(simulation, measured).sensor
+    std = noise_levels(simulation, measured.part(slice(0, ENOUGH))).sensor
     return std if (std > NOISELESS * measured.observation.std(0)).any() else None
 
 
@@ -49,8 +50,7 @@ def stand_in(
         states = start_states(simulation, measured)
     following = measured.following.copy()
     actions = executed_actions(simulation, measured)
-    for part in (False, True):
-        starts = measured.windows(horizon, horizon, held_out=part)
+    for starts in (measured.fitted(horizon), measured.judged(horizon)):
         rows = starts[:, None] + np.arange(horizon)
         reached = simulation.rollout(states[starts], actions[rows], time=measured.time[starts])
         following[rows] = simulation.state_map.observations(reached)

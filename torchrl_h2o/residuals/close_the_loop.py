@@ -13,9 +13,10 @@ from tqdm import tqdm
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.residuals.explanation import explain
 from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.outside import outside_intervals, outside_rows, still_outside
 from torchrl_h2o.residuals.report import DataSummary, Report
 from torchrl_h2o.residuals.simulation import Simulation
-from torchrl_h2o.residuals.summary import summarise
+from torchrl_h2o.residuals.summary import DISTURBED, summarise
 
 
 def close_the_loop(
@@ -67,6 +68,10 @@ def close_the_loop(
         return Report(simulator=simulation.name, data=summary, conclusion=reason)
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
-        explanation = explain(simulation, measured, entries, rng=np.random.default_rng(seed), progress=bar)
+        suspected = outside_intervals(simulation, measured)
+        calm = measured.without(outside_rows(suspected, len(measured)), DISTURBED)
+        explanation = explain(simulation, calm, entries, rng=np.random.default_rng(seed), progress=bar)
         bar.set_description("reporting")
-        return summarise(simulation, measured, explanation, seed=seed, start=start)
+        disturbed = still_outside(suspected, simulation.with_effects(*explanation.effects), measured)
+        judged = measured.without(outside_rows(disturbed, len(measured)), DISTURBED)
+        return summarise(simulation, judged, explanation, disturbed=disturbed, seed=seed, start=start)

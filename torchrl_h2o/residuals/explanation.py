@@ -96,7 +96,7 @@ def _with_undeclared(
 ) -> list[Part]:
     """The parts, with a force that nobody declared beside them or in their place, if that pays."""
     known = [part.effect for part in parts]
-    judged = measured.windows(1, held_out=True)
+    judged = measured.judged()
     mended = simulation.with_effects(*known)
     posed = Problem.pose(mended, measured, sensor_std=sensor_noise(mended, measured))
     best, problem = parts, replace(posed, simulation=simulation)
@@ -132,7 +132,7 @@ def _explained(force: Undeclared) -> float:
 def _needed(problem: Problem, trace: Trace, parts: list[Part]) -> list[Part]:
     """The parts without those effects of the catalogue that the force, fitted anew with the rest, makes up for."""
     free = {entry.name: free_parameters(entry) for entry in trace.entries}
-    fitted, judged = (problem.measured.windows(1, held_out=part) for part in (False, True))
+    fitted, judged = problem.measured.fitted(), problem.measured.judged()
     names = [entry.name for entry in trace.entries]
 
     def refitted(chosen: Sequence[int]) -> tuple[list[Part], np.ndarray]:

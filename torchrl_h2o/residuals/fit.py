@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ Free = tuple[str, ...]  # the names of the parameters of one effect that a fit m
 _ROUNDING = 2e-7  # of what is measured: data are single precision
 _WORST = 1e3  # of a residual, in scales: where a simulation diverges
 _ORIGIN = 10.0  # a fit's variables start here, so that relative steps are steps of their own size
+_FARTHEST = 50.0  # steps of its own size that one fit may move a variable
 _DRAWS = 4  # of sensor noise, for what it makes of each window
 _STEP = 1e-5  # relative, of finite differences: 1e-4 of a parameter's typical size
 
@@ -66,10 +68,11 @@ class Problem:
                 contact is near, little noise in a position is a large force.
             estimated: whether windows start from estimated states.
         """
-        states = (estimate_states if estimated else start_states)(simulation, measured)
+        starts = np.concatenate([measured.fitted(horizon), measured.judged(horizon)])
+        states = estimate_states(simulation, measured) if estimated else start_states(simulation, measured, starts)
         one = np.ones((1, 1, measured.observation.shape[1]))
         problem = cls(simulation, measured, horizon, one, states, estimated)
-        starts = measured.windows(horizon, horizon, held_out=False)
+        starts = measured.fitted(horizon)
         found = problem.residual((), starts)
         rounding = problem._rounding(found, starts)
         if sensor_std is None:
@@ -82,7 +85,7 @@ class Problem:
     def _made_by_noise(self, sensor_std: np.ndarray) -> np.ndarray:
         """The mean square, (T, H, n), that sensor noise makes of the residual of each window."""
         measured, rng = self.measured, np.random.default_rng(0)
-        starts = np.concatenate([measured.windows(self.horizon, self.horizon, held_out=part) for part in (False, True)])
+        starts = np.concatenate([measured.fitted(self.horizon), measured.judged(self.horizon)])
         base = self.residual((), starts)
         squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
         for _ in range(_DRAWS):
@@ -104,7 +107,7 @@ class Problem:
     @property
     def within_rounding(self) -> bool:
         """Whether nothing is left to explain but that data are single precision."""
-        starts = self.measured.windows(self.horizon, self.horizon, held_out=False)
+        starts = self.measured.fitted(self.horizon)
         plain = replace(self, scale=np.ones_like(self.scale[:1, :1]))
         found = plain.residual((), starts)
         return bool((np.abs(found).mean((0, 1)) < 3.0 * plain._rounding(found, starts)).all())
@@ -207,7 +210,7 @@ def fit(
     unknown = sysid.ParameterDict(
         {str(i): sysid.Parameter(str(i), _ORIGIN, *variable.bounds) for i, variable in enumerate(variables)}
     )
-    with contextlib.redirect_stdout(io.StringIO()):  # its scipy backend prints every iteration, whatever it is told
+    with _quiet():
         best, result = sysid.optimize(
             unknown,
             residual,
@@ -225,6 +228,19 @@ def fit(
         widths[variable.effect][variable.name] = half * variable.slope(position)
     at_best = problem.residual(fitted, starts)
     return Fit(tuple(fitted), tuple(free), float(losses(at_best).mean()), tuple(widths))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps ``mujoco.sysid`` quiet: it prints every iteration, whatever it is told, and warns of starts at a bound."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _half_widths(problem: Problem, result) -> np.ndarray:
@@ -273,7 +289,7 @@ class _Variable:
             ends = np.log2(np.array([low, high]) / self.parameter.value)
         else:
             ends = (np.array([low, high]) - self.parameter.value) / self.size
-        return tuple(_ORIGIN + np.clip(ends, -1e6, 1e6))
+        return tuple(_ORIGIN + np.clip(ends, -_FARTHEST, _FARTHEST))
 
 
 def typical_size(parameter: Parameter) -> float:

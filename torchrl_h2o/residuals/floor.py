@@ -37,7 +37,7 @@ def explainable_floor(
     Returns:
         The RMSE of each dimension, (n), in its unit: never above that of the residual itself.
     """
-    fitted, judged = measured.windows(1, held_out=False), measured.windows(1, held_out=True)
+    fitted, judged = measured.fitted(), measured.judged()
     inputs = _standard(_inputs(simulation, measured), fitted)
     targets = np.full_like(measured.observation, np.nan)
     for rows in (fitted, judged):

@@ -77,7 +77,7 @@ def force_response(
     contacts the derivative at a point would say little.
     """
     model, state_map = simulation.model, simulation.state_map
-    states = start_states(simulation, measured) if states is None else states
+    states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0]
     states, actions = states[starts], executed_actions(simulation, measured)[starts][:, None]
     change = np.nanstd(missed @ state_map.restore.T, axis=0)[model.nq :]
@@ -117,7 +117,7 @@ def step_path(
 ) -> StepPath:
     """The path of each transition: as simulated, bent to where it was measured to end."""
     model, steps = simulation.model, simulation.frame_skip
-    states = start_states(simulation, measured) if states is None else states
+    states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0] @ simulation.state_map.restore.T
     states = states[starts]
     actions = np.repeat(executed_actions(simulation, measured)[starts][:, None], steps, axis=1)

@@ -41,8 +41,8 @@ def choose_horizon(
     chosen, most = 1, 0.0
     sensor_std = sensor_noise(simulation, measured)
     for horizon in _HORIZONS:
-        starts = measured.windows(horizon, horizon, held_out=False)
-        if horizon > 1 and (len(starts) < _FEWEST or len(measured.windows(horizon, horizon, held_out=True)) < BLOCKS):
+        starts = measured.fitted(horizon)
+        if horizon > 1 and (len(starts) < _FEWEST or len(measured.judged(horizon)) < BLOCKS):
             break
         problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_std)
         few = np.sort(rng.choice(starts, min(len(starts), max(_FEWEST, _SCREENED // horizon)), replace=False))

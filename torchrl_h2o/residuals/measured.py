@@ -12,6 +12,7 @@ from torchrl_h2o.data import DataError
 from torchrl_h2o.data.ted import require_ted
 from torchrl_h2o.residuals.simulation import Simulation
 
+_ENOUGH = 3500  # windows: more make a fit slower and hardly better
 MIN_TRANSITIONS = 200  # below, held-out data cannot tell an effect from chance
 
 
@@ -111,6 +112,19 @@ class Measured:
         whole = bad_before[starts + horizon] == bad_before[starts]
         return starts[whole & (self.run[starts] == self.run[starts + horizon - 1])]
 
+    def fitted(self, horizon: int = 1) -> np.ndarray:
+        """The first rows of the windows that fits see: they do not overlap, and are enough, evenly spread."""
+        return _thinned(self.windows(horizon, horizon, held_out=False), _ENOUGH)
+
+    def judged(self, horizon: int = 1) -> np.ndarray:
+        """The first rows of the windows that no fit sees: they do not overlap, and are enough, evenly spread."""
+        return _thinned(self.windows(horizon, horizon, held_out=True), _ENOUGH)
+
+    def part(self, rows: slice) -> Measured:
+        """Some of the transitions, neighbours in time."""
+        arrays = ("observation", "action", "following", "run", "time", "usable", "held_out")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
+
     def without(self, rows: np.ndarray, reason: str) -> Measured:
         """The same data with more rows, a mask (T), left out for a reason."""
         left_out = dict(self.left_out)
@@ -128,6 +142,11 @@ class Measured:
         if len(still) == self.observation.shape[1]:
             return "nothing moves in these data; record some motion"
         return None
+
+
+def _thinned(starts: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the windows, evenly spread."""
+    return starts[np.unique(np.linspace(0, len(starts) - 1, min(most, len(starts))).round().astype(int))]
 
 
 def _float64(tensor) -> np.ndarray:

@@ -53,8 +53,8 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     Returns:
         The estimate.
     """
-    fitted, judged = (measured.windows(1, held_out=part) for part in (False, True))
-    states = start_states(simulation, measured)
+    fitted, judged = measured.fitted(), measured.judged()
+    states = start_states(simulation, measured, np.concatenate([fitted, judged]))
     scale = np.nanmedian(np.abs(residuals(simulation, measured, fitted, states=states)[:, 0]), axis=0)
     scale = 1.5 * np.maximum(scale, 1e-9 * measured.observation.std(0) + 1e-12)
 

@@ -7,7 +7,7 @@ states under the same actions: what recurs is physical, and is left to the effec
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -68,13 +68,46 @@ def outside_intervals(
     starts = measured.windows(horizon)
     if len(starts) <= _NEIGHBOURS:
         return []
-    size = _in_usual_sizes(residuals(simulation, measured, starts, horizon, states=states)[:, -1], measured)
+    size = _sizes(simulation, measured, starts, horizon, states)
     surprising = np.flatnonzero(size > threshold)
     if not _exceptional(starts[surprising], horizon, len(starts)):
         return []
     recurring = _recurring_sizes(_beginnings(simulation, measured, starts, horizon), starts, horizon, size, surprising)
     outside = surprising[size[surprising] > threshold * np.maximum(1.0, recurring / _TWICE)]
     return _intervals(starts[outside], size[outside], horizon, measured)
+
+
+def still_outside(
+    intervals: Sequence[OutsideInterval],
+    simulation: Simulation,
+    measured: Measured,
+    *,
+    horizon: int = 8,
+    threshold: float = 12.0,
+) -> list[OutsideInterval]:
+    """Of intervals found with a poorer simulator, those that the mended one does not explain either.
+
+    Args:
+        intervals: as :func:`outside_intervals` found them.
+        simulation: the mended simulator.
+        measured: the data, with no interval left out.
+        horizon: as for :func:`outside_intervals`.
+        threshold: as for :func:`outside_intervals`.
+
+    Returns:
+        The intervals that remain, with the sizes that they have now.
+    """
+    starts = measured.windows(horizon)
+    if not intervals or not len(starts):
+        return []
+    size = _sizes(simulation, measured, starts, horizon, None)
+    remaining = []
+    for interval in intervals:
+        inside = (starts >= interval.start) & (starts < interval.stop)
+        largest = float(size[inside].max(initial=0.0))
+        if largest > threshold:
+            remaining.append(replace(interval, size=largest))
+    return remaining
 
 
 def outside_rows(intervals: Sequence[OutsideInterval], rows: int) -> np.ndarray:
@@ -89,6 +122,12 @@ def _exceptional(surprising: np.ndarray, horizon: int, windows: int) -> bool:
     """Whether windows with these first rows are few enough, and in few enough events, to be exceptions."""
     events = 1 + np.count_nonzero(np.diff(surprising) > horizon)
     return 0 < len(surprising) <= _MOST * windows and events <= max(2.0, _OFTEN * windows)
+
+
+def _sizes(
+    simulation: Simulation, measured: Measured, starts: np.ndarray, horizon: int, states: np.ndarray | None
+) -> np.ndarray:
+    return _in_usual_sizes(residuals(simulation, measured, starts, horizon, states=states)[:, -1], measured)
 
 
 def _in_usual_sizes(residual: np.ndarray, measured: Measured) -> np.ndarray:

@@ -36,7 +36,7 @@ def residuals(
         (W, H, n), in the units of the observations; NaN where the simulation diverges.
     """
     if states is None:
-        states = start_states(simulation, measured)
+        states = start_states(simulation, measured, starts)
     rows = starts[:, None] + np.arange(horizon)
     reached = simulation.rollout(
         states[starts], executed_actions(simulation, measured, rng)[rows], time=measured.time[starts], applied=applied
@@ -48,24 +48,28 @@ def residuals(
     return _undelayed(simulation, measured)[rows] - observed
 
 
-def start_states(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """The measured states, (T, nq + nv): observations through the state map, what is hidden carried along."""
+def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | None = None) -> np.ndarray:
+    """The measured states, (T, nq + nv): observations through the state map, what is hidden carried along.
+
+    What is hidden takes steps to follow. It is right in all rows, or in those that are asked for.
+    """
     state_map = simulation.state_map
     true = np.concatenate([simulation.true_observations(measured.observation[run]) for run in measured.runs])
     states = state_map.states(true)
     if state_map.hidden:
-        states[:, state_map.hidden] = _settled(simulation, measured, states)
+        rows = np.arange(len(measured)) if rows is None else rows
+        states[np.ix_(rows, state_map.hidden)] = _settled(simulation, measured, states, rows)
     return states
 
 
-def _settled(simulation: Simulation, measured: Measured, states: np.ndarray) -> np.ndarray:
-    """What is hidden, (T, hidden): simulated from some rows before, with all else as measured at every row."""
+def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """What is hidden in some rows, (W, hidden): simulated from some rows before, with all else as measured at every row."""
     hidden = list(simulation.state_map.hidden)
     actions = executed_actions(simulation, measured)
-    first = np.maximum(np.arange(len(measured)) - _SETTLING, 0)
+    first = np.maximum(rows - _SETTLING, 0)
     # where a run begins, its first row is repeated
-    begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])
-    carried = states[:, hidden]
+    begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])[rows]
+    carried = states[np.ix_(rows, hidden)]
     for step in range(_SETTLING):
         row = np.maximum(first + step, begins)
         now = states[row]

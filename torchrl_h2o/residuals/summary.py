@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from torchrl_h2o.residuals.chance import sensor_noise
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.floor import explainable_floor
 from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.outside import OutsideInterval
 from torchrl_h2o.residuals.report import (
     DataSummary,
     DimensionError,
@@ -18,6 +20,7 @@ from torchrl_h2o.residuals.report import (
     FoundEffect,
     HorizonError,
     IndistinguishableGroup,
+    Interval,
     RejectedEffect,
     Report,
     TwoSample,
@@ -28,13 +31,20 @@ from torchrl_h2o.residuals.significance import IN_WORDS
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.two_sample import two_sample_auc
 
+DISTURBED = "disturbed from outside"
 _METRIC = "held-out one-step RMSE, each dimension over the spread of its one-step change"
 _HORIZONS = (1, 2, 5, 10, 20, 50)  # control steps
 _RANKED = 30  # rejected effects that the report lists
 
 
 def summarise(
-    simulation: Simulation, measured: Measured, explanation: Explanation, *, seed: int, start: float
+    simulation: Simulation,
+    measured: Measured,
+    explanation: Explanation,
+    *,
+    disturbed: Sequence[OutsideInterval] = (),
+    seed: int = 0,
+    start: float,
 ) -> Report:
     """The report of an explanation.
 
@@ -42,6 +52,7 @@ def summarise(
         simulation: without the effects found.
         measured: the data.
         explanation: what was found.
+        disturbed: what was set aside.
         seed: of the classifiers.
         start: of the wall clock, by ``time.perf_counter``.
     """
@@ -83,6 +94,16 @@ def summarise(
             two_sample_auc(simulation, measured, sensor_std=sensor_std, seed=seed),
             two_sample_auc(mended, measured, sensor_std=sensor_std, seed=seed),
         ),
+        unexplained_intervals=tuple(
+            Interval(
+                float(measured.time[interval.start]),
+                float(measured.time[interval.stop - 1]),
+                interval.stop - interval.start,
+                interval.size,
+                DISTURBED,
+            )
+            for interval in disturbed
+        ),
         stop_test=IN_WORDS,
         wall_s=time.perf_counter() - start,
         trace=_residual_trace(simulation, mended, measured),
@@ -96,7 +117,7 @@ def error_summary(simulation: Simulation, mended: Simulation, measured: Measured
     floor = explainable_floor(mended, measured)
     horizons = []
     for steps in _HORIZONS:
-        if len(measured.windows(steps, steps, held_out=True)) < 2:
+        if len(measured.judged(steps)) < 2:
             break
         ahead = [
             dict(zip(names, _rmse(which, measured, steps).tolist(), strict=True)) for which in (simulation, mended)
@@ -121,7 +142,7 @@ def spread(measured: Measured) -> np.ndarray:
 
 def _rmse(simulation: Simulation, measured: Measured, horizon: int) -> np.ndarray:
     """Held-out error at the end of windows, (n), in units."""
-    starts = measured.windows(horizon, max(1, horizon // 2), held_out=True)
+    starts = measured.judged(horizon)
     # with the simulator's own noise, if it has any: that is an error too
     missed = residuals(simulation, measured, starts, horizon, rng=np.random.default_rng(0))[:, -1]
     return np.sqrt(np.nanmean(missed**2, axis=0))

@@ -116,8 +116,7 @@ class Search:
 
     def __post_init__(self):
         measured, horizon = self.problem.measured, self.problem.horizon
-        self.fitted = measured.windows(horizon, horizon, held_out=False)
-        self.judged = measured.windows(horizon, horizon, held_out=True)
+        self.fitted, self.judged = measured.fitted(horizon), measured.judged(horizon)
         few = min(_SCREENED, len(self.fitted))
         self.screened = np.sort(self.rng.choice(self.fitted, few, replace=False))
 

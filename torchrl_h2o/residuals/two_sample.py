@@ -36,7 +36,7 @@ def two_sample_auc(
 
     Source: H2O+ (arXiv 2309.12716), Eq. (9).
     """
-    fitted, judged = (measured.windows(1, held_out=part) for part in (False, True))
+    fitted, judged = measured.fitted(), measured.judged()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         train = _real_and_simulated(simulation, measured, fitted, fitted, sensor_std)
@@ -62,7 +62,7 @@ def _real_and_simulated(
     simulation: Simulation, measured: Measured, rows: np.ndarray, like: np.ndarray, sensor_std: np.ndarray | None
 ) -> TensorDict:
     """Measured transitions and, from the same states and actions, simulated ones: standardised as those of ``like``."""
-    rng, states = np.random.default_rng(len(rows)), start_states(simulation, measured)
+    rng, states = np.random.default_rng(len(rows)), start_states(simulation, measured, rows)
     noise = np.zeros((2, *measured.observation.shape))
     if sensor_std is not None:
         noise = sensor_std * rng.standard_normal(noise.shape)

@@ -70,13 +70,13 @@ def find_undeclared(
         The effect, None if there is none that pays.
     """
     problem = Problem.pose(simulation, measured, sensor_std=sensor_noise(simulation, measured))
-    search = _Search(problem, measured.windows(1, held_out=False))
+    search = _Search(problem, measured.fitted())
     if search.nothing_to_explain():
         return None
     found = search.run(progress or (lambda words: None))
     if found is None:
         return None
-    judged = measured.windows(1, held_out=True)
+    judged = measured.judged()
     before, after = problem.residual((), judged), problem.residual(found.effects, judged)
     gain = losses(before) - losses(after)
     p = max(p_value(gain), search.chance_further((), found.effects, held_out=True))
@@ -129,7 +129,8 @@ class _Search:
         self, before: Sequence[ResidualForce], after: Sequence[ResidualForce], *, held_out: bool
     ) -> float:
         """How likely chance alone makes one force better than another, some steps ahead."""
-        starts = self.problem.measured.windows(_FURTHER, _FURTHER, held_out=held_out)
+        measured = self.problem.measured
+        starts = measured.judged(_FURTHER) if held_out else measured.fitted(_FURTHER)
         return p_value(losses(self.further.residual(before, starts)) - losses(self.further.residual(after, starts)))
 
     def _added(self, effect: ResidualForce, barred: set[str]) -> SparseForce:
