@@ -47,13 +47,14 @@ def pendulum() -> Simulation:
 
 
 def recorded(real: Simulation, transitions: int = 1500, noise: float = 0.0, seed: int = 0) -> Measured:
-    """One run under smooth random torques; noise is a share of each dimension's standard deviation."""
+    """One run under smooth random torques, after the action effects; noise is a share of each dimension's spread."""
     rng = np.random.default_rng(seed)
     action = np.zeros((transitions, 1))
     for t in range(1, transitions):
         action[t] = 0.9 * action[t - 1] + 0.4 * rng.standard_normal()
     action = np.clip(0.8 * action, -1.0, 1.0)
-    reached = real.rollout(np.zeros((1, 2)), action[None])[0]
+    executed = real.executed(action, np.random.default_rng([seed, 1]))
+    reached = real.rollout(np.zeros((1, 2)), executed[None])[0]
     observed = np.vstack([np.zeros(2), reached])
     observed += noise * observed.std(0) * rng.standard_normal(observed.shape)
     rows = np.arange(transitions)

@@ -1,0 +1,137 @@
+"""Measured transitions: cut into runs, windows that cross nothing, and a reason where they say too little."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from tests.residuals.pendulum import pendulum
+from torchrl_h2o.data import DataError
+from torchrl_h2o.residuals import Measured
+
+SIMULATION = pendulum()
+
+
+def ted(rows=300, width=2, actions=1):
+    """Every observation follows from the one before."""
+    rng = torch.Generator().manual_seed(0)
+    observed = torch.randn(rows + 1, width, generator=rng)
+    flags = {name: torch.zeros(rows, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+    following = {
+        "observation": observed[1:],
+        "reward": torch.zeros(rows, 1),
+        **{k: v.clone() for k, v in flags.items()},
+    }
+    return TensorDict(
+        {
+            "observation": observed[:-1].clone(),
+            "action": torch.randn(rows, actions, generator=rng),
+            "next": following,
+            **flags,
+        },
+        batch_size=[rows],
+    )
+
+
+def of(data, **kwargs):
+    return Measured.from_ted(data, SIMULATION, **kwargs)
+
+
+def test_one_run_where_every_observation_follows():
+    measured = of(ted())
+    assert measured.runs == [slice(0, 300)]
+    assert measured.observation.dtype == measured.action.dtype == np.float64
+
+
+def test_runs_are_cut_where_observations_do_not_follow():
+    data = ted()
+    data["observation"][100:] += 1.0
+    data["next", "observation"][100:] += 1.0
+    assert of(data).runs == [slice(0, 100), slice(100, 300)]
+
+
+def test_runs_are_cut_where_an_episode_ends_though_observations_follow():
+    data = ted()
+    data["next", "truncated"][99] = data["next", "done"][99] = True
+    assert of(data).runs == [slice(0, 100), slice(100, 300)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    breaks=st.lists(st.integers(1, 59), max_size=4),
+    unusable=st.lists(st.integers(0, 59), max_size=4),
+    border=st.integers(0, 60),
+    horizon=st.integers(1, 12),
+    stride=st.integers(1, 12),
+)
+def test_windows_cross_no_run_nor_unusable_row_nor_the_held_out_border(breaks, unusable, border, horizon, stride):
+    rows = np.arange(60)
+    measured = replace(
+        of(ted(60)),
+        run=np.isin(rows, breaks).cumsum(),
+        usable=~np.isin(rows, unusable),
+        held_out=rows >= border,
+    )
+    for part in (False, True, None):
+        starts = measured.windows(horizon, stride, held_out=part)
+        expected = []
+        for start in range(0, 60 - horizon + 1, stride):
+            window = slice(start, start + horizon)
+            one_run = np.ptp(measured.run[window]) == 0
+            right_part = part is None or (measured.held_out[window] == part).all()
+            if one_run and right_part and measured.usable[window].all():
+                expected.append(start)
+        assert starts.tolist() == expected
+
+
+def test_the_last_rows_are_held_out():
+    held_out = of(ted(), held_out=0.3).held_out
+    assert not held_out[:210].any()
+    assert held_out[210:].all()
+
+
+def test_time_is_read_and_otherwise_counted_in_control_steps():
+    data = ted()
+    assert of(data).time[10] == pytest.approx(0.2)
+    data["time"] = 5.0 + 0.02 * torch.arange(300, dtype=torch.float64)[:, None]
+    assert of(data).time[10] == pytest.approx(5.2)
+
+
+def test_rows_are_left_out_once_and_counted_by_reason():
+    measured, rows = of(ted()), np.arange(300)
+    less = measured.without(rows < 10, "a push").without(rows < 15, "a push").without(rows == 290, "a gap")
+    assert less.left_out == {"a push": 15, "a gap": 1}
+    assert np.flatnonzero(~less.usable).tolist() == [*range(15), 290]
+    assert measured.usable.all()
+
+
+def test_too_few_rows_are_no_conclusion_and_it_is_said_why():
+    assert "199 usable transitions are too few" in of(ted(199)).why_no_conclusion()
+    assert of(ted(200)).why_no_conclusion() is None
+    assert "150 usable" in of(ted()).without(np.arange(300) < 150, "a push").why_no_conclusion()
+
+
+def test_where_nothing_moves_is_no_conclusion_and_it_is_said_why():
+    still = of(ted())
+    still = replace(still, observation=np.ones_like(still.observation), following=np.ones_like(still.observation))
+    assert "nothing moves" in still.why_no_conclusion()
+
+
+def test_one_dimension_that_stands_still_is_no_reason():
+    data = ted()
+    data["observation"][:, 0] = data["next", "observation"][:, 0] = 1.0
+    assert of(data).why_no_conclusion() is None
+
+
+@pytest.mark.parametrize(
+    ("width", "actions", "column"), [(3, 1, "observation"), (1, 1, "observation"), (2, 2, "action")]
+)
+def test_a_width_that_the_simulator_does_not_have_is_refused(width, actions, column):
+    with pytest.raises(
+        DataError, match=rf"{column}.*the data have {max(width, actions) if column == 'action' else width}"
+    ):
+        of(ted(width=width, actions=actions), source="swing.csv")

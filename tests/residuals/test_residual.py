@@ -1,0 +1,158 @@
+"""Residuals: nothing where data come from the very same simulator, also with effects of every kind in it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import GymEnv, TransformedEnv
+
+from tests.residuals.pendulum import UnknownForce, pendulum, recorded
+from torchrl_h2o.effects import (
+    ActionDelay,
+    ActionNoise,
+    BodyMass,
+    Gravity,
+    JointForce,
+    ObservationBias,
+    ObservationGain,
+)
+from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller
+from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.residuals import Measured, Simulation, residuals
+from torchrl_h2o.residuals.residual import executed_actions
+
+STEPS = 60
+CONTROL_STEP = {"HalfCheetah-v5": 0.05, "Hopper-v5": 0.008}
+
+
+def of_every_kind(task, steps_late=2.0):
+    """The delay reaches over rows, and Hopper falls often: no run may leak into the next."""
+    return (
+        Gravity(1.3),
+        BodyMass(1.5, bodies="torso"),
+        ActionDelay(steps_late * CONTROL_STEP[task]),
+        JointForce(0.4, joints="*foot*"),
+        ObservationGain(0.8, entries=(1,)),
+        ObservationBias(0.1, entries=(2,)),
+    )
+
+
+def rollout(env, seed=0):
+    torch.manual_seed(seed)
+    env.set_seed(seed)
+    return env.rollout(STEPS, break_when_any_done=False)
+
+
+def gapped(task, *effects):
+    return TransformedEnv(GymEnv(task), DynamicsGap(*effects))
+
+
+@pytest.mark.parametrize("horizon", [1, 5])
+@pytest.mark.parametrize("steps_late", [None, 2.0, 1.4], ids=["plain", "effects of every kind", "late by a fraction"])
+@pytest.mark.parametrize("task", list(CONTROL_STEP))
+def test_data_of_the_very_same_simulator_leave_no_residual(task, steps_late, horizon):
+    env = gapped(task, *(of_every_kind(task, steps_late) if steps_late else ()))
+    simulation = Simulation.from_env(env)
+    measured = Measured.from_ted(rollout(env), simulation)
+    assert len(measured.runs) > 2 or task != "Hopper-v5"
+    missed = np.abs(residuals(simulation, measured, measured.windows(horizon), horizon)).max((1, 2))
+    # an env's actions are single precision, which shows where they are interpolated
+    assert np.median(missed) < (1e-6 if steps_late == 1.4 else 1e-9)
+    # an env's solver starts from its last solution, which shows in some contacts
+    assert missed.max() < 1e-4
+
+
+@pytest.mark.parametrize("missing", [type(effect) for effect in of_every_kind("Hopper-v5")])
+def test_an_effect_of_any_kind_that_is_missing_leaves_a_residual(missing):
+    env = gapped("Hopper-v5", *of_every_kind("Hopper-v5"))
+    full = Simulation.from_env(env)
+    measured = Measured.from_ted(rollout(env), full)
+    without = replace(full, effects=tuple(e for e in full.effects if not isinstance(e, missing)))
+    assert np.abs(residuals(without, measured, measured.windows(1))).max() > 1e-3
+
+
+def exact_wheel_legged(*effects, steps=80):
+    """Measured in double precision, though the env observes in single precision, and the states that it was in."""
+    env = TransformedEnv(WheelLeggedEnv(), DynamicsGap(*effects)) if effects else WheelLeggedEnv()
+    simulation = Simulation.from_env(env)
+    data = find_simulator(env).owner.data
+    env.set_seed(0)
+    torch.manual_seed(0)
+    step, states, actions, controller = env.reset(), [], [], noisy_balance_controller()
+    for _ in range(steps):
+        states.append(np.concatenate([data.qpos, data.qvel]))
+        step = controller(step)
+        actions.append(step["action"].double().numpy())
+        step = env.step(step)["next"].exclude("reward")
+        assert not step["done"].any()
+    states.append(np.concatenate([data.qpos, data.qvel]))
+    states = np.array(states)
+    observed = simulation.state_map.observations(states)
+    rows = np.arange(steps)
+    measured = Measured(
+        observed[:-1],
+        np.array(actions),
+        observed[1:],
+        run=0 * rows,
+        time=rows * simulation.control_step,
+        usable=rows >= 0,
+        held_out=rows >= 0.7 * steps,
+        left_out={},
+        source="wheel-legged robot",
+    )
+    return simulation, measured, states[:-1]
+
+
+@pytest.mark.parametrize("effects", [(), (Gravity(1.1), ActionDelay(0.01))], ids=["plain", "with effects"])
+def test_wheel_legged_robot_leaves_no_residual(effects):
+    simulation, measured, states = exact_wheel_legged(*effects)
+    starts = measured.windows(5)
+    assert np.abs(residuals(simulation, measured, starts, 5, states=states)).max() < 1e-9
+
+
+def test_hidden_coordinates_are_carried_along():
+    """How deep the wheels sink into the floor is not observed, and found by running some rows before."""
+    simulation, measured, _ = exact_wheel_legged()
+    at_rest = simulation.state_map.states(measured.observation)
+    starts = measured.windows(1)[20:]
+    carried, unknown = (np.abs(residuals(simulation, measured, starts, states=x)).mean((0, 1)) for x in (None, at_rest))
+    assert (carried < 0.02 * unknown).all()
+
+
+def test_divergence_is_nan_from_where_it_begins():
+    simulation = pendulum()
+    measured = recorded(simulation, 300)
+    applied = np.zeros((3, 4, 1))
+    applied[1, 2:] = 1e15
+    missed = residuals(simulation, measured, np.array([10, 20, 30]), 4, applied=applied)
+    assert np.isnan(missed[1, 2:]).all()
+    assert np.abs(missed[[0, 2]]).max() < 1e-9
+    assert np.abs(missed[1, :2]).max() < 1e-9
+
+
+def test_applied_forces_act_as_the_same_force_in_the_simulator():
+    simulation, torque = pendulum(), UnknownForce(0.2, lambda q, v, t: 1.0 + 0.0 * q)
+    measured = recorded(simulation.with_effects(torque), 300)
+    starts = measured.windows(3)
+    missed = residuals(simulation, measured, starts, 3, applied=np.full((len(starts), 3, 1), 0.2))
+    assert np.abs(missed).max() < 1e-9
+    assert np.abs(residuals(simulation, measured, starts, 3)).max() > 1e-3
+
+
+def test_random_effects_are_left_out_without_a_generator():
+    simulation = pendulum()
+    measured = recorded(simulation, 300)
+    noisy = simulation.with_effects(ActionNoise(0.3))
+    np.testing.assert_array_equal(executed_actions(noisy, measured), measured.action)
+    scatter = executed_actions(noisy, measured, np.random.default_rng(0)) - measured.action
+    assert scatter.std() == pytest.approx(0.3, rel=0.15)
+
+
+def test_no_run_leaks_into_the_next():
+    simulation = pendulum().with_effects(ActionDelay(0.04))
+    measured = recorded(simulation, 300)
+    cut = replace(measured, run=(np.arange(300) >= 100).astype(int))
+    executed = executed_actions(simulation, cut)
+    np.testing.assert_array_equal(executed[102:], measured.action[100:-2])
+    assert not executed[[0, 1, 100, 101]].any()
