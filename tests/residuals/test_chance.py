@@ -1,0 +1,46 @@
+"""Stand-ins: data in which nothing is missing but the sensors' noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import Gravity
+from torchrl_h2o.residuals import residuals
+from torchrl_h2o.residuals.chance import sensor_noise, stand_in
+
+SIMULATION = pendulum()
+
+
+def test_data_without_noise_need_no_stand_in():
+    assert sensor_noise(SIMULATION, recorded(SIMULATION)) is None
+
+
+@pytest.mark.parametrize("lacking", [(), (Gravity(1.05),)], ids=["right simulator", "wrong simulator"])
+def test_the_sensors_noise_is_found(lacking):
+    real = SIMULATION.with_effects(*lacking)
+    found = sensor_noise(SIMULATION, recorded(real, 3000, noise=0.02))
+    np.testing.assert_allclose(found, 0.02 * recorded(real, 3000).observation.std(0), rtol=0.25)
+
+
+@pytest.mark.parametrize("horizon", [1, 5])
+def test_nothing_is_missing_from_a_stand_in(horizon):
+    """Though it is from the measured data, under another gravity."""
+    measured = recorded(SIMULATION.with_effects(Gravity(1.5)), 600)
+    data = stand_in(SIMULATION, measured, np.zeros(2), np.random.default_rng(0), horizon)
+    for part in (False, True):
+        starts = data.windows(horizon, horizon, held_out=part)
+        assert np.abs(residuals(SIMULATION, data, starts, horizon)).max() < 1e-9
+        assert np.abs(residuals(SIMULATION, measured, starts, horizon)).max() > 1e-3
+
+
+def test_a_stand_in_is_read_by_noisy_sensors_and_leaves_the_data_as_they_are():
+    measured = recorded(SIMULATION, 2000)
+    kept = replace(measured, following=measured.following.copy(), observation=measured.observation.copy())
+    std = np.array([0.01, 0.3])
+    data = stand_in(SIMULATION, measured, std, np.random.default_rng(0))
+    for name in ("observation", "following"):
+        np.testing.assert_allclose((getattr(data, name) - getattr(measured, name)).std(0), std, rtol=0.1)
+        np.testing.assert_array_equal(getattr(measured, name), getattr(kept, name))
+    np.testing.assert_array_equal(data.action, measured.action)

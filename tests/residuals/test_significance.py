@@ -1,0 +1,48 @@
+"""The paired test: p-values of nothing are uniform, neighbours that depend on each other no evidence."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from torchrl_h2o.residuals.significance import p_value
+
+
+def noise(seed, windows=300, memory=0.0):
+    rng = np.random.default_rng(seed)
+    gain = rng.standard_normal(windows)
+    for t in range(1, windows):
+        gain[t] += memory * gain[t - 1]
+    return gain
+
+
+def test_p_values_of_no_gain_are_uniform():
+    assert stats.kstest([p_value(noise(seed)) for seed in range(200)], "uniform").pvalue > 0.01
+
+
+def test_neighbours_that_depend_on_each_other_are_not_taken_for_evidence():
+    chance = np.mean([p_value(noise(seed, 600, memory=0.6)) < 0.05 for seed in range(300)])
+    assert chance < 0.09
+
+
+def test_a_clear_gain_is_hardly_chance():
+    assert p_value(noise(0) + 2.0) < 1e-6
+
+
+def test_a_loss_is_no_gain():
+    assert p_value(noise(0) - 2.0) > 0.999
+
+
+def test_no_gain_at_all_proves_nothing_and_the_same_everywhere_everything():
+    assert p_value(np.zeros(50)) == 1.0
+    assert p_value(np.full(50, -0.5)) == 1.0
+    assert p_value(np.full(50, 0.5)) == 0.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10_000), scale=st.floats(1e-6, 1e6), windows=st.integers(2, 400))
+def test_the_unit_of_the_loss_does_not_matter_and_gain_is_the_opposite_of_loss(seed, scale, windows):
+    gain = noise(seed, windows)
+    assert p_value(scale * gain) == pytest.approx(p_value(gain), abs=1e-9)
+    assert p_value(-gain) == pytest.approx(1.0 - p_value(gain), abs=1e-9)

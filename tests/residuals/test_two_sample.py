@@ -1,0 +1,33 @@
+"""The gap as a classifier sees it: none where there is none, wide where gravity differs, noise of sensors no gap."""
+
+import pytest
+import torch
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import Gravity
+from torchrl_h2o.residuals import two_sample_auc
+
+SIMULATION = pendulum()
+
+
+def test_no_gap_is_seen_in_data_of_the_very_same_simulator():
+    assert two_sample_auc(SIMULATION, recorded(SIMULATION)) == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_gap_is_seen():
+    assert two_sample_auc(SIMULATION, recorded(SIMULATION.with_effects(Gravity(3.0)))) > 0.7
+
+
+def test_noise_of_the_sensors_is_no_gap_once_it_is_simulated_too():
+    measured = recorded(SIMULATION, 3000, noise=0.05)
+    sensor_std = 0.05 * recorded(SIMULATION, 3000).observation.std(0)
+    with_noise, without = (two_sample_auc(SIMULATION, measured, sensor_std=std) for std in (sensor_std, None))
+    assert with_noise == pytest.approx(0.5, abs=0.08)
+    assert without > with_noise + 0.05
+
+
+def test_the_same_seed_gives_the_same_and_leaves_the_random_state_alone():
+    measured = recorded(SIMULATION.with_effects(Gravity(2.0)), 400)
+    before = torch.get_rng_state()
+    assert two_sample_auc(SIMULATION, measured, seed=3) == two_sample_auc(SIMULATION, measured, seed=3)
+    assert torch.equal(before, torch.get_rng_state())
