@@ -29,8 +29,8 @@ def what_mends(gap: str) -> tuple[Effect, ...]:
     strength = PAPER_GAPS[gap].strength
     if gap == "soft_feet":  # what is left of a spring of no stiffness cannot be scaled
         return JointSpring(120.0, joints="bfoot"), JointSpring(60.0, joints="ffoot")
-    if gap == "joint_noise":  # noise that the simulator has and reality has not: its size
-        return (ActionNoise(strength),)
+    if gap == "joint_noise":  # noise that the simulator has and reality has not
+        return (ActionNoise(-strength),)
     made = {
         "gravity": lambda scale: Gravity(scale),
         "friction": lambda scale: GeomFriction(scale),

@@ -95,33 +95,39 @@ def _with_undeclared(
     simulation: Simulation, measured: Measured, trace: Trace, parts: list[Part], rng: np.random.Generator
 ) -> list[Part]:
     """The parts, with a force that nobody declared beside them or in their place, if that pays."""
-    known = [part.effect for part in parts]
-    judged = measured.judged()
-    mended = simulation.with_effects(*known)
+    mended = simulation.with_effects(*(part.effect for part in parts))
+    beside = find_undeclared(mended, measured)
+    if beside is None:
+        return parts
     posed = Problem.pose(mended, measured, sensor_std=sensor_noise(mended, measured))
-    best, problem = parts, replace(posed, simulation=simulation)
-    lowest = losses(problem.residual(known, judged))
-    for base in ([], known) if known else ([],):
-        force = _pays_beyond_noise(simulation.with_effects(*base), measured, rng)
+    problem = replace(posed, simulation=simulation)
+    judged = measured.judged()
+
+    def loss(candidate: Sequence[Part]) -> np.ndarray:
+        return losses(problem.residual([part.effect for part in candidate], judged))
+
+    best, lowest = parts, loss(parts)
+    alone = find_undeclared(simulation, measured) if parts else None
+    for force, base, known in ((alone, simulation, []), (beside, mended, parts)):
         if force is None:
             continue
-        candidate = [*(part for part in parts if base), Part(force.effect, False, force.ci95)]
-        if base:
+        candidate = [*known, Part(force.effect, False, force.ci95)]
+        if known:
             candidate = _needed(problem, trace, candidate)
-        after = losses(problem.residual([part.effect for part in candidate], judged))
-        if after.mean() < (1.0 - _PAYS) * lowest.mean() and p_value(lowest - after) < _LEVEL:
+        after = loss(candidate)
+        pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p_value(lowest - after) < _LEVEL
+        if pays and _beyond_noise(force, base, measured, rng):
             best, lowest = candidate, after
     return best
 
 
-def _pays_beyond_noise(simulation: Simulation, measured: Measured, rng: np.random.Generator) -> Undeclared | None:
-    """A force that nobody declared, unless noise alone would give one that explains about as much."""
-    force = find_undeclared(simulation, measured)
-    sensor_std = None if force is None else sensor_noise(simulation, measured)
+def _beyond_noise(force: Undeclared, simulation: Simulation, measured: Measured, rng: np.random.Generator) -> bool:
+    """Whether noise alone would not give a force that explains about as much."""
+    sensor_std = sensor_noise(simulation, measured)
     if sensor_std is None:
-        return force
+        return True
     by_chance = find_undeclared(simulation, stand_in(simulation, measured, sensor_std, rng))
-    return force if by_chance is None or _explained(force) > _BEYOND_NOISE * _explained(by_chance) else None
+    return by_chance is None or _explained(force) > _BEYOND_NOISE * _explained(by_chance)
 
 
 def _explained(force: Undeclared) -> float:

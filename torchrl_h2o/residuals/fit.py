@@ -177,7 +177,7 @@ def fit(
     free: Sequence[Free],
     starts: np.ndarray,
     *,
-    max_evaluations: int = 20,
+    max_evaluations: int = 25,
 ) -> Fit:
     """Moves the free parameters of effects, from the values that they have, to the least robust loss.
 

@@ -18,7 +18,7 @@ _HORIZONS = (1, 5, 20)  # control steps
 _SCREENED = 600  # steps, in windows of any length
 _FEWEST = 60  # windows
 _CLEAR = 0.5  # share of the loss that one entry promises to take away: no need to look farther
-_WORTH = 1.5  # times the promise of the shorter horizon: a longer one costs more, and drowns in what contacts amplify
+_WORTH = 1.3  # times the promise of the shorter horizon: a longer one costs more, and drowns in what contacts amplify
 
 
 def choose_horizon(
@@ -50,6 +50,6 @@ def choose_horizon(
         promise = leads[0].promise if leads else 0.0
         if horizon == 1 or promise > _WORTH * most:
             chosen, most = horizon, promise
-        if most > _CLEAR or sensor_std is None:
+        if most > _CLEAR:
             break
     return chosen

@@ -1,4 +1,4 @@
-"""Measured transitions as tracing reads them: float64 arrays, cut into runs, with the rows that say nothing left out."""
+"""Measured transitions as tracing reads them: float64 arrays, cut into runs, without the rows that say nothing."""
 
 from __future__ import annotations
 

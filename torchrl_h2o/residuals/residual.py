@@ -63,7 +63,7 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
 
 
 def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """What is hidden in some rows, (W, hidden): simulated from some rows before, with all else as measured at every row."""
+    """What is hidden in some rows, (W, hidden): simulated from steps before, with all else as measured at each."""
     hidden = list(simulation.state_map.hidden)
     actions = executed_actions(simulation, measured)
     first = np.maximum(rows - _SETTLING, 0)

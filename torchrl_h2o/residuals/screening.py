@@ -45,8 +45,8 @@ def screen(
 ) -> list[Lead]:
     """What each entry promises beside the effects that are known, the best first.
 
-    Each trial of an entry is simulated once. The residual is then taken as linear between neutral and the trial, and the
-    entry's promise is the robust loss that the best mixture of its trials would take away.
+    Each trial of an entry is simulated once. The residual is then taken as linear between neutral and the trial, and
+    the entry's promise is the robust loss that the best point on that line, or the trial itself, would take away.
 
     Args:
         problem: what to explain.

@@ -7,8 +7,9 @@ from scipy.stats import t as student
 
 BLOCKS = 30  # of neighbouring windows, whose residuals depend on each other
 IN_WORDS = (
-    "a one-sided t-test on the held-out loss, paired over {blocks} blocks of neighbouring windows, at 1 % divided by the "
-    "number of effects tried"
+    f"a one-sided t-test on the held-out loss, paired over {BLOCKS} blocks of neighbouring windows, at 1 % divided by "
+    "the number of effects tried; and, where sensors are noisy, twice the share of the loss that the same effect would "
+    "explain if nothing but noise were there"
 )
 
 

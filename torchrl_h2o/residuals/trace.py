@@ -19,11 +19,14 @@ from torchrl_h2o.residuals.simulation import Simulation
 
 _LEVEL = 0.01  # of the whole search, divided by the number of entries
 _PAYS = 0.002  # share of the held-out loss that an effect must take away to be worth a word
-_SCREENED = 600  # windows
+_WORTH_A_WORD = 0.01  # of what all effects explain together
+_SCREENED = 400  # control steps, in windows of any length
+_FEWEST = 100  # windows
 _FITTED = 12  # leads that are fitted on the screened windows
 _FINALISTS = 4  # leads that are fitted on all windows
 _MOST = 6  # effects
-_BEYOND_NOISE = 2.0  # times what an effect explains where there is nothing but noise
+_BEYOND_NOISE = 4.0  # times what an effect explains where there is nothing but noise
+_WORTH_A_FIT = 0.5  # of what an effect explains: another one that misses more, the others as they are, is not fitted
 _SAME = 1e-6  # of what an effect explains: less is a matter of rounding
 _ALIKE = 0.1  # of what an effect explains: another one that misses more of it is no alternative
 
@@ -92,7 +95,7 @@ def trace_effects(
         What was found, what was tried, and what cannot be told apart.
     """
     horizon = choose_horizon(simulation, measured, catalogue, rng)
-    problem = Problem.pose(simulation, measured, horizon)
+    problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_noise(simulation, measured))
     return Search(problem, catalogue, rng, progress).run()
 
 
@@ -116,8 +119,9 @@ class Search:
 
     def __post_init__(self):
         measured, horizon = self.problem.measured, self.problem.horizon
+        self.first = self.problem
         self.fitted, self.judged = measured.fitted(horizon), measured.judged(horizon)
-        few = min(_SCREENED, len(self.fitted))
+        few = min(max(_FEWEST, _SCREENED // horizon), len(self.fitted))
         self.screened = np.sort(self.rng.choice(self.fitted, few, replace=False))
 
     def run(self) -> Trace:
@@ -161,11 +165,16 @@ class Search:
         self.problem = replace(self.problem, scale=posed.scale, states=posed.states)
         return posed
 
-    def _fitted(self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = (), few: bool = False) -> Fit:
-        starts = self.screened if few else self.fitted
+    def _fitted(self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = ()) -> Fit:
+        """All of the effects fitted, on all windows."""
         if not entries:
-            return Fit((), (), float(losses(self.problem.residual((), starts)).mean()), ())
-        return fit(self.problem, start, [free_parameters(e) for e in entries], starts, max_evaluations=8 if few else 25)
+            return Fit((), (), float(losses(self.problem.residual((), self.fitted)).mean()), ())
+        return fit(self.problem, start, [free_parameters(entry) for entry in entries], self.fitted)
+
+    def _sketched(self, effects: Sequence[Effect], index: int, lead: Lead) -> Fit:
+        """One of the effects fitted, the others as they are, on few windows."""
+        free = [lead.free if i == index else () for i in range(len(effects))]
+        return fit(self.problem, effects, free, self.screened, max_evaluations=8)
 
     def _held_out(self, effects: Sequence[Effect]) -> np.ndarray:
         return losses(self.problem.residual(effects, self.judged))
@@ -174,10 +183,7 @@ class Search:
         self, entries: list[CatalogueEntry], best: Fit, leads: Sequence[Lead]
     ) -> tuple[list[CatalogueEntry], Fit] | None:
         """The entry that, fitted with those found, explains most of the held-out windows; None if none pays."""
-        few = [
-            (lead, self._fitted([*entries, lead.entry], [*best.effects, lead.effect], few=True))
-            for lead in leads[:_FITTED]
-        ]
+        few = [(lead, self._sketched([*best.effects, lead.effect], len(entries), lead)) for lead in leads[:_FITTED]]
         few.sort(key=lambda pair: pair[1].loss)
         before = self._held_out(best.effects)
         winner, lowest = None, before.mean()
@@ -186,13 +192,20 @@ class Search:
             after = self._held_out(candidate.effects)
             p = p_value(before - after)
             self.attempts[lead.entry.name] = Attempt(lead.entry, candidate, len(entries), float(after.mean()), p)
-            pays = after.mean() < (1.0 - _PAYS) * before.mean()
+            pays = after.mean() < (1.0 - _PAYS) * before.mean() and self._matters(best.effects, candidate.effects)
             if pays and p < _LEVEL / len(self.catalogue) and after.mean() < lowest:
                 winner, lowest = ([*entries, lead.entry], candidate), after.mean()
         if winner is None:
             return None
         explained = 1.0 - lowest / before.mean()
         return winner if explained > _BEYOND_NOISE * self._explained_by_noise(entries, best, winner) else None
+
+    def _matters(self, before: Sequence[Effect], after: Sequence[Effect]) -> bool:
+        """Whether an addition explains a share worth a word of all that has been explained since the start."""
+        nothing, without, with_it = (
+            losses(self.first.residual(effects, self.judged)).mean() for effects in ((), before, after)
+        )
+        return without - with_it > _WORTH_A_WORD * (nothing - with_it)
 
     def _explained_by_noise(
         self, entries: Sequence[CatalogueEntry], best: Fit, winner: tuple[list[CatalogueEntry], Fit]
@@ -230,7 +243,7 @@ class Search:
     def _simplest(
         self, entries: list[CatalogueEntry], best: Fit, index: int
     ) -> tuple[list[CatalogueEntry], Fit, tuple[Attempt, ...]]:
-        """Puts in the place of an effect, of those that do as well, one with the fewest parameters; the rest beside it."""
+        """Puts in an effect's place, of those that do as well, one with the fewest parameters; the rest beside it."""
         own = Attempt(entries[index], best, index, float(self._held_out(best.effects).mean()), 1.0)
         group = [own, *self._as_good(entries, best, index)]
         simplest = min(group, key=lambda attempt: len(free_parameters(attempt.entry)))
@@ -258,8 +271,8 @@ class Search:
         for lead in self._rivals(entries, index):
             instead = [lead.entry if i == index else entry for i, entry in enumerate(entries)]
             effects = [*kept[:index], lead.effect, *kept[index:]]
-            start = self._fitted(instead, effects, few=True)
-            if few_without - start.loss < 0.7 * (few_without - few_with_it):
+            start = self._sketched(effects, index, lead)
+            if few_without - start.loss < _WORTH_A_FIT * (few_without - few_with_it):
                 continue
             candidate = self._fitted(instead, start.effects)
             after = self._held_out(candidate.effects)
