@@ -1,0 +1,116 @@
+"""The search: what explains most first, nothing that chance explains, out with what others make up for, and groups."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tqdm import tqdm
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import (
+    ActionGain,
+    Armature,
+    BodyInertia,
+    CatalogueEntry,
+    Gravity,
+    JointDamping,
+    JointFrictionLoss,
+    JointSpring,
+)
+from torchrl_h2o.residuals import trace_effects
+
+SIMULATION = pendulum()
+FACTORS = ({"scale": 0.8}, {"scale": 1.25})
+GRAVITY = CatalogueEntry(Gravity(), FACTORS)
+GAIN = CatalogueEntry(ActionGain(), FACTORS)
+INERTIA = CatalogueEntry(BodyInertia(), FACTORS)
+ARMATURE = CatalogueEntry(Armature(), ({"inertia": 0.004}, {"inertia": 0.04}))
+FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
+DAMPING = CatalogueEntry(JointDamping(), ({"damping": 0.04}, {"damping": 0.4}))
+ALL = [GAIN, FRICTION, GRAVITY, DAMPING]
+
+
+def traced(*truth, catalogue=ALL, rows=1000, noise=0.0, seed=0):
+    measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise, seed=seed)
+    return traced_in(measured, catalogue)
+
+
+def traced_in(measured, catalogue):
+    with tqdm(disable=True) as progress:
+        return trace_effects(SIMULATION, measured, catalogue, rng=np.random.default_rng(0), progress=progress)
+
+
+def names(entries):
+    return [entry.name for entry in entries]
+
+
+def test_the_effect_that_explains_most_comes_first():
+    trace = traced(Gravity(1.02), JointFrictionLoss(0.1), catalogue=[GRAVITY, FRICTION])
+    assert names(trace.entries) == [FRICTION.name, GRAVITY.name]
+    assert trace.exact
+
+
+def test_three_effects_are_found_and_no_fourth():
+    trace = traced(Gravity(1.2), JointFrictionLoss(0.04), ActionGain(0.8))
+    found = {type(effect): effect for effect in trace.fit.effects}
+    assert set(found) == {Gravity, JointFrictionLoss, ActionGain}
+    assert found[Gravity].scale == pytest.approx(1.2, rel=0.01)
+    assert found[JointFrictionLoss].torque == pytest.approx(0.04, rel=0.01)
+    assert found[ActionGain].scale == pytest.approx(0.8, rel=0.01)
+
+
+def test_an_effect_that_was_a_help_on_the_way_is_taken_out_again():
+    """A spring stands for gravity, which is tried with it, until both are fitted together."""
+    spring = CatalogueEntry(JointSpring(joints="elbow"), ({"stiffness": 0.2}, {"stiffness": 1.0}))
+    trace = traced(Gravity(1.3), JointFrictionLoss(0.03), catalogue=[spring, *ALL])
+    assert set(names(trace.entries)) == {GRAVITY.name, FRICTION.name}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_alone_is_no_effect(seed):
+    trace = traced(noise=0.02, seed=seed)
+    assert trace.entries == ()
+    assert trace.fit.effects == ()
+    assert not trace.exact
+
+
+def test_effects_are_found_under_noise():
+    trace = traced(Gravity(1.3), rows=2500, noise=0.01)
+    assert names(trace.entries) == [GRAVITY.name]
+    assert trace.fit.effects[0].scale == pytest.approx(1.3, rel=0.1)
+
+
+def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
+    trace = traced(Armature(0.01), catalogue=[GRAVITY, INERTIA, ARMATURE, GAIN])
+    ((other,),) = trace.groups
+    assert {*names(trace.entries), other.entry.name} == {INERTIA.name, ARMATURE.name}
+    armature = next(e for e in (trace.fit.effects[0], other.effect) if isinstance(e, Armature))
+    assert armature.inertia == pytest.approx(0.01, rel=0.01)
+    assert traced(Gravity(1.3)).groups == ((),)
+
+
+def test_what_was_tried_is_told_with_its_loss_and_chance():
+    trace = traced(Gravity(1.3))
+    assert GRAVITY.name not in names(attempt.entry for attempt in trace.attempts)
+    assert set(names(attempt.entry for attempt in trace.attempts)) == {GAIN.name, FRICTION.name, DAMPING.name}
+    assert all(0.0 <= attempt.p_value <= 1.0 for attempt in trace.attempts)
+    losses = [attempt.loss for attempt in trace.attempts]
+    assert losses == sorted(losses)
+
+
+def test_an_effect_that_only_the_fitted_rows_have_is_not_kept():
+    """Friction that is gone in the held-out rows would only harm there."""
+    rough, smooth = (recorded(SIMULATION.with_effects(*e), 1000) for e in ((JointFrictionLoss(0.05),), ()))
+    late = smooth.held_out[:, None]
+    changed = {
+        name: np.where(late, getattr(smooth, name), getattr(rough, name)) for name in ("observation", "following")
+    }
+    assert traced_in(replace(rough, **changed), [FRICTION]).entries == ()
+
+
+def test_progress_counts_every_entry_that_is_screened():
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 500)
+    with tqdm(file=io.StringIO()) as progress:
+        trace_effects(SIMULATION, measured, ALL, rng=np.random.default_rng(0), progress=progress)
+        assert progress.n >= len(ALL)
