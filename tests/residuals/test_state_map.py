@@ -8,7 +8,7 @@ from torchrl.envs import GymEnv
 from torchrl_h2o.envs import WheelLeggedEnv
 from torchrl_h2o.envs.mujoco_model import find_simulator
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.state_map import StateMap
+from torchrl_h2o.residuals.state_map import StateMap, probe_gymnasium
 
 TASKS = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "InvertedPendulum-v5", "Swimmer-v5"]
 
@@ -81,6 +81,13 @@ def test_clipped_rows_are_left_out_and_counted():
 def test_an_observation_that_is_no_coordinate_is_refused(task):
     with pytest.raises(ValueError, match=r"does not observe coordinates.*StateMap of your own"):
         Simulation.from_env(GymEnv(task))
+
+
+def test_an_observation_that_mixes_coordinates_is_refused():
+    task = find_simulator(GymEnv("InvertedPendulum-v5")).owner
+    task._get_obs = lambda: np.array([task.data.qpos.sum(), *task.data.qvel])
+    with pytest.raises(ValueError, match="does not observe coordinates"):
+        probe_gymnasium(task, np.random.default_rng(0))
 
 
 def test_axle_follows_from_velocity_and_pitch_rate():
