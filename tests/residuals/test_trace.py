@@ -60,8 +60,7 @@ def test_three_effects_are_found_and_no_fourth():
     assert found[ActionGain].scale == pytest.approx(0.8, rel=0.01)
 
 
-def test_an_effect_that_was_a_help_on_the_way_is_taken_out_again():
-    """A spring stands for gravity, which is tried with it, until both are fitted together."""
+def test_a_spring_that_looks_like_gravity_is_not_named():
     spring = CatalogueEntry(JointSpring(joints="elbow"), ({"stiffness": 0.2}, {"stiffness": 1.0}))
     trace = traced(Gravity(1.3), JointFrictionLoss(0.03), catalogue=[spring, *ALL])
     assert set(names(trace.entries)) == {GRAVITY.name, FRICTION.name}
