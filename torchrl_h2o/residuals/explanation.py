@@ -114,11 +114,19 @@ def _with_undeclared(
         candidate = [*known, Part(force.effect, False, force.ci95)]
         if known:
             candidate = _needed(problem, trace, candidate)
+            candidate = _found_anew(simulation, measured, candidate)
         after = loss(candidate)
         pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p_value(lowest - after) < _LEVEL
         if pays and _beyond_noise(force, base, measured, rng):
             best, lowest = candidate, after
     return best
+
+
+def _found_anew(simulation: Simulation, measured: Measured, parts: list[Part]) -> list[Part]:
+    """The parts with the force looked for again beside the effects that are left, so that no idle terms are left in it."""
+    known = parts[:-1]
+    force = find_undeclared(simulation.with_effects(*(part.effect for part in known)), measured)
+    return parts if force is None else [*known, Part(force.effect, False, force.ci95)]
 
 
 def _beyond_noise(force: Undeclared, simulation: Simulation, measured: Measured, rng: np.random.Generator) -> bool:

@@ -250,9 +250,10 @@ def _half_widths(problem: Problem, result) -> np.ndarray:
     """
     jacobian, residual = result.jac, result.fun
     size = problem.horizon * problem.scale.shape[-1]
-    weight = 1.0 / np.sqrt(1.0 + np.clip(residual, -_WORST, _WORST) ** 2)
-    curvature = np.linalg.pinv(jacobian.T @ (weight[:, None] * jacobian))
-    pulls = (jacobian * (weight * residual)[:, None]).reshape(-1, size, jacobian.shape[1]).sum(1)
+    curvature = np.linalg.pinv(jacobian.T @ jacobian)
+    # scipy returns the Jacobian of the robust loss, scaled by (1 + r²)^(-3/4); the pull of a residual is r / √(1 + r²)
+    pull = (1.0 + residual**2) ** 0.75 * residual / np.sqrt(1.0 + residual**2)
+    pulls = (jacobian * pull[:, None]).reshape(-1, size, jacobian.shape[1]).sum(1)
     covariance = curvature @ (pulls.T @ pulls) @ curvature
     return 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
 

@@ -15,8 +15,7 @@ from torchrl_h2o.residuals.significance import BLOCKS
 from torchrl_h2o.residuals.simulation import Simulation
 
 _HORIZONS = (1, 5, 20)  # control steps
-_SCREENED = 600  # steps, in windows of any length
-_FEWEST = 60  # windows
+_FEWEST = 60  # windows, and no more are looked at
 _CLEAR = 0.5  # share of the loss that one entry promises to take away: no need to look farther
 _WORTH = 1.3  # times the promise of the shorter horizon: a longer one costs more, and drowns in what contacts amplify
 
@@ -45,7 +44,7 @@ def choose_horizon(
         if horizon > 1 and (len(starts) < _FEWEST or len(measured.judged(horizon)) < BLOCKS):
             break
         problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_std)
-        few = np.sort(rng.choice(starts, min(len(starts), max(_FEWEST, _SCREENED // horizon)), replace=False))
+        few = np.sort(rng.choice(starts, min(len(starts), _FEWEST), replace=False))
         leads = screen(problem, (), catalogue, few)
         promise = leads[0].promise if leads else 0.0
         if horizon == 1 or promise > _WORTH * most:

@@ -114,11 +114,11 @@ class Measured:
 
     def fitted(self, horizon: int = 1) -> np.ndarray:
         """The first rows of the windows that fits see: they do not overlap, and are enough, evenly spread."""
-        return _thinned(self.windows(horizon, horizon, held_out=False), _ENOUGH)
+        return thinned(self.windows(horizon, horizon, held_out=False), _ENOUGH)
 
     def judged(self, horizon: int = 1) -> np.ndarray:
         """The first rows of the windows that no fit sees: they do not overlap, and are enough, evenly spread."""
-        return _thinned(self.windows(horizon, horizon, held_out=True), _ENOUGH)
+        return thinned(self.windows(horizon, horizon, held_out=True), _ENOUGH)
 
     def part(self, rows: slice) -> Measured:
         """Some of the transitions, neighbours in time."""
@@ -144,7 +144,7 @@ class Measured:
         return None
 
 
-def _thinned(starts: np.ndarray, most: int) -> np.ndarray:
+def thinned(starts: np.ndarray, most: int) -> np.ndarray:
     """At most so many of the windows, evenly spread."""
     return starts[np.unique(np.linspace(0, len(starts) - 1, min(most, len(starts))).round().astype(int))]
 

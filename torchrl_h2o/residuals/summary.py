@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import ActionNoise, Effect
 from torchrl_h2o.residuals.chance import sensor_noise
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.floor import explainable_floor
@@ -57,7 +57,7 @@ def summarise(
         start: of the wall clock, by ``time.perf_counter``.
     """
     effects, trace = explanation.effects, explanation.trace
-    mended = simulation.with_effects(*effects)
+    mended = simulation.with_effects(*(effect for effect in effects if not _scatters(effect)))
     sensor_std = sensor_noise(mended, measured)
     alike = {attempt.entry.name for group in trace.groups for attempt in group}
     return Report(
@@ -69,7 +69,7 @@ def summarise(
                 part.effect,
                 part.declared,
                 part.ci95,
-                _error(simulation.with_effects(*effects[: index + 1]), measured),
+                _error(simulation.with_effects(*(e for e in effects[: index + 1] if not _scatters(e))), measured),
             )
             for index, part in enumerate(explanation.parts)
         ),
@@ -108,6 +108,11 @@ def summarise(
         wall_s=time.perf_counter() - start,
         trace=_residual_trace(simulation, mended, measured),
     )
+
+
+def _scatters(effect: Effect) -> bool:
+    """Whether an effect is noise that reality has: no single draw of it is closer to what was measured."""
+    return isinstance(effect, ActionNoise) and effect.std > 0.0
 
 
 def error_summary(simulation: Simulation, mended: Simulation, measured: Measured) -> ErrorSummary:
@@ -162,7 +167,7 @@ def _group(
     return IndistinguishableGroup(
         alike,
         tuple(errors),
-        "data in which their predictions differ: other speeds, loads or parts of the range, or a measurement of one of them",
+        "data in which their predictions differ: other speeds, loads or parts of the range; or measuring one of them",
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,10 +10,10 @@ from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.chance import sensor_noise, stand_in
-from torchrl_h2o.residuals.fit import Fit, Problem, fit, losses
+from torchrl_h2o.residuals.fit import Fit, Free, Problem, fit, losses
 from torchrl_h2o.residuals.horizon import choose_horizon
-from torchrl_h2o.residuals.measured import Measured
-from torchrl_h2o.residuals.screening import Lead, free_parameters, screen
+from torchrl_h2o.residuals.measured import Measured, thinned
+from torchrl_h2o.residuals.screening import Lead, free_parameters, is_possible, promising_sets, screen
 from torchrl_h2o.residuals.significance import p_value
 from torchrl_h2o.residuals.simulation import Simulation
 
@@ -22,8 +22,11 @@ _PAYS = 0.002  # share of the held-out loss that an effect must take away to be 
 _WORTH_A_WORD = 0.01  # of what all effects explain together
 _SCREENED = 400  # control steps, in windows of any length
 _FEWEST = 100  # windows
-_FITTED = 12  # leads that are fitted on the screened windows
-_FINALISTS = 4  # leads that are fitted on all windows
+_FITTED_WINDOWS = 1200  # while searching; what was found is fitted to all of them in the end
+_FITTED = 12  # rivals of an effect that are tried in its place
+_FINALISTS = 3  # sets of leads of one size that are fitted on all windows
+_AMONG = 60  # leads that sets are made of
+_SETS = ((1, 12), (2, 6), (3, 6))  # how many entries may be added at once, and how many such sets are sketched
 _MOST = 6  # effects
 _BEYOND_NOISE = 4.0  # times what an effect explains where there is nothing but noise
 _WORTH_A_FIT = 0.5  # of what an effect explains: another one that misses more, the others as they are, is not fitted
@@ -120,7 +123,8 @@ class Search:
     def __post_init__(self):
         measured, horizon = self.problem.measured, self.problem.horizon
         self.first = self.problem
-        self.fitted, self.judged = measured.fitted(horizon), measured.judged(horizon)
+        self.all, self.judged = measured.fitted(horizon), measured.judged(horizon)
+        self.fitted = thinned(self.all, _FITTED_WINDOWS)
         few = min(max(_FEWEST, _SCREENED // horizon), len(self.fitted))
         self.screened = np.sort(self.rng.choice(self.fitted, few, replace=False))
 
@@ -132,13 +136,18 @@ class Search:
             added = self._best_addition(entries, best, leads)
             if added is None:
                 break
-            self.rivals[added[0][-1].name] = leads
+            for entry in added[0][len(entries) :]:
+                self.rivals[entry.name] = leads
+            # which trial shows an entry's direction best is known by now
+            known = {lead.entry.name: replace(lead.entry, trials=(dict(lead.trial),)) for lead in leads}
+            self.catalogue = [known.get(entry.name, entry) for entry in self.catalogue]
             entries, best = self._eliminated(*added)
             self.progress.set_postfix_str(", ".join(entry.name for entry in entries))
         groups = []
         for index in range(len(entries)):
             entries, best, group = self._simplest(entries, best, index)
             groups.append(group)
+        best = self._fitted(entries, best.effects, self.all)
         tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
         found = {entry.name for entry in entries}
         attempts = tuple(attempt for attempt in tried if attempt.entry.name not in found)
@@ -165,15 +174,17 @@ class Search:
         self.problem = replace(self.problem, scale=posed.scale, states=posed.states)
         return posed
 
-    def _fitted(self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = ()) -> Fit:
-        """All of the effects fitted, on all windows."""
+    def _fitted(
+        self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = (), starts: np.ndarray | None = None
+    ) -> Fit:
+        """All of the effects fitted together."""
+        starts = self.fitted if starts is None else starts
         if not entries:
-            return Fit((), (), float(losses(self.problem.residual((), self.fitted)).mean()), ())
-        return fit(self.problem, start, [free_parameters(entry) for entry in entries], self.fitted)
+            return Fit((), (), float(losses(self.problem.residual((), starts)).mean()), ())
+        return fit(self.problem, start, [free_parameters(entry) for entry in entries], starts)
 
-    def _sketched(self, effects: Sequence[Effect], index: int, lead: Lead) -> Fit:
-        """One of the effects fitted, the others as they are, on few windows."""
-        free = [lead.free if i == index else () for i in range(len(effects))]
+    def _sketched(self, effects: Sequence[Effect], free: Sequence[Free]) -> Fit:
+        """Some of the effects fitted, the others as they are, on few windows."""
         return fit(self.problem, effects, free, self.screened, max_evaluations=8)
 
     def _held_out(self, effects: Sequence[Effect]) -> np.ndarray:
@@ -182,35 +193,67 @@ class Search:
     def _best_addition(
         self, entries: list[CatalogueEntry], best: Fit, leads: Sequence[Lead]
     ) -> tuple[list[CatalogueEntry], Fit] | None:
-        """The entry that, fitted with those found, explains most of the held-out windows; None if none pays."""
-        few = [(lead, self._sketched([*best.effects, lead.effect], len(entries), lead)) for lead in leads[:_FITTED]]
-        few.sort(key=lambda pair: pair[1].loss)
+        """The entries that, fitted with those found, explain most of the held-out windows; None if none pay.
+
+        Several are added at once where they explain clearly more than fewer do.
+        """
         before = self._held_out(best.effects)
-        winner, lowest = None, before.mean()
-        for lead, start in few[:_FINALISTS]:
-            candidate = self._fitted([*entries, lead.entry], start.effects)
-            after = self._held_out(candidate.effects)
-            p = p_value(before - after)
-            self.attempts[lead.entry.name] = Attempt(lead.entry, candidate, len(entries), float(after.mean()), p)
-            pays = after.mean() < (1.0 - _PAYS) * before.mean() and self._matters(best.effects, candidate.effects)
-            if pays and p < _LEVEL / len(self.catalogue) and after.mean() < lowest:
-                winner, lowest = ([*entries, lead.entry], candidate), after.mean()
+        winner, added, lowest, base = None, 0, before, best.effects
+        for size, finalists in enumerate(self._finalists(best, leads), start=1):
+            if len(entries) + size > _MOST:
+                break
+            for chosen, start in finalists:
+                together = [*entries, *(lead.entry for lead in chosen)]
+                candidate = self._fitted(together, start.effects)
+                after = self._held_out(candidate.effects)
+                p = p_value(lowest - after)
+                if size == 1:
+                    attempt = Attempt(
+                        chosen[0].entry, candidate, len(entries), float(after.mean()), p_value(before - after)
+                    )
+                    self.attempts[chosen[0].entry.name] = attempt
+                pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p < _LEVEL / len(self.catalogue)
+                if pays and self._matters(base, candidate.effects, size - added):
+                    winner, added, lowest, base = (together, candidate), size, after, candidate.effects
         if winner is None:
             return None
-        explained = 1.0 - lowest / before.mean()
-        return winner if explained > _BEYOND_NOISE * self._explained_by_noise(entries, best, winner) else None
+        explained = 1.0 - lowest.mean() / before.mean()
+        return winner if explained > _BEYOND_NOISE * self._explained_by_noise(best, *winner, added) else None
 
-    def _matters(self, before: Sequence[Effect], after: Sequence[Effect]) -> bool:
-        """Whether an addition explains a share worth a word of all that has been explained since the start."""
+    def _finalists(self, best: Fit, leads: Sequence[Lead]) -> Iterator[list[tuple[tuple[Lead, ...], Fit]]]:
+        """The sets of one, two and three leads that are worth a fit on all windows, each with where to start it."""
+        kept = [() for _ in best.effects]
+        for size, tried in _SETS:
+            among = [lead for lead in leads[:_AMONG] if lead.promise > 0.0]
+            if len(among) < size:
+                return
+            sets = promising_sets(self.problem, best.effects, among, size, self.screened, tried)
+            if size == 1:
+                sets = [(lead,) for lead in leads[:tried]]
+            sketches = [
+                (
+                    chosen,
+                    self._sketched(
+                        [*best.effects, *(lead.effect for lead in chosen)], [*kept, *(lead.free for lead in chosen)]
+                    ),
+                )
+                for chosen in sets
+                if self._possible(best, chosen)
+            ]
+            yield sorted(sketches, key=lambda pair: pair[1].loss)[:_FINALISTS]
+
+    def _possible(self, best: Fit, chosen: Sequence[Lead]) -> bool:
+        return is_possible(self.problem, [*best.effects, *(lead.effect for lead in chosen)])
+
+    def _matters(self, before: Sequence[Effect], after: Sequence[Effect], number: int) -> bool:
+        """Whether additions explain a share worth a word each of all that has been explained since the start."""
         nothing, without, with_it = (
             losses(self.first.residual(effects, self.judged)).mean() for effects in ((), before, after)
         )
-        return without - with_it > _WORTH_A_WORD * (nothing - with_it)
+        return without - with_it > number * _WORTH_A_WORD * (nothing - with_it)
 
-    def _explained_by_noise(
-        self, entries: Sequence[CatalogueEntry], best: Fit, winner: tuple[list[CatalogueEntry], Fit]
-    ) -> float:
-        """The share of the loss that the last entry would explain if nothing but noise were there."""
+    def _explained_by_noise(self, best: Fit, entries: Sequence[CatalogueEntry], candidate: Fit, added: int) -> float:
+        """The share of the loss that the last entries would explain if nothing but noise were there."""
         simulation, measured = self.problem.simulation.with_effects(*best.effects), self.problem.measured
         sensor_std = sensor_noise(simulation, measured)
         if sensor_std is None:
@@ -219,7 +262,8 @@ class Search:
         data = stand_in(simulation, measured, sensor_std, self.rng, horizon, self.problem.states)
         posed = Problem.pose(simulation, data, horizon, sensor_std=sensor_std)
         # from the values that the data gave, and that noise might give too
-        refitted = fit(posed, winner[1].effects[-1:], [free_parameters(winner[0][-1])], self.fitted)
+        free = [free_parameters(entry) for entry in entries[-added:]]
+        refitted = fit(posed, candidate.effects[-added:], free, self.fitted)
         before = losses(posed.residual((), self.judged)).mean()
         return 1.0 - float(losses(posed.residual(refitted.effects, self.judged)).mean() / before)
 
@@ -229,7 +273,7 @@ class Search:
         while removed and len(entries) > 1:
             removed = False
             before = self._held_out(best.effects)
-            for index in range(len(entries) - 1):  # not the one that was just added
+            for index in range(len(entries)):
                 rest = [entry for i, entry in enumerate(entries) if i != index]
                 kept = [effect for i, effect in enumerate(best.effects) if i != index]
                 candidate = self._fitted(rest, kept)
@@ -246,7 +290,8 @@ class Search:
         """Puts in an effect's place, of those that do as well, one with the fewest parameters; the rest beside it."""
         own = Attempt(entries[index], best, index, float(self._held_out(best.effects).mean()), 1.0)
         group = [own, *self._as_good(entries, best, index)]
-        simplest = min(group, key=lambda attempt: len(free_parameters(attempt.entry)))
+        order = {entry.name: place for place, entry in enumerate(self.catalogue)}
+        simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), order[a.entry.name]))
         rest = tuple(attempt for attempt in group if attempt is not simplest)
         instead = [simplest.entry if i == index else entry for i, entry in enumerate(entries)]
         self.rivals[simplest.entry.name] = self.rivals[entries[index].name]
@@ -255,8 +300,9 @@ class Search:
     def _rivals(self, entries: Sequence[CatalogueEntry], index: int) -> list[Lead]:
         """The entries that promised about as much as one of those found did when it was added."""
         leads = self.rivals[entries[index].name]
-        promise = next(lead.promise for lead in leads if lead.entry == entries[index])
-        others = [lead for lead in leads if lead.entry not in entries]
+        names = {entry.name for entry in entries}
+        promise = next(lead.promise for lead in leads if lead.entry.name == entries[index].name)
+        others = [lead for lead in leads if lead.entry.name not in names]
         return sorted(others, key=lambda lead: abs(lead.promise - promise))[:_FITTED]
 
     def _as_good(self, entries: Sequence[CatalogueEntry], best: Fit, index: int) -> tuple[Attempt, ...]:
@@ -271,7 +317,9 @@ class Search:
         for lead in self._rivals(entries, index):
             instead = [lead.entry if i == index else entry for i, entry in enumerate(entries)]
             effects = [*kept[:index], lead.effect, *kept[index:]]
-            start = self._sketched(effects, index, lead)
+            if not is_possible(self.problem, effects):
+                continue
+            start = self._sketched(effects, [lead.free if i == index else () for i in range(len(effects))])
             if few_without - start.loss < _WORTH_A_FIT * (few_without - few_with_it):
                 continue
             candidate = self._fitted(instead, start.effects)

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from sklearn.metrics import roc_auc_score
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from torchrl_h2o.objectives import DynamicsRatioLoss, make_dynamics_ratio_estimator
 from torchrl_h2o.residuals.measured import Measured
@@ -46,10 +45,8 @@ def two_sample_auc(
         )
         loss = DynamicsRatioLoss(estimator)
         optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2)
-        replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(train)), batch_size=_BATCH)
-        replay.extend(train)
         for _ in range(_UPDATES):
-            losses = loss(replay.sample())
+            losses = loss(train[torch.randint(len(train), (_BATCH,))])
             optimiser.zero_grad()
             (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
             optimiser.step()
