@@ -66,7 +66,6 @@ def outcomes_scattered(measured: Measured, std: float, rng: np.random.Generator)
     return replace(measured, following=measured.following + std * rng.standard_normal(measured.following.shape))
 
 
-@pytest.mark.xfail(strict=True, reason="intervals take the Jacobian of scipy for one that its robust loss left alone")
 def test_the_95_percent_interval_holds_the_truth_in_95_percent_of_the_draws():
     rng, holds = np.random.default_rng(0), []
     real = recorded(SIMULATION.with_effects(Gravity(1.2), JointDamping(0.05)), 300)

@@ -123,7 +123,7 @@ def _with_undeclared(
 
 
 def _found_anew(simulation: Simulation, measured: Measured, parts: list[Part]) -> list[Part]:
-    """The parts with the force looked for again beside the effects that are left, so that no idle terms are left in it."""
+    """The parts with the force looked for again beside the effects that are left, without terms that are idle now."""
     known = parts[:-1]
     force = find_undeclared(simulation.with_effects(*(part.effect for part in known)), measured)
     return parts if force is None else [*known, Part(force.effect, False, force.ci95)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from torchrl_h2o.residuals.simulation import Simulation
 
 _HORIZONS = (1, 5, 20)  # control steps
 _FEWEST = 60  # windows, and no more are looked at
+_FOLLOWED = 60  # entries
 _CLEAR = 0.5  # share of the loss that one entry promises to take away: no need to look farther
 _WORTH = 1.3  # times the promise of the shorter horizon: a longer one costs more, and drowns in what contacts amplify
 
@@ -46,6 +48,8 @@ def choose_horizon(
         problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_std)
         few = np.sort(rng.choice(starts, min(len(starts), _FEWEST), replace=False))
         leads = screen(problem, (), catalogue, few)
+        # farther ahead, look only at what promises something, in the direction in which it does
+        catalogue = [replace(lead.entry, trials=(dict(lead.trial),)) for lead in leads[:_FOLLOWED]]
         promise = leads[0].promise if leads else 0.0
         if horizon == 1 or promise > _WORTH * most:
             chosen, most = horizon, promise

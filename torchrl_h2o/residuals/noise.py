@@ -1,6 +1,7 @@
-"""Noise, traced from the residual's covariance: that of the sensors and that of the executed action.
+"""Noise of the executed action, traced from the residual's covariance.
 
-Noise moves no mean, so no fit of the mean can find it; it scatters along what the actuators, or the sensors, can do.
+It moves no mean, so no fit of the mean can find it; it scatters along what the actuators can do, where noise of the
+sensors scatters along what a state can do.
 """
 
 from __future__ import annotations
@@ -24,23 +25,21 @@ _SHARE = 0.15  # of the scatter: less could be sensor noise, which contacts thro
 
 @dataclass(frozen=True, eq=False)
 class NoiseEstimate:
-    """What the residual's scatter says of noise.
+    """What the residual's scatter says of noise of the action.
 
     Args:
-        sensor_std: (n), of each reading, in its unit.
         action_std: of the executed action about the one asked for, in units of the action, all actuators alike.
         action_uncertainty: half of the 95 % interval of ``action_std``, as a share of it.
         p_value: the chance to see as much action noise where there is none, on held-out data.
     """
 
-    sensor_std: np.ndarray
     action_std: float
     action_uncertainty: float
     p_value: float
 
 
 def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
-    r"""Splits the covariance of one-step residuals into noise of the sensors and of the action.
+    r"""The noise of the executed action, told from that of the sensors by the covariance of one-step residuals.
 
     With :math:`F` and :math:`G` the simulator's derivatives by what is observed and by the action, a residual is
     :math:`e = n' - F n + G\nu`, its covariance :math:`\Sigma + F\Sigma F^\top + \sigma^2 G G^\top`. The variances are
@@ -78,7 +77,7 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
         _variances(*(values[rows] for values in (residual, by_action, by_sensor)))[0] for rows in _blocks(residual)
     ]
     spread = 1.96 * np.std(np.sqrt(parts), ddof=1) / np.sqrt(_BLOCKS) / (np.sqrt(with_action[0]) + 1e-12)
-    return NoiseEstimate(np.sqrt(with_action[1:]) * scale, std, float(spread), p_value(gain) if worth else 1.0)
+    return NoiseEstimate(std, float(spread), p_value(gain) if worth else 1.0)
 
 
 def _calm(residual: np.ndarray, by_action: np.ndarray, by_sensor: np.ndarray) -> tuple[np.ndarray, ...]:

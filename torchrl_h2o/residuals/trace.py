@@ -26,7 +26,7 @@ _FITTED_WINDOWS = 1200  # while searching; what was found is fitted to all of th
 _FITTED = 12  # rivals of an effect that are tried in its place
 _FINALISTS = 3  # sets of leads of one size that are fitted on all windows
 _AMONG = 60  # leads that sets are made of
-_SETS = ((1, 12), (2, 6), (3, 6))  # how many entries may be added at once, and how many such sets are sketched
+_SETS = ((1, 12), (2, 4), (3, 4))  # how many entries may be added at once, and how many such sets are sketched
 _MOST = 6  # effects
 _BEYOND_NOISE = 4.0  # times what an effect explains where there is nothing but noise
 _WORTH_A_FIT = 0.5  # of what an effect explains: another one that misses more, the others as they are, is not fitted
@@ -185,7 +185,7 @@ class Search:
 
     def _sketched(self, effects: Sequence[Effect], free: Sequence[Free]) -> Fit:
         """Some of the effects fitted, the others as they are, on few windows."""
-        return fit(self.problem, effects, free, self.screened, max_evaluations=8)
+        return fit(self.problem, effects, free, self.screened, max_evaluations=6)
 
     def _held_out(self, effects: Sequence[Effect]) -> np.ndarray:
         return losses(self.problem.residual(effects, self.judged))
@@ -207,11 +207,6 @@ class Search:
                 candidate = self._fitted(together, start.effects)
                 after = self._held_out(candidate.effects)
                 p = p_value(lowest - after)
-                if size == 1:
-                    attempt = Attempt(
-                        chosen[0].entry, candidate, len(entries), float(after.mean()), p_value(before - after)
-                    )
-                    self.attempts[chosen[0].entry.name] = attempt
                 pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p < _LEVEL / len(self.catalogue)
                 if pays and self._matters(base, candidate.effects, size - added):
                     winner, added, lowest, base = (together, candidate), size, after, candidate.effects
@@ -240,7 +235,17 @@ class Search:
                 for chosen in sets
                 if self._possible(best, chosen)
             ]
+            if size == 1:
+                self._remember(best, sketches)
             yield sorted(sketches, key=lambda pair: pair[1].loss)[:_FINALISTS]
+
+    def _remember(self, best: Fit, sketches: Sequence[tuple[tuple[Lead, ...], Fit]]) -> None:
+        """Notes what entries explain by themselves beside those found, for the report."""
+        before = self._held_out(best.effects)
+        for (lead,), sketch in sketches:
+            after = self._held_out(sketch.effects)
+            p = p_value(before - after)
+            self.attempts[lead.entry.name] = Attempt(lead.entry, sketch, len(best.effects), float(after.mean()), p)
 
     def _possible(self, best: Fit, chosen: Sequence[Lead]) -> bool:
         return is_possible(self.problem, [*best.effects, *(lead.effect for lead in chosen)])
