@@ -19,7 +19,7 @@ from torchrl_h2o.residuals.simulation import Simulation
 
 _LEVEL = 0.01  # of the whole search, divided by the number of entries
 _PAYS = 0.002  # share of the held-out loss that an effect must take away to be worth a word
-_WORTH_A_WORD = 0.01  # of what all effects explain together
+_WORTH_A_WORD = 0.003  # of what all effects explain together
 _SCREENED = 400  # control steps, in windows of any length
 _FEWEST = 100  # windows
 _FITTED_WINDOWS = 1200  # while searching; what was found is fitted to all of them in the end
