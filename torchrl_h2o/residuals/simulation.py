@@ -5,7 +5,7 @@ Everything runs through ``mujoco.rollout``; one control step is ``frame_skip`` p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -77,14 +77,18 @@ class Simulation:
 
     @classmethod
     def from_mjcf(
-        cls, path: str | Path, state_map: StateMap | Sequence[str], control_step: float, effects: Sequence[Effect] = ()
+        cls,
+        path: str | Path,
+        state_map: StateMap | Sequence[str] | Mapping[str, str],
+        control_step: float,
+        effects: Sequence[Effect] = (),
     ) -> Simulation:
         """An MJCF file.
 
         Args:
             path: of the file.
             state_map: a map, or the names of what is observed, in the order of the data: a joint's name for its
-                position, with ``_velocity`` behind it for its velocity.
+                position, with ``_velocity`` behind it for its velocity; or which of these each column of a log is.
             control_step: the time between two rows of the data, in s: a multiple of the model's timestep.
             effects: put into it.
 
