@@ -22,7 +22,8 @@ _PAYS = 0.002  # share of the held-out loss that an effect must take away to be 
 _WORTH_A_WORD = 0.003  # of what all effects explain together
 _SCREENED = 400  # control steps, in windows of any length
 _FEWEST = 100  # windows
-_FITTED_WINDOWS = 1200  # while searching; what was found is fitted to all of them in the end
+_FITTED_STEPS = 1200  # in windows, while searching; what was found is fitted to all of them in the end
+_FEWEST_FITTED = 200  # windows
 _FITTED = 12  # rivals of an effect that are tried in its place
 _FINALISTS = 3  # sets of leads of one size that are fitted on all windows
 _AMONG = 60  # leads that sets are made of
@@ -124,7 +125,7 @@ class Search:
         measured, horizon = self.problem.measured, self.problem.horizon
         self.first = self.problem
         self.all, self.judged = measured.fitted(horizon), measured.judged(horizon)
-        self.fitted = thinned(self.all, _FITTED_WINDOWS)
+        self.fitted = thinned(self.all, max(_FEWEST_FITTED, _FITTED_STEPS // horizon))
         few = min(max(_FEWEST, _SCREENED // horizon), len(self.fitted))
         self.screened = np.sort(self.rng.choice(self.fitted, few, replace=False))
 
