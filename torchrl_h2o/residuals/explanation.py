@@ -22,6 +22,7 @@ from torchrl_h2o.residuals.undeclared import Undeclared, find_undeclared
 
 _LEVEL = 0.01
 _PAYS = 0.05  # share of the held-out loss that a force which nobody declared must take away
+_WORTH_A_WORD = 0.01  # of all that is explained
 _BEYOND_NOISE = 2.0  # times what such a force explains where there is nothing but noise
 _NOISE_CHANGE = 0.1  # of the simulator's own action noise: less is not worth a word
 
@@ -106,6 +107,14 @@ def _with_undeclared(
     def loss(candidate: Sequence[Part]) -> np.ndarray:
         return losses(problem.residual([part.effect for part in candidate], judged))
 
+    first = Problem.pose(simulation, measured, sensor_std=sensor_noise(simulation, measured))
+
+    def matters(before: Sequence[Part], after: Sequence[Part]) -> bool:
+        nothing, without, with_it = (
+            losses(first.residual([part.effect for part in some], judged)).mean() for some in ((), before, after)
+        )
+        return without - with_it > _WORTH_A_WORD * (nothing - with_it)
+
     best, lowest = parts, loss(parts)
     alone = find_undeclared(simulation, measured) if parts else None
     for force, base, known in ((alone, simulation, []), (beside, mended, parts)):
@@ -117,7 +126,7 @@ def _with_undeclared(
             candidate = _found_anew(simulation, measured, candidate)
         after = loss(candidate)
         pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p_value(lowest - after) < _LEVEL
-        if pays and _beyond_noise(force, base, measured, rng):
+        if pays and matters(best, candidate) and _beyond_noise(force, base, measured, rng):
             best, lowest = candidate, after
     return best
 

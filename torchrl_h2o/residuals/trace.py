@@ -29,6 +29,7 @@ _FINALISTS = 3  # sets of leads of one size that are fitted on all windows
 _AMONG = 60  # leads that sets are made of
 _SETS = ((1, 12), (2, 4), (3, 4))  # how many entries may be added at once, and how many such sets are sketched
 _MOST = 6  # effects
+_ROUNDS = 3  # of growing and simplifying
 _BEYOND_NOISE = 4.0  # times what an effect explains where there is nothing but noise
 _WORTH_A_FIT = 0.5  # of what an effect explains: another one that misses more, the others as they are, is not fitted
 _SAME = 1e-6  # of what an effect explains: less is a matter of rounding
@@ -130,9 +131,29 @@ class Search:
         self.screened = np.sort(self.rng.choice(self.fitted, few, replace=False))
 
     def run(self) -> Trace:
-        """Adds the effect that explains most while one explains more than chance, and takes out what is not needed."""
-        entries, best = [], self._fitted([])
-        while (more := self._weigh(best)) and len(entries) < _MOST:
+        """Adds effects while they explain more than chance, takes out what is not needed, and looks for their equals."""
+        entries, best, exact = self._grown([], self._fitted([]))
+        for _ in range(_ROUNDS):
+            found = entries
+            entries, best, groups = self._simplified(entries, best)
+            if exact or entries == found:
+                break
+            # an effect of many parameters may have stood in the way of what a simpler one leaves to be found
+            found = entries
+            entries, best, exact = self._grown(entries, best)
+            if entries == found:
+                break
+        best = self._fitted(entries, best.effects, self.all)
+        names = {entry.name for entry in entries}
+        tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
+        attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
+        return Trace(tuple(entries), best, attempts, groups, exact)
+
+    def _grown(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit, bool]:
+        """Adds effects while that pays; beside them whether nothing is left but that data are single precision."""
+        while more := self._weigh(best):
+            if len(entries) >= _MOST:
+                break
             leads = screen(self.problem, best.effects, self._others(entries), self.screened, self.progress.update)
             added = self._best_addition(entries, best, leads)
             if added is None:
@@ -144,15 +165,17 @@ class Search:
             self.catalogue = [known.get(entry.name, entry) for entry in self.catalogue]
             entries, best = self._eliminated(*added)
             self.progress.set_postfix_str(", ".join(entry.name for entry in entries))
+        return entries, best, not more
+
+    def _simplified(
+        self, entries: list[CatalogueEntry], best: Fit
+    ) -> tuple[list[CatalogueEntry], Fit, tuple[tuple[Attempt, ...], ...]]:
+        """Each effect replaced by the simplest that does as well; beside them what else does as well."""
         groups = []
         for index in range(len(entries)):
             entries, best, group = self._simplest(entries, best, index)
             groups.append(group)
-        best = self._fitted(entries, best.effects, self.all)
-        tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
-        found = {entry.name for entry in entries}
-        attempts = tuple(attempt for attempt in tried if attempt.entry.name not in found)
-        return Trace(tuple(entries), best, attempts, tuple(groups), exact=not more)
+        return entries, best, tuple(groups)
 
     def _others(self, entries: Sequence[CatalogueEntry]) -> list[CatalogueEntry]:
         names = {entry.name for entry in entries}
