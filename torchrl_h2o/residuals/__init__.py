@@ -9,9 +9,9 @@ from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.report import Report
 from torchrl_h2o.residuals.residual import residuals
+from torchrl_h2o.residuals.search import trace_effects
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.state_map import StateMap
-from torchrl_h2o.residuals.trace import trace_effects
 from torchrl_h2o.residuals.two_sample import two_sample_auc
 from torchrl_h2o.residuals.undeclared import find_undeclared
 

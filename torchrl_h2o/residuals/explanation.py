@@ -15,9 +15,10 @@ from torchrl_h2o.residuals.fit import Problem, fit, losses
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.noise import estimate_noise
 from torchrl_h2o.residuals.screening import free_parameters
+from torchrl_h2o.residuals.search import trace_effects
 from torchrl_h2o.residuals.significance import p_value
 from torchrl_h2o.residuals.simulation import Simulation
-from torchrl_h2o.residuals.trace import Trace, trace_effects
+from torchrl_h2o.residuals.trace import Trace
 from torchrl_h2o.residuals.undeclared import Undeclared, find_undeclared
 
 _LEVEL = 0.01

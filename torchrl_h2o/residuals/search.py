@@ -1,0 +1,318 @@
+"""Traces a residual to effects of a catalogue: forward selection, backward elimination, what cannot be told apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from tqdm import tqdm
+
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.chance import sensor_noise, stand_in
+from torchrl_h2o.residuals.fit import Fit, Free, Problem, fit, losses
+from torchrl_h2o.residuals.horizon import choose_horizon
+from torchrl_h2o.residuals.measured import Measured, thinned
+from torchrl_h2o.residuals.screening import Lead, free_parameters, is_possible, promising_sets, screen
+from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.simulation import Simulation
+from torchrl_h2o.residuals.trace import Attempt, Trace
+
+_LEVEL = 0.01  # of the whole search, divided by the number of entries
+_PAYS = 0.002  # share of the held-out loss that an effect must take away to be worth a word
+_WORTH_A_WORD = 0.003  # of what all effects explain together
+_SCREENED = 400  # control steps, in windows of any length
+_FEWEST = 100  # windows
+_FITTED_STEPS = 1200  # in windows, while searching; what was found is fitted to all of them in the end
+_FEWEST_FITTED = 200  # windows
+_FITTED = 12  # rivals of an effect that are tried in its place
+_FINALISTS = 3  # sets of leads of one size that are fitted on all windows
+_AMONG = 60  # leads that sets are made of
+_SETS = ((1, 12), (2, 4), (3, 4))  # how many entries may be added at once, and how many such sets are sketched
+_MOST = 6  # effects
+_ROUNDS = 3  # of growing and simplifying
+_BEYOND_NOISE = 4.0  # times what an effect explains where there is nothing but noise
+_WORTH_A_FIT = 0.5  # of what an effect explains: another one that misses more, the others as they are, is not fitted
+_SAME = 1e-6  # of what an effect explains: less is a matter of rounding
+_ALIKE = 0.1  # of what an effect explains: another one that misses more of it is no alternative
+
+
+def trace_effects(
+    simulation: Simulation,
+    measured: Measured,
+    catalogue: Sequence[CatalogueEntry],
+    *,
+    rng: np.random.Generator,
+    progress: tqdm,
+) -> Trace:
+    """Traces the residual between data and a simulation to effects of a catalogue.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        catalogue: the effects that it could lack.
+        rng: draws the windows that are screened.
+        progress: shows how far the search is.
+
+    Returns:
+        What was found, what was tried, and what cannot be told apart.
+    """
+    horizon = choose_horizon(simulation, measured, catalogue, rng)
+    problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_noise(simulation, measured))
+    return Search(problem, catalogue, rng, progress).run()
+
+
+@dataclass
+class Search:
+    """A search over a catalogue.
+
+    Args:
+        problem: what to explain.
+        catalogue: the entries.
+        rng: draws the windows that are screened.
+        progress: shows how far it is.
+    """
+
+    problem: Problem
+    catalogue: Sequence[CatalogueEntry]
+    rng: np.random.Generator
+    progress: tqdm
+    attempts: dict[str, Attempt] = field(default_factory=dict)
+    rivals: dict[str, list[Lead]] = field(default_factory=dict)
+
+    def __post_init__(self):
+        measured, horizon = self.problem.measured, self.problem.horizon
+        self.first = self.problem
+        self.all, self.judged = measured.fitted(horizon), measured.judged(horizon)
+        self.fitted = thinned(self.all, max(_FEWEST_FITTED, _FITTED_STEPS // horizon))
+        few = min(max(_FEWEST, _SCREENED // horizon), len(self.fitted))
+        self.screened = np.sort(self.rng.choice(self.fitted, few, replace=False))
+
+    def run(self) -> Trace:
+        """Adds effects while they explain more than chance, takes out what is not needed, looks for their equals."""
+        entries, best, exact = self._grown([], self._fitted([]))
+        for _ in range(_ROUNDS):
+            found = entries
+            entries, best, groups = self._simplified(entries, best)
+            if exact or entries == found:
+                break
+            # an effect of many parameters may have stood in the way of what a simpler one leaves to be found
+            found = entries
+            entries, best, exact = self._grown(entries, best)
+            if entries == found:
+                break
+        best = self._fitted(entries, best.effects, self.all)
+        names = {entry.name for entry in entries}
+        tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
+        attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
+        return Trace(tuple(entries), best, attempts, groups, exact)
+
+    def _grown(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit, bool]:
+        """Adds effects while that pays; beside them whether nothing is left but that data are single precision."""
+        while more := self._weigh(best):
+            if len(entries) >= _MOST:
+                break
+            leads = screen(self.problem, best.effects, self._others(entries), self.screened, self.progress.update)
+            added = self._best_addition(entries, best, leads)
+            if added is None:
+                break
+            for entry in added[0][len(entries) :]:
+                self.rivals[entry.name] = leads
+            # which trial shows an entry's direction best is known by now
+            known = {lead.entry.name: replace(lead.entry, trials=(dict(lead.trial),)) for lead in leads}
+            self.catalogue = [known.get(entry.name, entry) for entry in self.catalogue]
+            entries, best = self._eliminated(*added)
+            self.progress.set_postfix_str(", ".join(entry.name for entry in entries))
+        return entries, best, not more
+
+    def _simplified(
+        self, entries: list[CatalogueEntry], best: Fit
+    ) -> tuple[list[CatalogueEntry], Fit, tuple[tuple[Attempt, ...], ...]]:
+        """Each effect replaced by the simplest that does as well; beside them what else does as well."""
+        groups = []
+        for index in range(len(entries)):
+            entries, best, group = self._simplest(entries, best, index)
+            groups.append(group)
+        return entries, best, tuple(groups)
+
+    def _others(self, entries: Sequence[CatalogueEntry]) -> list[CatalogueEntry]:
+        names = {entry.name for entry in entries}
+        return [entry for entry in self.catalogue if entry.name not in names]
+
+    def _weigh(self, best: Fit) -> bool:
+        """Weighs residuals by the size that they have now; returns whether anything is left to explain."""
+        return not self._weigh_by(best.effects).within_rounding
+
+    def _weigh_by(self, effects: Sequence[Effect]) -> Problem:
+        """Weighs residuals by the size that they, and what sensor noise makes of them, have with some effects in."""
+        simulation, measured = self.problem.simulation.with_effects(*effects), self.problem.measured
+        posed = Problem.pose(
+            simulation,
+            measured,
+            self.problem.horizon,
+            sensor_std=sensor_noise(simulation, measured),
+            estimated=self.problem.estimated,
+        )
+        self.problem = replace(self.problem, scale=posed.scale, states=posed.states)
+        return posed
+
+    def _fitted(
+        self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = (), starts: np.ndarray | None = None
+    ) -> Fit:
+        """All of the effects fitted together."""
+        starts = self.fitted if starts is None else starts
+        if not entries:
+            return Fit((), (), float(losses(self.problem.residual((), starts)).mean()), ())
+        return fit(self.problem, start, [free_parameters(entry) for entry in entries], starts)
+
+    def _sketched(self, effects: Sequence[Effect], free: Sequence[Free]) -> Fit:
+        """Some of the effects fitted, the others as they are, on few windows."""
+        return fit(self.problem, effects, free, self.screened, max_evaluations=6)
+
+    def _held_out(self, effects: Sequence[Effect]) -> np.ndarray:
+        return losses(self.problem.residual(effects, self.judged))
+
+    def _best_addition(
+        self, entries: list[CatalogueEntry], best: Fit, leads: Sequence[Lead]
+    ) -> tuple[list[CatalogueEntry], Fit] | None:
+        """The entries that, fitted with those found, explain most of the held-out windows; None if none pay.
+
+        Several are added at once where they explain clearly more than fewer do.
+        """
+        before = self._held_out(best.effects)
+        winner, added, lowest, base = None, 0, before, best.effects
+        for size, finalists in enumerate(self._finalists(best, leads), start=1):
+            if len(entries) + size > _MOST:
+                break
+            for chosen, start in finalists:
+                together = [*entries, *(lead.entry for lead in chosen)]
+                candidate = self._fitted(together, start.effects)
+                after = self._held_out(candidate.effects)
+                p = p_value(lowest - after)
+                pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p < _LEVEL / len(self.catalogue)
+                if pays and self._matters(base, candidate.effects, size - added):
+                    winner, added, lowest, base = (together, candidate), size, after, candidate.effects
+        if winner is None:
+            return None
+        explained = 1.0 - lowest.mean() / before.mean()
+        return winner if explained > _BEYOND_NOISE * self._explained_by_noise(best, *winner, added) else None
+
+    def _finalists(self, best: Fit, leads: Sequence[Lead]) -> Iterator[list[tuple[tuple[Lead, ...], Fit]]]:
+        """The sets of one, two and three leads that are worth a fit on all windows, each with where to start it."""
+        kept = [() for _ in best.effects]
+        for size, tried in _SETS:
+            among = [lead for lead in leads[:_AMONG] if lead.promise > 0.0]
+            if len(among) < size:
+                return
+            sets = promising_sets(self.problem, best.effects, among, size, self.screened, tried)
+            if size == 1:
+                sets = [(lead,) for lead in leads[:tried]]
+            sketches = [
+                (
+                    chosen,
+                    self._sketched(
+                        [*best.effects, *(lead.effect for lead in chosen)], [*kept, *(lead.free for lead in chosen)]
+                    ),
+                )
+                for chosen in sets
+                if self._possible(best, chosen)
+            ]
+            if size == 1:
+                self._remember(best, sketches)
+            yield sorted(sketches, key=lambda pair: pair[1].loss)[:_FINALISTS]
+
+    def _remember(self, best: Fit, sketches: Sequence[tuple[tuple[Lead, ...], Fit]]) -> None:
+        """Notes what entries explain by themselves beside those found, for the report."""
+        before = self._held_out(best.effects)
+        for (lead,), sketch in sketches:
+            after = self._held_out(sketch.effects)
+            p = p_value(before - after)
+            self.attempts[lead.entry.name] = Attempt(lead.entry, sketch, len(best.effects), float(after.mean()), p)
+
+    def _possible(self, best: Fit, chosen: Sequence[Lead]) -> bool:
+        return is_possible(self.problem, [*best.effects, *(lead.effect for lead in chosen)])
+
+    def _matters(self, before: Sequence[Effect], after: Sequence[Effect], number: int) -> bool:
+        """Whether additions explain a share worth a word each of all that has been explained since the start."""
+        nothing, without, with_it = (
+            losses(self.first.residual(effects, self.judged)).mean() for effects in ((), before, after)
+        )
+        return without - with_it > number * _WORTH_A_WORD * (nothing - with_it)
+
+    def _explained_by_noise(self, best: Fit, entries: Sequence[CatalogueEntry], candidate: Fit, added: int) -> float:
+        """The share of the loss that the last entries would explain if nothing but noise were there."""
+        simulation, measured = self.problem.simulation.with_effects(*best.effects), self.problem.measured
+        sensor_std = sensor_noise(simulation, measured)
+        if sensor_std is None:
+            return 0.0
+        horizon = self.problem.horizon
+        data = stand_in(simulation, measured, sensor_std, self.rng, horizon, self.problem.states)
+        posed = Problem.pose(simulation, data, horizon, sensor_std=sensor_std)
+        # from the values that the data gave, and that noise might give too
+        free = [free_parameters(entry) for entry in entries[-added:]]
+        refitted = fit(posed, candidate.effects[-added:], free, self.fitted)
+        before = losses(posed.residual((), self.judged)).mean()
+        return 1.0 - float(losses(posed.residual(refitted.effects, self.judged)).mean() / before)
+
+    def _eliminated(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit]:
+        """Takes out, one by one, what the others make up for."""
+        removed = True
+        while removed and len(entries) > 1:
+            removed = False
+            before = self._held_out(best.effects)
+            for index in range(len(entries)):
+                rest = [entry for i, entry in enumerate(entries) if i != index]
+                kept = [effect for i, effect in enumerate(best.effects) if i != index]
+                candidate = self._fitted(rest, kept)
+                after = self._held_out(candidate.effects)
+                needed = after.mean() > before.mean() / (1.0 - _PAYS) and p_value(after - before) < _LEVEL
+                if not needed:
+                    entries, best, removed = rest, candidate, True
+                    break
+        return entries, best
+
+    def _simplest(
+        self, entries: list[CatalogueEntry], best: Fit, index: int
+    ) -> tuple[list[CatalogueEntry], Fit, tuple[Attempt, ...]]:
+        """Puts in an effect's place, of those that do as well, one with the fewest parameters; the rest beside it."""
+        own = Attempt(entries[index], best, index, float(self._held_out(best.effects).mean()), 1.0)
+        group = [own, *self._as_good(entries, best, index)]
+        order = {entry.name: place for place, entry in enumerate(self.catalogue)}
+        simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), order[a.entry.name]))
+        rest = tuple(attempt for attempt in group if attempt is not simplest)
+        instead = [simplest.entry if i == index else entry for i, entry in enumerate(entries)]
+        self.rivals[simplest.entry.name] = self.rivals[entries[index].name]
+        return instead, simplest.fit, rest
+
+    def _rivals(self, entries: Sequence[CatalogueEntry], index: int) -> list[Lead]:
+        """The entries that promised about as much as one of those found did when it was added."""
+        leads = self.rivals[entries[index].name]
+        names = {entry.name for entry in entries}
+        promise = next(lead.promise for lead in leads if lead.entry.name == entries[index].name)
+        others = [lead for lead in leads if lead.entry.name not in names]
+        return sorted(others, key=lambda lead: abs(lead.promise - promise))[:_FITTED]
+
+    def _as_good(self, entries: Sequence[CatalogueEntry], best: Fit, index: int) -> tuple[Attempt, ...]:
+        """Which other entries do as well as one of those found, in its place."""
+        kept = [effect for i, effect in enumerate(best.effects) if i != index]
+        self._weigh_by(kept)
+        with_it, without = self._held_out(best.effects), self._held_out(kept).mean()
+        few_with_it, few_without = (
+            losses(self.problem.residual(e, self.screened)).mean() for e in (best.effects, kept)
+        )
+        as_good = []
+        for lead in self._rivals(entries, index):
+            instead = [lead.entry if i == index else entry for i, entry in enumerate(entries)]
+            effects = [*kept[:index], lead.effect, *kept[index:]]
+            if not is_possible(self.problem, effects):
+                continue
+            start = self._sketched(effects, [lead.free if i == index else () for i in range(len(effects))])
+            if few_without - start.loss < _WORTH_A_FIT * (few_without - few_with_it):
+                continue
+            candidate = self._fitted(instead, start.effects)
+            after = self._held_out(candidate.effects)
+            p = p_value(after - with_it)
+            worse = (after.mean() - with_it.mean()) / (without - with_it.mean())
+            if worse < _SAME or (worse < _ALIKE and p > _LEVEL):
+                as_good.append(Attempt(lead.entry, candidate, index, float(after.mean()), p))
+        return tuple(sorted(as_good, key=lambda attempt: attempt.loss))
