@@ -150,6 +150,19 @@ def test_data_in_which_nothing_moves_are_no_conclusion():
     assert "nothing moves" in closed(still).conclusion
 
 
+def test_a_sensor_that_is_off_is_no_conclusion_and_it_is_said_which():
+    measured = recorded(SIMULATION, 300)
+    dead = np.array([1.0, 0.0])
+    off = replace(measured, observation=measured.observation * dead, following=measured.following * dead)
+    assert "entries 1 never change" in closed(off).conclusion
+
+
+def test_a_simulator_that_diverges_is_no_conclusion():
+    measured = recorded(SIMULATION, 300)
+    far = replace(measured, observation=1e12 * measured.observation, following=1e12 * measured.following)
+    assert "diverges within one step of" in closed(far).conclusion
+
+
 def test_a_progress_bar_is_shown_only_if_asked(capsys):
     measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 300)
     close_the_loop(SIMULATION, measured, [GRAVITY], progress=False)

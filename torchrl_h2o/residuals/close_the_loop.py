@@ -15,8 +15,11 @@ from torchrl_h2o.residuals.explanation import explain
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.outside import outside_intervals, outside_rows, still_outside
 from torchrl_h2o.residuals.report import DataSummary, Report
+from torchrl_h2o.residuals.residual import residuals
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.summary import DISTURBED, summarise
+
+_MAY_DIVERGE = 0.1  # of the transitions: a few are measured in a fall, or wrongly
 
 
 def close_the_loop(
@@ -63,7 +66,7 @@ def close_the_loop(
     measured = (
         data if isinstance(data, Measured) else Measured.from_ted(data, simulation, source=source, held_out=held_out)
     )
-    if (reason := measured.why_no_conclusion()) is not None:
+    if (reason := measured.why_no_conclusion() or _why_it_diverges(simulation, measured)) is not None:
         summary = DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out)
         return Report(simulator=simulation.name, data=summary, conclusion=reason)
     entries = simulation.catalogue() if catalogue is None else catalogue
@@ -75,3 +78,14 @@ def close_the_loop(
         disturbed = still_outside(suspected, simulation.with_effects(*explanation.effects), measured)
         judged = measured.without(outside_rows(disturbed, len(measured)), DISTURBED)
         return summarise(simulation, judged, explanation, disturbed=disturbed, seed=seed, start=start)
+
+
+def _why_it_diverges(simulation: Simulation, measured: Measured) -> str | None:
+    """Why nothing can be said with a simulator that blows up at measured states, None if it does not."""
+    diverged = ~np.isfinite(residuals(simulation, measured, measured.fitted())).all((1, 2))
+    if diverged.mean() <= _MAY_DIVERGE:
+        return None
+    return (
+        f"the simulator diverges within one step of {diverged.mean():.0%} of the measured states; check its timestep, "
+        "the units, and which coordinate each column is"
+    )

@@ -141,6 +141,11 @@ class Measured:
         still = np.flatnonzero(np.ptp(self.observation[self.usable], axis=0) == 0.0)
         if len(still) == self.observation.shape[1]:
             return "nothing moves in these data; record some motion"
+        if len(still):
+            return (
+                f"the observation's entries {', '.join(map(str, still))} never change, as of sensors that are off: "
+                "what they say would be explained by effects that are not there; mend them or leave them out"
+            )
         return None
 
 
