@@ -13,7 +13,7 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals.fit import Problem
+from torchrl_h2o.residuals.problem import Problem
 from torchrl_h2o.residuals.screening import free_parameters, screen
 
 SIMULATION = pendulum()

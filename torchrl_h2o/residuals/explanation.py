@@ -11,9 +11,10 @@ from tqdm import tqdm
 
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Effect
 from torchrl_h2o.residuals.chance import sensor_noise, stand_in
-from torchrl_h2o.residuals.fit import Problem, fit, losses
+from torchrl_h2o.residuals.fit import fit
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.noise import estimate_noise
+from torchrl_h2o.residuals.problem import Problem, losses
 from torchrl_h2o.residuals.screening import free_parameters
 from torchrl_h2o.residuals.search import trace_effects
 from torchrl_h2o.residuals.significance import p_value
@@ -101,14 +102,13 @@ def _with_undeclared(
     beside = find_undeclared(mended, measured)
     if beside is None:
         return parts
-    posed = Problem.pose(mended, measured, sensor_std=sensor_noise(mended, measured))
-    problem = replace(posed, simulation=simulation)
+    problem = replace(Problem.pose(mended, measured), simulation=simulation)
     judged = measured.judged()
 
     def loss(candidate: Sequence[Part]) -> np.ndarray:
         return losses(problem.residual([part.effect for part in candidate], judged))
 
-    first = Problem.pose(simulation, measured, sensor_std=sensor_noise(simulation, measured))
+    first = Problem.pose(simulation, measured)
 
     def matters(before: Sequence[Part], after: Sequence[Part]) -> bool:
         nothing, without, with_it = (

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.residuals.chance import sensor_noise
-from torchrl_h2o.residuals.fit import Problem
 from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.problem import Problem
 from torchrl_h2o.residuals.screening import screen
 from torchrl_h2o.residuals.significance import BLOCKS
 from torchrl_h2o.residuals.simulation import Simulation
@@ -40,12 +39,13 @@ def choose_horizon(
         1, 5 or 20.
     """
     chosen, most = 1, 0.0
-    sensor_std = sensor_noise(simulation, measured)
+    sensor_std = None
     for horizon in _HORIZONS:
         starts = measured.fitted(horizon)
         if horizon > 1 and (len(starts) < _FEWEST or len(measured.judged(horizon)) < BLOCKS):
             break
         problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_std)
+        sensor_std = problem.sensor_std
         few = np.sort(rng.choice(starts, min(len(starts), _FEWEST), replace=False))
         leads = screen(problem, (), catalogue, few)
         # farther ahead, look only at what promises something, in the direction in which it does

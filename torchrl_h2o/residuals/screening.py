@@ -9,7 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
-from torchrl_h2o.residuals.fit import Free, Problem, losses
+from torchrl_h2o.residuals.fit import Free
+from torchrl_h2o.residuals.problem import Problem, losses
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ import numpy as np
 from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
-from torchrl_h2o.residuals.chance import sensor_noise, stand_in
-from torchrl_h2o.residuals.fit import Fit, Free, Problem, fit, losses
+from torchrl_h2o.residuals.chance import stand_in
+from torchrl_h2o.residuals.fit import Fit, Free, fit
 from torchrl_h2o.residuals.horizon import choose_horizon
 from torchrl_h2o.residuals.measured import Measured, thinned
+from torchrl_h2o.residuals.problem import Problem, losses
 from torchrl_h2o.residuals.screening import Lead, free_parameters, is_possible, promising_sets, screen
 from torchrl_h2o.residuals.significance import p_value
 from torchrl_h2o.residuals.simulation import Simulation
@@ -58,8 +59,7 @@ def trace_effects(
         What was found, what was tried, and what cannot be told apart.
     """
     horizon = choose_horizon(simulation, measured, catalogue, rng)
-    problem = Problem.pose(simulation, measured, horizon, sensor_std=sensor_noise(simulation, measured))
-    return Search(problem, catalogue, rng, progress).run()
+    return Search(Problem.pose(simulation, measured, horizon), catalogue, rng, progress).run()
 
 
 @dataclass
@@ -90,17 +90,15 @@ class Search:
 
     def run(self) -> Trace:
         """Adds effects while they explain more than chance, takes out what is not needed, looks for their equals."""
-        entries, best, exact = self._grown([], self._fitted([]))
+        entries, best, groups = [], self._fitted([]), ()
         for _ in range(_ROUNDS):
-            found = entries
-            entries, best, groups = self._simplified(entries, best)
-            if exact or entries == found:
+            grown, best, exact = self._grown(entries, best)
+            if grown == entries:
+                break
+            entries, best, groups = self._simplified(grown, best)
+            if exact or entries == grown:
                 break
             # an effect of many parameters may have stood in the way of what a simpler one leaves to be found
-            found = entries
-            entries, best, exact = self._grown(entries, best)
-            if entries == found:
-                break
         best = self._fitted(entries, best.effects, self.all)
         names = {entry.name for entry in entries}
         tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
@@ -145,15 +143,9 @@ class Search:
 
     def _weigh_by(self, effects: Sequence[Effect]) -> Problem:
         """Weighs residuals by the size that they, and what sensor noise makes of them, have with some effects in."""
-        simulation, measured = self.problem.simulation.with_effects(*effects), self.problem.measured
-        posed = Problem.pose(
-            simulation,
-            measured,
-            self.problem.horizon,
-            sensor_std=sensor_noise(simulation, measured),
-            estimated=self.problem.estimated,
-        )
-        self.problem = replace(self.problem, scale=posed.scale, states=posed.states)
+        mended = self.problem.simulation.with_effects(*effects)
+        posed = Problem.pose(mended, self.problem.measured, self.problem.horizon)
+        self.problem = replace(posed, simulation=self.problem.simulation)
         return posed
 
     def _fitted(
@@ -241,13 +233,12 @@ class Search:
 
     def _explained_by_noise(self, best: Fit, entries: Sequence[CatalogueEntry], candidate: Fit, added: int) -> float:
         """The share of the loss that the last entries would explain if nothing but noise were there."""
-        simulation, measured = self.problem.simulation.with_effects(*best.effects), self.problem.measured
-        sensor_std = sensor_noise(simulation, measured)
-        if sensor_std is None:
+        problem = self.problem
+        if problem.sensor_std is None:
             return 0.0
-        horizon = self.problem.horizon
-        data = stand_in(simulation, measured, sensor_std, self.rng, horizon, self.problem.states)
-        posed = Problem.pose(simulation, data, horizon, sensor_std=sensor_std)
+        mended = problem.simulation.with_effects(*best.effects)
+        data = stand_in(mended, problem.measured, problem.sensor_std, self.rng, problem.horizon, problem.states)
+        posed = Problem.pose(mended, data, problem.horizon, sensor_std=problem.sensor_std)
         # from the values that the data gave, and that noise might give too
         free = [free_parameters(entry) for entry in entries[-added:]]
         refitted = fit(posed, candidate.effects[-added:], free, self.fitted)

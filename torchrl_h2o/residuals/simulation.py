@@ -123,7 +123,11 @@ class Simulation:
 
     def with_effects(self, *effects: Effect) -> Simulation:
         """The simulation with more effects in it, behind those that are in it."""
-        return replace(self, effects=(*self.effects, *effects))
+        more = replace(self, effects=(*self.effects, *effects))
+        if not any(isinstance(effect, ModelEffect) for effect in effects):
+            # the same model: not compiled anew for every value of an actuator's delay
+            more.__dict__.update(model=self.model, _data=self._data)
+        return more
 
     def executed(self, actions: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """What is executed of the actions of one recorded run, (T, nu), after the action effects.

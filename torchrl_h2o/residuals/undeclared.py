@@ -9,10 +9,10 @@ import numpy as np
 
 from torchrl_h2o.effects import ResidualForce
 from torchrl_h2o.effects.residual_force import degrees_of_freedom
-from torchrl_h2o.residuals.chance import sensor_noise
-from torchrl_h2o.residuals.fit import Fit, Problem, fit, losses
+from torchrl_h2o.residuals.fit import Fit, fit
 from torchrl_h2o.residuals.forces import force_response, residual_forces, step_path
 from torchrl_h2o.residuals.measured import Measured
+from torchrl_h2o.residuals.problem import Problem, losses
 from torchrl_h2o.residuals.significance import p_value
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.sparse_force import SparseForce, sparse_force
@@ -69,7 +69,7 @@ def find_undeclared(
     Returns:
         The effect, None if there is none that pays.
     """
-    problem = Problem.pose(simulation, measured, sensor_std=sensor_noise(simulation, measured))
+    problem = Problem.pose(simulation, measured)
     search = _Search(problem, measured.fitted())
     if search.nothing_to_explain():
         return None
@@ -98,8 +98,7 @@ class _Search:
         simulation, measured, states = self.problem.simulation, self.problem.measured, self.problem.states
         self.path = step_path(simulation, measured, self.starts, states=states)
         self.response = force_response(simulation, measured, self.starts, states=states)
-        sensor_std = sensor_noise(simulation, measured)
-        self.further = Problem.pose(simulation, measured, _FURTHER, sensor_std=sensor_std)
+        self.further = Problem.pose(simulation, measured, _FURTHER, sensor_std=self.problem.sensor_std)
         self.before = losses(self.problem.residual((), self.starts)).mean()
 
     def nothing_to_explain(self) -> bool:
