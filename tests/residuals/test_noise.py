@@ -80,4 +80,5 @@ def test_noise_is_that_before_the_control_range_cuts_it_off():
     simulation = pendulum().with_effects(ActionGain(1.3))
     found = estimate_noise(simulation, recorded(real, 4000))
     assert found.p_value < LEVEL
-    assert found.action_std == pytest.approx(0.5, rel=0.2)
+    assert found.action_std == pytest.approx(0.5, rel=0.1)
+    assert abs(found.action_std - 0.5) < 2.0 * found.half_width < 0.1

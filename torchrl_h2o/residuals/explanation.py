@@ -198,5 +198,5 @@ def _noise(simulation: Simulation, measured: Measured, found: Sequence[Effect]) 
     if abs(missing) <= _NOISE_CHANGE * own_variance:
         return []
     std = math.copysign(math.sqrt(abs(missing)), missing)
-    half = math.sqrt(abs(missing)) * noise.action_uncertainty if variance else 0.0
+    half = noise.half_width if variance else 0.0
     return [Part(ActionNoise(std), True, {"std": (std - half, std + half)})]

@@ -6,19 +6,23 @@ sensors scatters along what a state can do.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import brentq, nnls
+from scipy.optimize import nnls
+from scipy.stats import chi2, norm
 
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.residual import executed_actions, residuals, start_states
 from torchrl_h2o.residuals.significance import p_value
 from torchrl_h2o.residuals.simulation import Simulation
 
+_FLOOR = 1e-3  # of the mean residual's square, in every dimension: derivatives are no better
 _BLOCKS = 10  # of the data, to see how much an estimate scatters
+_ITERATIONS = 8
 _NUDGE = 1e-4  # of a spread, for finite differences
-_FIRM = 25.0  # mean squares: a larger square is no noise, and would be all that a mean of squares sees
+_USUAL = 0.995  # of residuals, if normal: a larger one counts as no larger, as contacts throw some far out
+_TAILS = 4.0  # degrees of freedom of Student's t, that a residual is judged by: contacts again
 _WORTH = 1e-3  # of the control range: less action noise is not worth a word
 _SHARE = 0.15  # of the scatter: less could be sensor noise, which contacts throw far out, much as the action does
 
@@ -29,12 +33,12 @@ class NoiseEstimate:
 
     Args:
         action_std: of the executed action about the one asked for, in units of the action, all actuators alike.
-        action_uncertainty: half of the 95 % interval of ``action_std``, as a share of it.
+        half_width: of its 95 % interval.
         p_value: the chance to see as much action noise where there is none, on held-out data.
     """
 
     action_std: float
-    action_uncertainty: float
+    half_width: float
     p_value: float
 
 
@@ -42,53 +46,81 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     r"""The noise of the executed action, told from that of the sensors by the covariance of one-step residuals.
 
     With :math:`F` and :math:`G` the simulator's derivatives by what is observed and by the action, a residual is
-    :math:`e = n' - F n + G\nu`, its covariance :math:`\Sigma + F\Sigma F^\top + \sigma^2 G G^\top`. The variances are
-    fitted to the squares, and judged on held-out data by the Gaussian likelihood with and without :math:`\sigma`.
+    :math:`e = n' - F n + G\nu`, its covariance :math:`\Sigma + F\Sigma F^\top + G\,\mathrm{E}[\nu\nu^\top] G^\top`.
+    The variances are fitted to the squares, and judged on held-out data by the likelihood with and without :math:`\nu`.
+    Near its limits MuJoCo clamps the control and with it the noise: :math:`\mathrm{E}[\nu\nu^\top]` is what is left.
 
     Args:
-        simulation: with all effects found so far; its own random effects are left out.
+        simulation: with all effects found so far and no noise of its own.
         measured: the data.
 
     Returns:
         The estimate.
     """
-    fitted, judged = measured.fitted(), measured.judged()
-    states = start_states(simulation, measured, np.concatenate([fitted, judged]))
-    scale = np.nanmedian(np.abs(residuals(simulation, measured, fitted, states=states)[:, 0]), axis=0)
-    scale = 1.5 * np.maximum(scale, 1e-9 * measured.observation.std(0) + 1e-12)
-
-    def evidence(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        residual = residuals(simulation, measured, rows, states=states)[:, 0] / scale
-        by_action, by_sensor = derivatives(simulation, measured, rows, states)
-        whole = np.isfinite(residual).all(1) & np.isfinite(by_action).all((1, 2)) & np.isfinite(by_sensor).all((1, 2))
-        sensors = by_sensor[whole] * scale / scale[:, None]
-        return residual[whole], by_action[whole] / scale[:, None], sensors
-
-    residual, by_action, by_sensor = _calm(*evidence(fitted))
-    with_action = _variances(residual, by_action, by_sensor)
-    sensors_alone = _variances(residual, by_action[:, :, :0], by_sensor)
-    test = _calm(*evidence(judged))
-    gain = _log_likelihood(with_action, *test) - _log_likelihood(sensors_alone, test[0], test[1][:, :, :0], test[2])
+    fitted = _Evidence.of(simulation, measured, measured.fitted())
+    judged = _Evidence.of(simulation, measured, measured.judged(), fitted.scale)
+    (estimate, left_out), (silent, _) = _variances(fitted), _variances(fitted.without_action())
+    gain = _log_likelihood(estimate, judged) - _log_likelihood(silent, judged.without_action())
     low, high = simulation.model.actuator_ctrlrange.T
     reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
-    std = _before_clamping(np.sqrt(with_action[0]), executed_actions(simulation, measured)[fitted], low, high)
-    worth = std > _WORTH * reach and _share_of_action(with_action, by_action, by_sensor) > _SHARE
-    parts = [
-        _variances(*(values[rows] for values in (residual, by_action, by_sensor)))[0] for rows in _blocks(residual)
-    ]
-    spread = 1.96 * np.std(np.sqrt(parts), ddof=1) / np.sqrt(_BLOCKS) / (np.sqrt(with_action[0]) + 1e-12)
-    return NoiseEstimate(std, float(spread), p_value(gain) if worth else 1.0)
+    std = float(np.sqrt(estimate[0]))
+    worth = std > _WORTH * reach and _share_of_action(estimate, fitted) > _SHARE
+    half_width = 1.96 * np.sqrt(_BLOCKS - 1) * np.std(np.sqrt(left_out))
+    return NoiseEstimate(std, float(half_width), p_value(gain) if worth else 1.0)
 
 
-def _calm(residual: np.ndarray, by_action: np.ndarray, by_sensor: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The half of the transitions in which noise grows least: where contacts are near, no derivative holds."""
-    growth = (by_sensor**2).sum((1, 2))
-    rows = growth <= np.median(growth)
-    return residual[rows], by_action[rows], by_sensor[rows]
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """Residuals and what could have made them, (W), in the scale of each dimension; only calm transitions.
 
+    ``executed`` and ``limits`` are the actions and the control range, in their units.
+    """
 
-def _blocks(residual: np.ndarray) -> list[np.ndarray]:
-    return np.array_split(np.arange(len(residual)), _BLOCKS)
+    residual: np.ndarray
+    by_action: np.ndarray
+    by_sensor: np.ndarray
+    executed: np.ndarray
+    limits: np.ndarray
+    scale: np.ndarray
+
+    @classmethod
+    def of(
+        cls, simulation: Simulation, measured: Measured, rows: np.ndarray, scale: np.ndarray | None = None
+    ) -> _Evidence:
+        states = start_states(simulation, measured, rows)
+        residual = residuals(simulation, measured, rows, states=states)[:, 0]
+        by_action, by_sensor = derivatives(simulation, measured, rows, states)
+        whole = np.isfinite(residual).all(1) & np.isfinite(by_action).all((1, 2)) & np.isfinite(by_sensor).all((1, 2))
+        # the half in which noise grows least: where contacts are near, no derivative holds
+        growth = np.where(whole, (by_sensor**2).sum((1, 2)), np.inf)
+        calm = whole & (growth <= np.median(growth[whole]))
+        residual, by_action, by_sensor = residual[calm], by_action[calm], by_sensor[calm]
+        if scale is None:
+            smallest = 1e-9 * measured.observation.std(0) + 1e-12
+            scale = np.maximum(np.abs(residual).mean(0), smallest)
+        model = simulation.model
+        free = ~model.actuator_ctrllimited.astype(bool)
+        limits = np.where(free[:, None], [-np.inf, np.inf], model.actuator_ctrlrange)
+        executed = np.clip(executed_actions(simulation, measured)[rows][calm], *limits.T)
+        by_action, by_sensor = by_action / scale[:, None], by_sensor * scale / scale[:, None]
+        return cls(residual / scale, by_action, by_sensor, executed, limits, scale)
+
+    def without_action(self) -> _Evidence:
+        return replace(self, by_action=self.by_action[:, :, :0], executed=self.executed[:, :0], limits=self.limits[:0])
+
+    def rows(self, chosen: np.ndarray) -> _Evidence:
+        arrays = ("residual", "by_action", "by_sensor", "executed")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in arrays})
+
+    def clamped(self, std: float) -> np.ndarray:
+        """By the action, (W, n, nu), with noise of this size as it is left by the limits of the control."""
+        if std == 0.0 or not np.isfinite(self.limits).any():
+            return self.by_action
+        # the second moment of a normal number that is held between two limits; 40 deviations away there are none
+        low, high = (np.clip((limit - self.executed) / std, -40.0, 40.0) for limit in self.limits.T)
+        inside = norm.cdf(high) - norm.cdf(low) - high * norm.pdf(high) + low * norm.pdf(low)
+        left = inside + low**2 * norm.cdf(low) + high**2 * norm.sf(high)
+        return self.by_action * np.sqrt(np.maximum(left, 0.0))[:, None]
 
 
 def derivatives(
@@ -126,52 +158,77 @@ def derivatives(
     return np.stack(by_action, axis=-1), np.stack(by_sensor, axis=-1)
 
 
-def _before_clamping(std: float, actions: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    """The noise that scatters the control by so much once MuJoCo has clamped it to its range; no limits, no change."""
-    limited = high > low
-    if std == 0.0 or not limited.any():
-        return float(std)
-    draws = np.random.default_rng(0).standard_normal((16, *actions[:, limited].shape))
+def _variances(evidence: _Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """The variances of the action (one for all; 0 without derivatives by it) and of each sensor, (1 + n).
 
-    def clamped(noise: float) -> float:
-        inside = np.clip(actions[:, limited], low[limited], high[limited])
-        return np.sqrt(np.mean((np.clip(inside + noise * draws, low[limited], high[limited]) - inside) ** 2))
-
-    most = 20.0 * std
-    return float(brentq(lambda noise: clamped(noise) - std, 0.0, most) if clamped(most) > std else most)
-
-
-def _variances(residual: np.ndarray, by_action: np.ndarray, by_sensor: np.ndarray) -> np.ndarray:
-    """The variances of the action (one for all; 0 without derivatives by it) and of each sensor, (1 + n)."""
-    squares = np.minimum(residual**2, _FIRM)
-    of_action = (by_action**2).sum(-1)[..., None]
-    of_sensors = np.minimum(np.eye(residual.shape[1]) + by_sensor**2, 1e6)
-    design = np.concatenate([of_action, of_sensors], -1)
-    # twice: squares scatter with the variance that they estimate
-    weight = np.ones_like(squares)
-    for _ in range(3):
-        found, _ = nnls((design * weight[..., None]).reshape(-1, design.shape[-1]), (squares * weight).ravel())
-        weight = 1.0 / (design @ found + 1e-3)
-    return found
+    Beside them that of the action with one block of the data left out after the other, (blocks). By Fisher scoring: the
+    covariance of a residual is linear in the variances, and weighed by its own inverse.
+    """
+    found = np.zeros(1 + evidence.residual.shape[1])
+    for _ in range(_ITERATIONS):
+        inner, towards = _normal_equations(evidence, found)
+        found = _non_negative(inner.sum(0), towards.sum(0))
+    left_out = [
+        _non_negative(inner.sum(0) - one, towards.sum(0) - other)[0] for one, other in zip(inner, towards, strict=True)
+    ]
+    return found, np.array(left_out)
 
 
-def _share_of_action(variances: np.ndarray, by_action: np.ndarray, by_sensor: np.ndarray) -> float:
+def _normal_equations(evidence: _Evidence, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of one step of the scoring, for each block of the data: (blocks, 1 + n, 1 + n) and (blocks, 1 + n)."""
+    n = evidence.residual.shape[1]
+    covariance = (
+        _covariance(variances, evidence) if variances.any() else np.tile(np.eye(n), (len(evidence.residual), 1, 1))
+    )
+    inverse = np.linalg.inv(covariance)
+    whitened = (inverse @ evidence.residual[..., None])[..., 0]
+    distance = (whitened * evidence.residual).sum(-1)
+    # in how many directions noise could be seen at all
+    rank = np.maximum(1.0, n - _FLOOR * inverse.trace(axis1=1, axis2=2)) if variances.any() else n
+    most = chi2.ppf(_USUAL, rank)
+    trust = np.minimum(1.0, most / np.maximum(distance, 1e-12))
+    trust /= chi2.cdf(most, rank + 2.0) + (1.0 - _USUAL) * most / rank  # so that normal noise is not thought smaller
+    by_action = evidence.clamped(float(np.sqrt(variances[0])))
+    parts = np.empty((1 + n, len(inverse), n, n))
+    parts[0] = by_action @ by_action.swapaxes(1, 2)
+    by_sensor = evidence.by_sensor.transpose(2, 0, 1)
+    parts[1:] = by_sensor[..., None] * by_sensor[..., None, :]
+    parts[range(1, 1 + n), :, range(n), range(n)] += 1.0
+    weighed = inverse @ parts
+    inner = np.einsum("kwij,lwji->wkl", weighed, weighed, optimize=True)
+    towards = trust[:, None] * np.einsum("wi,kwij,wj->wk", whitened, parts, whitened, optimize=True)
+    blocks = np.array_split(np.arange(len(inverse)), _BLOCKS)
+    return np.array([inner[rows].sum(0) for rows in blocks]), np.array([towards[rows].sum(0) for rows in blocks])
+
+
+def _covariance(variances: np.ndarray, evidence: _Evidence) -> np.ndarray:
+    """Of each residual, (W, n, n)."""
+    by_action, by_sensor = evidence.clamped(float(np.sqrt(variances[0]))), evidence.by_sensor
+    return (
+        variances[0] * by_action @ by_action.swapaxes(1, 2)
+        + (by_sensor * variances[1:]) @ by_sensor.swapaxes(1, 2)
+        + np.diag(variances[1:] + _FLOOR)
+    )
+
+
+def _non_negative(inner: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """The least squares of normal equations, none of them negative."""
+    diagonal = np.diag(inner)
+    size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    root = np.linalg.cholesky(inner / np.outer(size, size) + 1e-12 * np.eye(len(inner)))
+    return nnls(root.T, np.linalg.solve(root, towards / size))[0] / size
+
+
+def _share_of_action(variances: np.ndarray, evidence: _Evidence) -> float:
     """The share of the scatter that is noise of the action, mean over the dimensions."""
-    of_action = variances[0] * (by_action**2).sum(-1)
-    of_sensors = variances[1:] + (by_sensor**2) @ variances[1:]
+    of_action = variances[0] * (evidence.clamped(float(np.sqrt(variances[0]))) ** 2).sum(-1)
+    of_sensors = variances[1:] + (evidence.by_sensor**2) @ variances[1:]
     return float(np.mean(of_action / (of_action + of_sensors + 1e-12)))
 
 
-def _log_likelihood(
-    variances: np.ndarray, residual: np.ndarray, by_action: np.ndarray, by_sensor: np.ndarray
-) -> np.ndarray:
+def _log_likelihood(variances: np.ndarray, evidence: _Evidence) -> np.ndarray:
     """Of each residual, (W), but for a constant."""
-    covariance = (
-        variances[0] * by_action @ by_action.swapaxes(1, 2)
-        + (by_sensor * variances[1:]) @ by_sensor.swapaxes(1, 2)
-        + np.diag(variances[1:] + 1e-3)
-    )
-    distance = (residual * np.linalg.solve(covariance, residual[..., None])[..., 0]).sum(-1)
+    covariance = _covariance(variances, evidence)
+    distance = (evidence.residual * np.linalg.solve(covariance, evidence.residual[..., None])[..., 0]).sum(-1)
     _, volume = np.linalg.slogdet(covariance)
-    # a Student's t of 4 degrees rather than a normal: contacts throw residuals far out
-    return -0.5 * volume - 0.5 * (4.0 + residual.shape[1]) * np.log1p(distance / 4.0)
+    return -0.5 * volume - 0.5 * (_TAILS + evidence.residual.shape[1]) * np.log1p(distance / _TAILS)

@@ -99,6 +99,7 @@ class Search:
             if exact or entries == grown:
                 break
             # an effect of many parameters may have stood in the way of what a simpler one leaves to be found
+        self._weigh_by(best.effects)
         best = self._fitted(entries, best.effects, self.all)
         names = {entry.name for entry in entries}
         tried = sorted(self.attempts.values(), key=lambda attempt: attempt.loss)
@@ -107,9 +108,8 @@ class Search:
 
     def _grown(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit, bool]:
         """Adds effects while that pays; beside them whether nothing is left but that data are single precision."""
-        while more := self._weigh(best):
-            if len(entries) >= _MOST:
-                break
+        entries, best, exact = self._weighed(entries, best)
+        while not exact and len(entries) < _MOST:
             leads = screen(self.problem, best.effects, self._others(entries), self.screened, self.progress.update)
             added = self._best_addition(entries, best, leads)
             if added is None:
@@ -120,8 +120,9 @@ class Search:
             known = {lead.entry.name: replace(lead.entry, trials=(dict(lead.trial),)) for lead in leads}
             self.catalogue = [known.get(entry.name, entry) for entry in self.catalogue]
             entries, best = self._eliminated(*added)
+            entries, best, exact = self._weighed(entries, best)
             self.progress.set_postfix_str(", ".join(entry.name for entry in entries))
-        return entries, best, not more
+        return entries, best, exact
 
     def _simplified(
         self, entries: list[CatalogueEntry], best: Fit
@@ -137,9 +138,16 @@ class Search:
         names = {entry.name for entry in entries}
         return [entry for entry in self.catalogue if entry.name not in names]
 
-    def _weigh(self, best: Fit) -> bool:
-        """Weighs residuals by the size that they have now; returns whether anything is left to explain."""
-        return not self._weigh_by(best.effects).within_rounding
+    def _weighed(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit, bool]:
+        """Weighs residuals by the size that they have now; beside the fit whether nothing is left to explain.
+
+        Where a better simulator gives other states to start from, what was fitted from the old ones is fitted anew.
+        """
+        states, posed = self.problem.states, self._weigh_by(best.effects)
+        if entries and not np.array_equal(states, posed.states):
+            entries, best = self._eliminated(entries, self._fitted(entries, best.effects))
+            posed = self._weigh_by(best.effects)
+        return entries, best, posed.within_rounding
 
     def _weigh_by(self, effects: Sequence[Effect]) -> Problem:
         """Weighs residuals by the size that they, and what sensor noise makes of them, have with some effects in."""
