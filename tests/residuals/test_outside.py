@@ -57,13 +57,16 @@ def test_what_the_simulator_lacks_is_no_push(simulation, effects):
     assert outside_rows(intervals, ROWS).mean() < 0.01
 
 
-@pytest.mark.xfail(reason="a limit that is hit two or three times in all cannot be told from a push yet")
-def test_a_limit_that_is_hit_now_and_then_is_no_push(tmp_path):
+RARE = pytest.mark.xfail(reason="two hits, both in held-out rows: no effect may be fitted to them, so they are set aside")
+
+
+@pytest.mark.parametrize("quantile", [0.7, pytest.param(0.97, marks=RARE)])
+def test_a_limit_that_is_hit_now_and_then_is_no_push(tmp_path, quantile):
     path = tmp_path / "stopped.xml"
     path.write_text(PENDULUM.read_text().replace('name="hinge" type', 'name="hinge" range="-50 50" type'))
     simulation = Simulation.from_mjcf(path, ["hinge", "hinge_velocity"], 0.005)
     free = swings(simulation, torque=0.3)
-    furthest = float(np.quantile(np.abs(free.observation[:, 0]), 0.97))
+    furthest = float(np.quantile(np.abs(free.observation[:, 0]), quantile))
     reality = simulation.with_effects(JointRange(furthest / 50.0))
     data = swings(reality, torque=0.3)
     assert np.abs(data.observation[:, 0]).max() < np.abs(free.observation[:, 0]).max()
