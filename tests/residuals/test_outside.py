@@ -57,7 +57,9 @@ def test_what_the_simulator_lacks_is_no_push(simulation, effects):
     assert outside_rows(intervals, ROWS).mean() < 0.01
 
 
-RARE = pytest.mark.xfail(reason="two hits, both in held-out rows: no effect may be fitted to them, so they are set aside")
+RARE = pytest.mark.xfail(
+    reason="two hits, both in held-out rows: no effect may be fitted to them, so they are set aside"
+)
 
 
 @pytest.mark.parametrize("quantile", [0.7, pytest.param(0.97, marks=RARE)])

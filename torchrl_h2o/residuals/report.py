@@ -92,13 +92,25 @@ class IndistinguishableGroup:
 
 @dataclass(frozen=True)
 class DimensionError:
-    """The held-out one-step error of one dimension, in its unit; ``floor`` None where none was estimated."""
+    """The held-out one-step error of one dimension.
+
+    Args:
+        name: of the dimension.
+        unit: of the errors.
+        before: without the effects.
+        after: with all of them.
+        floor: what the best possible model would leave, None where none was estimated.
+        autocorrelation: of the residual that is left, from one transition to the next: about 0 where it is white, down
+            to -0.5 where noise of the sensors is all of it, above 0 where the simulator still lacks something; None
+            where it was not looked at.
+    """
 
     name: str
     unit: str
     before: float
     after: float
     floor: float | None = None
+    autocorrelation: float | None = None
 
 
 @dataclass(frozen=True)

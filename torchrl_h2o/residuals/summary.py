@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import rankdata
 
 from torchrl_h2o.effects import ActionNoise, Effect
 from torchrl_h2o.residuals.chance import sensor_noise
@@ -27,6 +28,7 @@ from torchrl_h2o.residuals.report import (
 )
 from torchrl_h2o.residuals.residual import residuals
 from torchrl_h2o.residuals.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.separation import separated_by
 from torchrl_h2o.residuals.significance import IN_WORDS
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.two_sample import two_sample_auc
@@ -34,6 +36,7 @@ from torchrl_h2o.residuals.two_sample import two_sample_auc
 DISTURBED = "disturbed from outside"
 _METRIC = "held-out one-step RMSE, each dimension over the spread of its one-step change"
 _HORIZONS = (1, 2, 5, 10, 20, 50)  # control steps
+_ROUNDING = 1e-5  # of a dimension's spread: less is no residual
 _RANKED = 30  # rejected effects that the report lists
 
 
@@ -134,8 +137,36 @@ def error_summary(simulation: Simulation, mended: Simulation, measured: Measured
         before=_error(simulation, measured),
         after=_error(mended, measured),
         floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
-        per_dimension=tuple(map(DimensionError, names, units, before.tolist(), after.tolist(), floor.tolist())),
+        per_dimension=tuple(
+            map(
+                DimensionError,
+                names,
+                units,
+                *(values.tolist() for values in (before, after, floor, autocorrelation(mended, measured))),
+            )
+        ),
         horizons=tuple(horizons),
+    )
+
+
+def autocorrelation(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """How much the held-out one-step residual of a row says of the next row's, (n): about 0 where it is white.
+
+    Noise of the sensors makes it negative, down to -0.5: what a reading adds to one residual, it takes off the next.
+    What is left of the simulator's own errors makes it positive.
+
+    Returns:
+        The correlation of neighbours, by ranks (Spearman's), as single contacts would outweigh all else; NaN where no
+        more than rounding is left.
+    """
+    rows = measured.windows(2, held_out=True)
+    first, second = (residuals(simulation, measured, rows + later)[:, 0] for later in (0, 1))
+    left = np.abs(first).mean(0) > _ROUNDING * spread(measured) if len(rows) > 1 else np.zeros(first.shape[1], bool)
+    return np.array(
+        [
+            np.corrcoef(rankdata(a), rankdata(b))[0, 1] if some else np.nan
+            for a, b, some in zip(first.T, second.T, left, strict=True)
+        ]
     )
 
 
@@ -164,11 +195,8 @@ def _group(
     errors = [
         _error(simulation.with_effects(*effects[:index], other, *effects[index + 1 :]), measured) for other in alike
     ]
-    return IndistinguishableGroup(
-        alike,
-        tuple(errors),
-        "data in which their predictions differ: other speeds, loads or parts of the range; or measuring one of them",
-    )
+    others = [effect for i, effect in enumerate(effects) if i != index and not _scatters(effect)]
+    return IndistinguishableGroup(alike, tuple(errors), separated_by(simulation, measured, alike, others))
 
 
 def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:

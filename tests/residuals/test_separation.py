@@ -1,0 +1,41 @@
+"""What would tell effects apart: where their predictions differ, in words, or nothing if they never do."""
+
+import pytest
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import ActionDelay, ActionGain, JointDamping, JointFrictionLoss, ObservationDelay
+from torchrl_h2o.residuals.separation import separated_by
+
+SIMULATION = pendulum()
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return recorded(SIMULATION, 1000)
+
+
+def test_effects_that_differ_at_speed_are_told_apart_there(measured):
+    words = separated_by(SIMULATION, measured, (JointDamping(0.05), JointDamping(0.1)), [])
+    assert "differ most in elbow_velocity" in words
+    assert "where elbow_velocity is large" in words
+
+
+def test_the_size_of_the_difference_is_given_in_its_unit(measured):
+    words = separated_by(SIMULATION, measured, (ActionGain(1.0), ActionGain(1.0), ActionGain(0.5)), [])
+    assert "where action 0 is large" in words
+    assert " rad/s a step" in words
+
+
+def test_other_effects_stay_in_beside_each_alternative(measured):
+    """Of a motor that is dead, no gain can be told."""
+    alternatives = (ActionGain(1.0), ActionGain(1.1))
+    free = separated_by(SIMULATION, measured, alternatives, [])
+    dead = separated_by(SIMULATION, measured, alternatives, [ActionGain(0.0)])
+    assert "differ" in free
+    assert dead.startswith("nothing that these sensors read")
+
+
+def test_effects_that_predict_the_same_are_told_apart_by_nothing_that_is_read(measured):
+    alternatives = (ActionDelay(0.02), ObservationDelay(0.02))
+    assert separated_by(SIMULATION, measured, alternatives, []).startswith("nothing that these sensors read")
+    assert "differ" in separated_by(SIMULATION, measured, (*alternatives, JointFrictionLoss(0.1)), [])

@@ -1,0 +1,31 @@
+"""Whether the residual that is left is white: it is, or nearly, where nothing but noise is left."""
+
+import numpy as np
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import ActionNoise, Gravity
+from torchrl_h2o.residuals.summary import autocorrelation
+
+SIMULATION = pendulum()
+
+
+def test_noise_of_the_action_leaves_a_white_residual():
+    measured = recorded(SIMULATION.with_effects(ActionNoise(0.3)), 4000)
+    np.testing.assert_allclose(autocorrelation(SIMULATION, measured), 0.0, atol=0.1)
+
+
+def test_what_the_simulator_lacks_goes_on():
+    assert (autocorrelation(SIMULATION, recorded(SIMULATION.with_effects(Gravity(1.5)), 2000)) > 0.8).all()
+
+
+def test_what_noise_of_the_sensors_adds_it_takes_off_again():
+    found = autocorrelation(SIMULATION, recorded(SIMULATION, 4000, noise=0.02))
+    assert ((found > -0.6) & (found < -0.3)).all()
+
+
+def test_rounding_is_no_residual():
+    assert np.isnan(autocorrelation(SIMULATION, recorded(SIMULATION, 500))).all()
+
+
+def test_without_neighbours_there_is_none():
+    assert np.isnan(autocorrelation(SIMULATION, recorded(SIMULATION.with_effects(Gravity(1.5)), 4))).all()
