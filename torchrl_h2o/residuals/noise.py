@@ -24,7 +24,7 @@ _NUDGE = 1e-4  # of a spread, for finite differences
 _USUAL = 0.995  # of residuals, if normal: a larger one counts as no larger, as contacts throw some far out
 _TAILS = 4.0  # degrees of freedom of Student's t, that a residual is judged by: contacts again
 _WORTH = 1e-3  # of the control range: less action noise is not worth a word
-_SHARE = 0.15  # of the scatter: less could be sensor noise, which contacts throw far out, much as the action does
+_FIRM = 3.0  # half widths of its interval: less could be sensor noise, which contacts throw far out too
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +60,14 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     fitted = _Evidence.of(simulation, measured, measured.fitted())
     judged = _Evidence.of(simulation, measured, measured.judged(), fitted.scale)
     (estimate, left_out), (silent, _) = _variances(fitted), _variances(fitted.without_action())
-    gain = _log_likelihood(estimate, judged) - _log_likelihood(silent, judged.without_action())
+    std = float(np.sqrt(estimate[0]))
+    half_width = float(1.96 * np.sqrt(_BLOCKS - 1) * np.std(np.sqrt(left_out)))
     low, high = simulation.model.actuator_ctrlrange.T
     reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
-    std = float(np.sqrt(estimate[0]))
-    worth = std > _WORTH * reach and _share_of_action(estimate, fitted) > _SHARE
-    half_width = 1.96 * np.sqrt(_BLOCKS - 1) * np.std(np.sqrt(left_out))
-    return NoiseEstimate(std, float(half_width), p_value(gain) if worth else 1.0)
+    if std < max(_WORTH * reach, _FIRM * half_width):
+        return NoiseEstimate(std, half_width, 1.0)
+    gain = _log_likelihood(estimate, judged) - _log_likelihood(silent, judged.without_action())
+    return NoiseEstimate(std, half_width, p_value(gain))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,13 +218,6 @@ def _non_negative(inner: np.ndarray, towards: np.ndarray) -> np.ndarray:
     size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     root = np.linalg.cholesky(inner / np.outer(size, size) + 1e-12 * np.eye(len(inner)))
     return nnls(root.T, np.linalg.solve(root, towards / size))[0] / size
-
-
-def _share_of_action(variances: np.ndarray, evidence: _Evidence) -> float:
-    """The share of the scatter that is noise of the action, mean over the dimensions."""
-    of_action = variances[0] * (evidence.clamped(float(np.sqrt(variances[0]))) ** 2).sum(-1)
-    of_sensors = variances[1:] + (evidence.by_sensor**2) @ variances[1:]
-    return float(np.mean(of_action / (of_action + of_sensors + 1e-12)))
 
 
 def _log_likelihood(variances: np.ndarray, evidence: _Evidence) -> np.ndarray:
