@@ -38,19 +38,15 @@ class Linearised:
     @classmethod
     def about(cls, simulation: Simulation, measured: Measured) -> Linearised:
         """Linearises the simulation about every measured row, in one batch."""
-        state_map, states = simulation.state_map, start_states(simulation, measured)
-        observed = state_map.observations(states)
+        states = start_states(simulation, measured)
+        observed = simulation.state_map.observations(states)
         spread = np.nanstd(observed, axis=0)
         spread = np.where(spread > 0.0, spread, 1.0)
-        directions = _NUDGE * spread * state_map.restore
-        begun = np.concatenate([states, *(states + direction for direction in directions.T)])
-        copies = len(begun) // len(states)
-        actions = np.tile(executed_actions(simulation, measured), (copies, 1))
-        reached = simulation.rollout(begun, actions[:, None], time=np.tile(measured.time, copies))[:, 0]
-        reached = (state_map.observations(reached) / spread).reshape(copies, *observed.shape)
-        slope = np.moveaxis(reached[1:] - reached[0], 0, -1) / _NUDGE
+        actions = executed_actions(simulation, measured)
+        reached, slope = one_step(simulation, states, actions, measured.time, _NUDGE * spread)
+        slope = slope * spread / spread[:, None]
         follows = np.append(measured.run[1:] == measured.run[:-1], False)
-        return cls(spread, observed / spread, reached[0], slope, follows, states)
+        return cls(spread, observed / spread, reached / spread, slope, follows, states)
 
     @property
     def known(self) -> np.ndarray:
@@ -66,3 +62,26 @@ class Linearised:
         """
         correction = np.nan_to_num(estimate - self.observed) * self.spread
         return self.states + correction @ state_map.restore.T
+
+
+def one_step(
+    simulation: Simulation, states: np.ndarray, actions: np.ndarray, time: np.ndarray, nudge: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is observed after one control step, and how that changes with what was observed before, by differences.
+
+    Args:
+        simulation: the simulator.
+        states: (B, nq + nv), to start from.
+        actions: (B, nu), as executed.
+        time: (B), of the start, in s.
+        nudge: (n), the steps of the differences, in the units of the observations.
+
+    Returns:
+        Observations (B, n), and their derivatives by those before (B, n, n); NaN where the simulation diverges.
+    """
+    steps = nudge * simulation.state_map.restore
+    begun = np.concatenate([states, *(states + step for step in steps.T)])
+    copies = 1 + len(nudge)
+    reached = simulation.rollout(begun, np.tile(actions, (copies, 1))[:, None], time=np.tile(time, copies))[:, 0]
+    reached = simulation.state_map.observations(reached).reshape(copies, len(states), -1)
+    return reached[0], np.moveaxis(reached[1:] - reached[0], 0, -1) / nudge

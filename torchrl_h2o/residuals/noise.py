@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import chi2, norm
 
+from torchrl_h2o.residuals.linearised import one_step
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.residual import executed_actions, residuals, start_states
 from torchrl_h2o.residuals.significance import p_value
@@ -138,25 +139,17 @@ def derivatives(
     Returns:
         By the executed action, (W, n, nu), and by the observation before, (W, n, n), in their units.
     """
-    actions, start, state_map = executed_actions(simulation, measured)[rows], states[rows], simulation.state_map
-
-    def observed(start: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        reached = simulation.rollout(start, actions[:, None], time=measured.time[rows])
-        return state_map.observations(reached[:, 0])
-
-    base = observed(start, actions)
+    start, actions, time = states[rows], executed_actions(simulation, measured)[rows], measured.time[rows]
+    base, by_sensor = one_step(simulation, start, actions, time, _NUDGE * (measured.observation.std(0) + 1e-9))
     by_action = []
     for index in range(actions.shape[1]):
         # inwards: at the end of the control range nothing would move
         step = np.zeros_like(actions)
         size = _NUDGE * (np.abs(actions[:, index]).max() + 1e-6)
         step[:, index] = np.where(actions[:, index] > 0.0, -size, size)
-        by_action.append((observed(start, actions + step) - base) / step[:, index, None])
-    by_sensor = []
-    for index, spread in enumerate(measured.observation.std(0) + 1e-9):
-        step = _NUDGE * spread * state_map.restore[:, index]
-        by_sensor.append((observed(start + step, actions) - base) / (_NUDGE * spread))
-    return np.stack(by_action, axis=-1), np.stack(by_sensor, axis=-1)
+        reached = simulation.rollout(start, (actions + step)[:, None], time=time)[:, 0]
+        by_action.append((simulation.state_map.observations(reached) - base) / step[:, index, None])
+    return np.stack(by_action, axis=-1), by_sensor
 
 
 def _variances(evidence: _Evidence) -> tuple[np.ndarray, np.ndarray]:

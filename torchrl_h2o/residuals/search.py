@@ -295,7 +295,10 @@ class Search:
         """Which other entries do as well as one of those found, in its place."""
         kept = [effect for i, effect in enumerate(best.effects) if i != index]
         self._weigh_by(kept)
-        with_it, without = self._held_out(best.effects), self._held_out(kept).mean()
+        with_it = self._held_out(best.effects)
+        explained = self._held_out(kept).mean() - with_it.mean()
+        if explained <= 0.0:
+            return ()  # what explains nothing has no equals
         few_with_it, few_without = (
             losses(self.problem.residual(e, self.screened)).mean() for e in (best.effects, kept)
         )
@@ -311,7 +314,7 @@ class Search:
             candidate = self._fitted(instead, start.effects)
             after = self._held_out(candidate.effects)
             p = p_value(after - with_it)
-            worse = (after.mean() - with_it.mean()) / (without - with_it.mean())
+            worse = (after.mean() - with_it.mean()) / explained
             if worse < _SAME or (worse < _ALIKE and p > _LEVEL):
                 as_good.append(Attempt(lead.entry, candidate, index, float(after.mean()), p))
         return tuple(sorted(as_good, key=lambda attempt: attempt.loss))
