@@ -165,11 +165,15 @@ def _floats(entries: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
-    """An instance of a dataclass: what was read already, and the rest as it stands in the entry."""
-    values = {field.name: read.get(field.name, entry.get(field.name)) for field in dataclasses.fields(cls)}
-    missing = [name for name in values if name not in read and name not in entry]
-    if missing:
-        raise KeyError(missing[0])
+    """An instance of a dataclass: what was read already, and the rest as it stands in the entry.
+
+    An earlier version's entry may lack what has a default.
+    """
+    there = {**entry, **read}
+    values = {}
+    for field in dataclasses.fields(cls):
+        if field.name in there or field.default is dataclasses.MISSING:
+            values[field.name] = there[field.name]
     floats = {field.name for field in dataclasses.fields(cls) if field.type is float}
     return cls(**{name: _float(value) if name in floats else value for name, value in values.items()})
 
