@@ -22,7 +22,7 @@ def test_effects_that_differ_at_speed_are_told_apart_there(measured):
 
 def test_the_size_of_the_difference_is_given_in_its_unit(measured):
     words = separated_by(SIMULATION, measured, (ActionGain(1.0), ActionGain(1.0), ActionGain(0.5)), [])
-    assert "where action 0 is large" in words
+    assert "where the action of" in words
     assert " rad/s a step" in words
 
 

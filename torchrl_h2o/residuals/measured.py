@@ -66,8 +66,7 @@ class Measured:
         observation, action = _float64(data["observation"]), _float64(data["action"])
         following = _float64(data["next", "observation"])
         _require_width(observation, simulation.state_map.names, "observation", source)
-        actuators = [simulation.model.actuator(i).name or f"actuator {i}" for i in range(simulation.model.nu)]
-        _require_width(action, actuators, "action", source)
+        _require_width(action, simulation.actuators, "action", source)
         ends = data["next", "done"].flatten().numpy()
         breaks = ends[:-1] | (following[:-1] != observation[1:]).any(1)
         run = np.concatenate([[0], np.cumsum(breaks)])

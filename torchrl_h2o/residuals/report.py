@@ -22,23 +22,25 @@ class FoundEffect:
         declared: whether it is an entry of the catalogue; else it was made from the residual.
         ci95: the 95 % interval of each parameter by name, (low, high) in the parameter's unit.
         error_after: the held-out error with the effects up to this one in, in the summary's unit.
+        words: what the effect does, with units; by default those of the effect, without the names that a simulator
+            gives to its sensors and actuators. One that no catalogue holds is marked so.
     """
 
     effect: Effect
     declared: bool
     ci95: Mapping[str, tuple[float, float]]
     error_after: float
+    words: str = ""
+
+    def __post_init__(self):
+        if not self.words:
+            words = report_words.effect_words(self.effect)
+            object.__setattr__(self, "words", words if self.declared else f"{report_words.UNDECLARED}: {words}")
 
     @property
     def name(self) -> str:
         """The effect's class and what it acts on: ``"BodyMass[torso]"``."""
         return report_words.effect_name(self.effect)
-
-    @property
-    def words(self) -> str:
-        """What the effect does, in words with units; one that no catalogue holds is marked so."""
-        words = report_words.effect_words(self.effect)
-        return words if self.declared else f"not on any list: {words}"
 
 
 @dataclass(frozen=True)
@@ -50,22 +52,23 @@ class RejectedEffect:
         error_after: the held-out error with it put in, in the summary's unit; not finite if it diverged.
         p_value: how likely chance alone explains as much, None where no test was made.
         reason: why it was not put in: "explains no more than chance".
+        words: what the effect does, with units; by default those of the effect.
     """
 
     effect: Effect
     error_after: float
     p_value: float | None
     reason: str
+    words: str = ""
+
+    def __post_init__(self):
+        if not self.words:
+            object.__setattr__(self, "words", report_words.effect_words(self.effect))
 
     @property
     def name(self) -> str:
         """The effect's class and what it acts on."""
         return report_words.effect_name(self.effect)
-
-    @property
-    def words(self) -> str:
-        """What the effect does, in words with units."""
-        return report_words.effect_words(self.effect)
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,7 @@ class IndistinguishableGroup:
         effects: the effects, each at its best fit; the first is the one put in.
         errors: the held-out error with each of them in place of the first, in the summary's unit.
         separated_by: which data would tell them apart.
+        words: what each of them does, with units; by default those of the effects.
 
     Raises:
         ValueError: if there is not one error for each effect.
@@ -84,10 +88,13 @@ class IndistinguishableGroup:
     effects: tuple[Effect, ...]
     errors: tuple[float, ...]
     separated_by: str
+    words: tuple[str, ...] = ()
 
     def __post_init__(self):
         if len(self.effects) != len(self.errors):
             raise ValueError(f"a group of {len(self.effects)} effects has {len(self.errors)} errors; give one for each")
+        if not self.words:
+            object.__setattr__(self, "words", tuple(map(report_words.effect_words, self.effects)))
 
 
 @dataclass(frozen=True)

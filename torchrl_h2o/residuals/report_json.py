@@ -23,7 +23,7 @@ from torchrl_h2o.residuals.report import (
     Report,
     TwoSample,
 )
-from torchrl_h2o.residuals.report_words import effect_name, effect_words
+from torchrl_h2o.residuals.report_words import effect_name
 from torchrl_h2o.residuals.residual_trace import ResidualTrace
 
 FILE = "report.json"
@@ -69,8 +69,8 @@ def report_to_json(report: Report) -> dict[str, Any]:
             "indistinguishable": [
                 {
                     "effects": [
-                        {"name": effect_name(effect), "error": error, "effect": effect_to_dict(effect)}
-                        for effect, error in zip(group.effects, group.errors, strict=True)
+                        {"name": effect_name(effect), "words": words, "error": error, "effect": effect_to_dict(effect)}
+                        for effect, error, words in zip(group.effects, group.errors, group.words, strict=True)
                     ],
                     "separated_by": group.separated_by,
                 }
@@ -118,7 +118,6 @@ def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict
     ci95 = rest.pop("ci95", {})
     return {
         "name": effect_name(effect),
-        "words": effect_words(effect),
         "parameters": {
             name: {"value": parameter.value, "unit": parameter.unit, "ci95": ci95.get(name)}
             for name, parameter in effect.parameters.items()
@@ -191,6 +190,7 @@ def _group(entry: Mapping[str, Any]) -> IndistinguishableGroup:
         effects=tuple(effect_from_dict(member["effect"]) for member in members),
         errors=tuple(_float(member["error"]) for member in members),
         separated_by=entry["separated_by"],
+        words=tuple(member["words"] for member in members if "words" in member),
     )
 
 

@@ -12,7 +12,6 @@ from torchrl_h2o.residuals import report_plots
 from torchrl_h2o.residuals.report import FoundEffect, Report
 from torchrl_h2o.residuals.report_words import (
     change,
-    effect_words,
     interval,
     interval_digits,
     number,
@@ -58,7 +57,7 @@ def report_page(report: Report) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "quantity": quantity, "in_words": effect_words}
+    environment.filters |= {"number": number, "quantity": quantity}
     return environment.get_template(_TEMPLATE).render(
         report=report,
         change=change,

@@ -51,8 +51,8 @@ def separated_by(simulation: Simulation, measured: Measured, effects: tuple[Effe
 def _where(simulation: Simulation, measured: Measured, rows: np.ndarray, size: np.ndarray, most: np.ndarray) -> str:
     """At which state or action, in words; nothing where no single one tells."""
     coordinates = np.abs(np.hstack([measured.observation[rows], measured.action[rows]]))
-    names = [*simulation.state_map.names, *(f"action {i}" for i in range(measured.action.shape[1]))]
-    units = [*simulation.state_map.units, *("1" for _ in range(measured.action.shape[1]))]
+    names = [*simulation.state_map.names, *(f"the action of actuator {name}" for name in simulation.actuators)]
+    units = [*simulation.state_map.units, *("1" for _ in simulation.actuators)]
     moving = coordinates.std(0) > 0.0
     ranks, size_ranks = rankdata(coordinates[:, moving], axis=0), rankdata(size)
     telling = np.zeros(len(names))

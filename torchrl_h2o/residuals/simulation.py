@@ -109,6 +109,11 @@ class Simulation:
         """The time between two actions, in s."""
         return self.frame_skip * self.model.opt.timestep
 
+    @property
+    def actuators(self) -> tuple[str, ...]:
+        """The names of the action's entries, their indices where they have none."""
+        return tuple(self.model.actuator(i).name or str(i) for i in range(self.model.nu))
+
     @cached_property
     def _data(self) -> list[mujoco.MjData]:
         return [mujoco.MjData(self.model) for _ in range(max(1, self._pool.nthread))]

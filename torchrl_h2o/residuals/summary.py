@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy.stats import rankdata
@@ -26,6 +27,7 @@ from torchrl_h2o.residuals.report import (
     Report,
     TwoSample,
 )
+from torchrl_h2o.residuals.report_words import UNDECLARED, effect_words
 from torchrl_h2o.residuals.residual import residuals
 from torchrl_h2o.residuals.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.separation import separated_by
@@ -63,6 +65,7 @@ def summarise(
     mended = simulation.with_effects(*(effect for effect in effects if not _scatters(effect)))
     sensor_std = sensor_noise(mended, measured)
     alike = {attempt.entry.name for group in trace.groups for attempt in group}
+    in_words = partial(effect_words, sensors=simulation.state_map.names, actuators=simulation.actuators)
     return Report(
         simulator=simulation.name,
         data=DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out),
@@ -73,6 +76,7 @@ def summarise(
                 part.declared,
                 part.ci95,
                 _error(simulation.with_effects(*(e for e in effects[: index + 1] if not _scatters(e))), measured),
+                in_words(part.effect) if part.declared else f"{UNDECLARED}: {in_words(part.effect)}",
             )
             for index, part in enumerate(explanation.parts)
         ),
@@ -84,12 +88,13 @@ def summarise(
                 "as good as one that was put in"
                 if attempt.entry.name in alike
                 else "explains less, or no more than chance",
+                in_words(attempt.effect),
             )
             for attempt in trace.attempts[:_RANKED]
             if attempt.entry.name not in {entry.name for entry in trace.entries}
         ),
         indistinguishable=tuple(
-            _group(simulation, measured, effects, index, part.alike)
+            _group(simulation, measured, effects, index, part.alike, in_words)
             for index, part in enumerate(explanation.parts)
             if part.alike
         ),
@@ -189,14 +194,20 @@ def _error(simulation: Simulation, measured: Measured) -> float:
 
 
 def _group(
-    simulation: Simulation, measured: Measured, effects: tuple[Effect, ...], index: int, others: tuple[Effect, ...]
+    simulation: Simulation,
+    measured: Measured,
+    effects: tuple[Effect, ...],
+    index: int,
+    others: tuple[Effect, ...],
+    in_words: Callable[[Effect], str],
 ) -> IndistinguishableGroup:
     alike = (effects[index], *others)
     errors = [
         _error(simulation.with_effects(*effects[:index], other, *effects[index + 1 :]), measured) for other in alike
     ]
     others = [effect for i, effect in enumerate(effects) if i != index and not _scatters(effect)]
-    return IndistinguishableGroup(alike, tuple(errors), separated_by(simulation, measured, alike, others))
+    words = tuple(map(in_words, alike))
+    return IndistinguishableGroup(alike, tuple(errors), separated_by(simulation, measured, alike, others), words)
 
 
 def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:

@@ -18,7 +18,6 @@ from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.sparse_force import SparseForce, sparse_force
 from torchrl_h2o.residuals.terms import TermLibrary
 
-IN_WORDS = "a one-sided t-test on the held-out loss, one and five steps ahead, paired over blocks of neighbours, at 1 %"
 _LEVEL = 0.01
 _PAYS = 0.01  # share of the held-out loss that all terms must take away
 _ADDS = 0.002  # share of the loss that a round of terms must take away, and that a term may not cost when taken out
@@ -57,9 +56,9 @@ def find_undeclared(
 
     The residual is read as a force on each degree of freedom and regressed, sparsely, on a library of terms. The terms
     found are then fitted in the simulation, to the residual itself, and those that are not needed are taken out. The
-    result must pay on held-out data: a one-sided t-test, paired over blocks of neighbouring transitions, at 1 %, and at
-    least 1 % of the loss, one step ahead and further. Further, because noise of the sensors has a bias one step ahead
-    that terms can imitate: they pay there, and do harm where the simulation runs on.
+    result must pay on held-out data: two one-sided tests, paired over blocks of neighbouring transitions, at 1 %, and
+    at least 1 % of the loss, one step ahead and further. Further, because noise of the sensors has a bias one step
+    ahead that terms can imitate: they pay there, and do harm where the simulation runs on.
 
     Args:
         simulation: with all effects found so far.
