@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import chi2, norm
 
+from torchrl_h2o.residuals.chance import sensor_noise, stand_in
 from torchrl_h2o.residuals.linearised import one_step
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.residual import executed_actions, residuals, start_states
@@ -25,7 +26,8 @@ _NUDGE = 1e-4  # of a spread, for finite differences
 _USUAL = 0.995  # of residuals, if normal: a larger one counts as no larger, as contacts throw some far out
 _TAILS = 4.0  # degrees of freedom of Student's t, that a residual is judged by: contacts again
 _WORTH = 1e-3  # of the control range: less action noise is not worth a word
-_FIRM = 3.0  # half widths of its interval: less could be sensor noise, which contacts throw far out too
+_FIRM = 3.0  # half widths of its interval: less is not clear enough, blocks share what they get wrong
+_BEYOND_SENSORS = 3.0  # times what noise of the sensors alone looks like, which contacts throw far out too
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     half_width = float(1.96 * np.sqrt(_BLOCKS - 1) * np.std(np.sqrt(left_out)))
     low, high = simulation.model.actuator_ctrlrange.T
     reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
-    if std < max(_WORTH * reach, _FIRM * half_width):
+    if std < max(_WORTH * reach, _FIRM * half_width) or std < _BEYOND_SENSORS * _by_sensors_alone(simulation, measured):
         return NoiseEstimate(std, half_width, 1.0)
     gain = _log_likelihood(estimate, judged) - _log_likelihood(silent, judged.without_action())
     return NoiseEstimate(std, half_width, p_value(gain))
@@ -203,6 +205,16 @@ def _covariance(variances: np.ndarray, evidence: _Evidence) -> np.ndarray:
         + (by_sensor * variances[1:]) @ by_sensor.swapaxes(1, 2)
         + np.diag(variances[1:] + _FLOOR)
     )
+
+
+def _by_sensors_alone(simulation: Simulation, measured: Measured) -> float:
+    """What would be taken for noise of the action if nothing but the sensors' were there, a standard deviation."""
+    sensor_std = sensor_noise(simulation, measured)
+    if sensor_std is None:
+        return 0.0
+    data = stand_in(simulation, measured, sensor_std, np.random.default_rng(0))
+    found, _ = _variances(_Evidence.of(simulation, data, measured.fitted()))
+    return float(np.sqrt(found[0]))
 
 
 def _non_negative(inner: np.ndarray, towards: np.ndarray) -> np.ndarray:
