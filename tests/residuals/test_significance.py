@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.significance import p_value, p_value_of_losses
 
 
 def noise(seed, windows=300, memory=0.0):
@@ -58,3 +58,41 @@ def test_the_unit_of_the_loss_does_not_matter_and_a_gain_one_way_is_none_the_oth
     gain = noise(seed, windows)
     assert p_value(scale * gain) == pytest.approx(p_value(gain), abs=1e-9)
     assert p_value(gain) + p_value(-gain) >= 1.0 - 1e-9
+
+
+def robust(residual):
+    return np.sqrt(1.0 + residual**2).mean(1) - 1.0
+
+
+@pytest.mark.parametrize("dimensions", [1, 3])
+@pytest.mark.parametrize("change", [0.1, 1.0, 10.0])
+def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_be(dimensions, change):
+    """Residuals of very different sizes, moved by what has nothing to do with them."""
+    significant = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        size = np.exp(2.0 * rng.standard_normal((300, 1)))
+        residual, moved = (size * rng.standard_normal((300, dimensions)) for _ in range(2))
+        significant += p_value_of_losses(robust(residual), robust(residual + change * moved)) < 0.02
+    assert stats.binomtest(significant, 200, 0.02, alternative="greater").pvalue > 0.01
+
+
+def test_what_vanishes_now_and_then_is_seen():
+    """In three blocks of thirty: tests on means cannot tell that from chance."""
+    before, after = np.full(300, 1e-9), np.full(300, 1e-9)
+    before[[5, 6, 7, 105, 106, 205]] = 5.0
+    assert p_value(before - after) > 0.01
+    assert p_value_of_losses(before, after) < 1e-5
+
+
+def test_what_shrinks_now_and_then_by_a_little_is_not():
+    before, after = np.full(300, 1e-9), np.full(300, 1e-9)
+    before[[5, 105, 205]], after[[5, 105, 205]] = 5.0, 2.0
+    assert p_value_of_losses(before, after) > 0.01
+
+
+def test_losses_that_stay_or_grow_prove_nothing():
+    same = np.abs(noise(0))
+    assert p_value_of_losses(same, same) == 1.0
+    assert p_value_of_losses(same, 2.0 * same) > 0.99
+    assert p_value_of_losses(np.zeros(40), np.zeros(40)) == 1.0

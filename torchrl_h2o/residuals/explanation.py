@@ -17,7 +17,7 @@ from torchrl_h2o.residuals.noise import estimate_noise
 from torchrl_h2o.residuals.problem import Problem, losses
 from torchrl_h2o.residuals.screening import free_parameters
 from torchrl_h2o.residuals.search import trace_effects
-from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.significance import p_value_of_losses
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.trace import Trace
 from torchrl_h2o.residuals.undeclared import Undeclared, find_undeclared
@@ -126,7 +126,7 @@ def _with_undeclared(
         if known:
             candidate = _found_anew(simulation, measured, _needed(problem, trace, candidate))
         after = loss(candidate)
-        pays = after.mean() < (1.0 - _PAYS) * before.mean() and p_value(before - after) < _LEVEL
+        pays = after.mean() < (1.0 - _PAYS) * before.mean() and p_value_of_losses(before, after) < _LEVEL
         if pays and matters(parts, candidate) and _beyond_noise(force, base, measured, rng):
             paying.append((candidate, after))
     if not paying:
@@ -183,7 +183,7 @@ def _needed(problem: Problem, trace: Trace, parts: list[Part]) -> list[Part]:
     for index in range(len(parts) - 1):
         rest = [i for i in chosen if i != index]
         candidate, after = refitted(rest)
-        if after.mean() < lowest.mean() / (1.0 - _PAYS) or p_value(after - lowest) > _LEVEL:
+        if after.mean() < lowest.mean() / (1.0 - _PAYS) or p_value_of_losses(after, lowest) > _LEVEL:
             chosen, best, lowest = rest, candidate, after
     return best
 

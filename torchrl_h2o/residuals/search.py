@@ -15,12 +15,13 @@ from torchrl_h2o.residuals.horizon import choose_horizon
 from torchrl_h2o.residuals.measured import Measured, thinned
 from torchrl_h2o.residuals.problem import Problem, losses
 from torchrl_h2o.residuals.screening import Lead, free_parameters, is_possible, promising_sets, screen
-from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.significance import p_value_of_losses
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.trace import Attempt, Trace
 
 _LEVEL = 0.01  # of the whole search, divided by the number of entries
 _PAYS = 0.002  # share of the held-out loss that an effect must take away to be worth a word
+_PAYS_UNDER_NOISE = 0.02  # the same where sensors are noisy: start states that are a little wrong look like an effect
 _WORTH_A_WORD = 0.003  # of what all effects explain together
 _SCREENED = 400  # control steps, in windows of any length
 _FEWEST = 100  # windows
@@ -180,6 +181,7 @@ class Search:
         Several are added at once where they explain clearly more than fewer do.
         """
         before = self._held_out(best.effects)
+        least = _PAYS if self.problem.sensor_std is None else _PAYS_UNDER_NOISE
         winner, added, lowest, base = None, 0, before, best.effects
         for size, finalists in enumerate(self._finalists(best, leads), start=1):
             if len(entries) + size > _MOST:
@@ -188,8 +190,8 @@ class Search:
                 together = [*entries, *(lead.entry for lead in chosen)]
                 candidate = self._fitted(together, start.effects)
                 after = self._held_out(candidate.effects)
-                p = p_value(lowest - after)
-                pays = after.mean() < (1.0 - _PAYS) * lowest.mean() and p < _LEVEL / len(self.catalogue)
+                p = p_value_of_losses(lowest, after)
+                pays = after.mean() < (1.0 - least) * lowest.mean() and p < _LEVEL / len(self.catalogue)
                 if pays and self._matters(base, candidate.effects, size - added):
                     winner, added, lowest, base = (together, candidate), size, after, candidate.effects
         if winner is None:
@@ -226,7 +228,7 @@ class Search:
         before = self._held_out(best.effects)
         for (lead,), sketch in sketches:
             after = self._held_out(sketch.effects)
-            p = p_value(before - after)
+            p = p_value_of_losses(before, after)
             self.attempts[lead.entry.name] = Attempt(lead.entry, sketch, len(best.effects), float(after.mean()), p)
 
     def _possible(self, best: Fit, chosen: Sequence[Lead]) -> bool:
@@ -264,7 +266,7 @@ class Search:
                 kept = [effect for i, effect in enumerate(best.effects) if i != index]
                 candidate = self._fitted(rest, kept)
                 after = self._held_out(candidate.effects)
-                needed = after.mean() > before.mean() / (1.0 - _PAYS) and p_value(after - before) < _LEVEL
+                needed = after.mean() > before.mean() / (1.0 - _PAYS) and p_value_of_losses(after, before) < _LEVEL
                 if not needed:
                     entries, best, removed = rest, candidate, True
                     break
@@ -313,7 +315,7 @@ class Search:
                 continue
             candidate = self._fitted(instead, start.effects)
             after = self._held_out(candidate.effects)
-            p = p_value(after - with_it)
+            p = p_value_of_losses(after, with_it)
             worse = (after.mean() - with_it.mean()) / explained
             if worse < _SAME or (worse < _ALIKE and p > _LEVEL):
                 as_good.append(Attempt(lead.entry, candidate, index, float(after.mean()), p))

@@ -13,7 +13,7 @@ from torchrl_h2o.residuals.fit import Fit, fit
 from torchrl_h2o.residuals.forces import force_response, residual_forces, step_path
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.problem import Problem, losses
-from torchrl_h2o.residuals.significance import p_value
+from torchrl_h2o.residuals.significance import p_value_of_losses
 from torchrl_h2o.residuals.simulation import Simulation
 from torchrl_h2o.residuals.sparse_force import SparseForce, sparse_force
 from torchrl_h2o.residuals.terms import TermLibrary
@@ -78,7 +78,7 @@ def find_undeclared(
     judged = measured.judged()
     before, after = problem.residual((), judged), problem.residual(found.effects, judged)
     gain = losses(before) - losses(after)
-    p = max(p_value(gain), search.chance_further((), found.effects, held_out=True))
+    p = max(p_value_of_losses(losses(before), losses(after)), search.chance_further((), found.effects, held_out=True))
     if p > _LEVEL or gain.mean() < _PAYS * losses(before).mean():
         return None
     size = problem.scale_of(judged)
@@ -129,7 +129,7 @@ class _Search:
         """How likely chance alone makes one force better than another, some steps ahead."""
         measured = self.problem.measured
         starts = measured.judged(_FURTHER) if held_out else measured.fitted(_FURTHER)
-        return p_value(losses(self.further.residual(before, starts)) - losses(self.further.residual(after, starts)))
+        return p_value_of_losses(*(losses(self.further.residual(forces, starts)) for forces in (before, after)))
 
     def _added(self, effect: ResidualForce, barred: set[str]) -> SparseForce:
         """The terms, on one degree of freedom, that explain most of what an effect leaves."""
