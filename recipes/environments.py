@@ -4,7 +4,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, ObservationNorm, TransformedEnv
+from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, ObservationNorm, TransformedEnv
 
 from torchrl_h2o.effects import Effect, paper_gap
 from torchrl_h2o.envs import DynamicsGap
@@ -49,6 +49,8 @@ def _make(cfg: DictConfig, effects: list, raw: bool, kwargs: dict) -> EnvBase:
     transforms = [DynamicsGap(*effects), DoubleToFloat()]
     if cfg.observation_norm is not None and not raw:
         transforms.append(ObservationNorm(**_norm(cfg), in_keys=["observation"], standard_normal=True))
+    if _frames(cfg) > 1 and not raw:
+        transforms.append(CatFrames(N=_frames(cfg), dim=-1, in_keys=["observation"]))
     return TransformedEnv(instantiate(cfg.env.make, **kwargs), Compose(*transforms))
 
 
@@ -61,19 +63,27 @@ def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:
 
 
 def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
-    """The real transitions as the learner sees them: observations normalised, rewards shifted and scaled."""
+    """The real transitions as the learner sees them: observations normalised and stacked, rewards scaled."""
     real = real.copy()
     real["next"] = real["next"].copy().set("reward", learning_reward(cfg, real["next", "reward"]))
     if cfg.observation_norm is not None:
         norm = _norm(cfg)
         for part in (real, real["next"]):
             part["observation"] = (part["observation"] - norm["loc"]) / norm["scale"]
+    if _frames(cfg) > 1:
+        both = CatFrames(N=_frames(cfg), dim=-1, in_keys=["observation", ("next", "observation")])
+        real = both.unfolding(real.refine_names("time"))
+        real.names = None
     return real
 
 
 def learning_reward(cfg: DictConfig, reward: torch.Tensor) -> torch.Tensor:
     """The reward that the losses see; what is reported is the task's own."""
     return cfg.reward_scale * (reward + cfg.reward_offset)
+
+
+def _frames(cfg: DictConfig) -> int:
+    return cfg.get("frames", 1)  # a run of an earlier version says nothing of it
 
 
 def _norm(cfg: DictConfig) -> dict[str, torch.Tensor]:
