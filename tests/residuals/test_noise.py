@@ -1,5 +1,7 @@
 """Noise: that of the action found by the scatter that it makes, that of the sensors told apart from it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -82,3 +84,13 @@ def test_noise_is_that_before_the_control_range_cuts_it_off():
     assert found.p_value < LEVEL
     assert found.action_std == pytest.approx(0.5, rel=0.1)
     assert abs(found.action_std - 0.5) < 2.0 * found.half_width < 0.1
+
+
+def test_what_scatters_more_than_the_actuators_do_is_not_theirs():
+    """As of a velocity that is read off a slow encoder: its noise is not white, and no model of a reading's is it."""
+    simulation = pendulum()
+    measured = recorded(simulation.with_effects(ActionNoise(0.2)), 3000)
+    weak = replace(measured, action=0.1 * measured.action)
+    weakened = simulation.with_effects(ActionGain(10.0))
+    assert estimate_noise(simulation, measured).p_value < LEVEL
+    assert estimate_noise(weakened, weak).p_value == 1.0

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import chi2, norm
 
-from torchrl_h2o.residuals.chance import sensor_noise, stand_in
+from torchrl_h2o.residuals.chance import ENOUGH, sensor_noise, stand_in
+from torchrl_h2o.residuals.initial_states import noise_levels
 from torchrl_h2o.residuals.linearised import one_step
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.residual import executed_actions, residuals, start_states
@@ -26,6 +27,7 @@ _NUDGE = 1e-4  # of a spread, for finite differences
 _USUAL = 0.995  # of residuals, if normal: a larger one counts as no larger, as contacts throw some far out
 _TAILS = 4.0  # degrees of freedom of Student's t, that a residual is judged by: contacts again
 _WORTH = 1e-3  # of the control range: less action noise is not worth a word
+_LIKELY = 2.0  # times the root mean square of the actions: no actuator scatters more, but filtered sensors look so
 _FIRM = 3.0  # half widths of its interval: less is not clear enough, blocks share what they get wrong
 _BEYOND_SENSORS = 3.0  # times what noise of the sensors alone looks like, which contacts throw far out too
 
@@ -62,12 +64,18 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     """
     fitted = _Evidence.of(simulation, measured, measured.fitted())
     judged = _Evidence.of(simulation, measured, measured.judged(), fitted.scale)
-    (estimate, left_out), (silent, _) = _variances(fitted), _variances(fitted.without_action())
+    # what a reading adds to one residual and takes off the next is the sensors', whatever else would explain each
+    sensor = (noise_levels(simulation, measured.part(slice(0, ENOUGH))).sensor / fitted.scale) ** 2
+    estimate, left_out = _variances(fitted, sensor)
+    silent, _ = _variances(fitted.without_action(), sensor)
     std = float(np.sqrt(estimate[0]))
     half_width = float(1.96 * np.sqrt(_BLOCKS - 1) * np.std(np.sqrt(left_out)))
     low, high = simulation.model.actuator_ctrlrange.T
     reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
-    if std < max(_WORTH * reach, _FIRM * half_width) or std < _BEYOND_SENSORS * _by_sensors_alone(simulation, measured):
+    asked = float(np.sqrt((measured.action**2).mean()))
+    if not max(_WORTH * reach, _FIRM * half_width) < std < _LIKELY * asked:
+        return NoiseEstimate(std, half_width, 1.0)
+    if std < _BEYOND_SENSORS * _by_sensors_alone(simulation, measured):
         return NoiseEstimate(std, half_width, 1.0)
     gain = _log_likelihood(estimate, judged) - _log_likelihood(silent, judged.without_action())
     return NoiseEstimate(std, half_width, p_value(gain))
@@ -154,18 +162,21 @@ def derivatives(
     return np.stack(by_action, axis=-1), by_sensor
 
 
-def _variances(evidence: _Evidence) -> tuple[np.ndarray, np.ndarray]:
+def _variances(evidence: _Evidence, sensor: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """The variances of the action (one for all; 0 without derivatives by it) and of each sensor, (1 + n).
 
-    Beside them that of the action with one block of the data left out after the other, (blocks). By Fisher scoring: the
-    covariance of a residual is linear in the variances, and weighed by its own inverse.
+    Those of the sensors are at least as given. Beside them that of the action with one block of the data left out after
+    the other, (blocks). By Fisher scoring: the covariance of a residual is linear in the variances, and weighed by its
+    own inverse.
     """
-    found = np.zeros(1 + evidence.residual.shape[1])
+    found, least = np.zeros((2, 1 + evidence.residual.shape[1]))
+    least[1:] = sensor
     for _ in range(_ITERATIONS):
         inner, towards = _normal_equations(evidence, found)
-        found = _non_negative(inner.sum(0), towards.sum(0))
+        found = _at_least(least, inner.sum(0), towards.sum(0))
     left_out = [
-        _non_negative(inner.sum(0) - one, towards.sum(0) - other)[0] for one, other in zip(inner, towards, strict=True)
+        _at_least(least, inner.sum(0) - one, towards.sum(0) - other)[0]
+        for one, other in zip(inner, towards, strict=True)
     ]
     return found, np.array(left_out)
 
@@ -217,12 +228,12 @@ def _by_sensors_alone(simulation: Simulation, measured: Measured) -> float:
     return float(np.sqrt(found[0]))
 
 
-def _non_negative(inner: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """The least squares of normal equations, none of them negative."""
+def _at_least(least: np.ndarray, inner: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """The least squares of normal equations, none of them below its least."""
     diagonal = np.diag(inner)
     size = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     root = np.linalg.cholesky(inner / np.outer(size, size) + 1e-12 * np.eye(len(inner)))
-    return nnls(root.T, np.linalg.solve(root, towards / size))[0] / size
+    return least + nnls(root.T, np.linalg.solve(root, (towards - inner @ least) / size))[0] / size
 
 
 def _log_likelihood(variances: np.ndarray, evidence: _Evidence) -> np.ndarray:
