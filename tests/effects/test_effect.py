@@ -101,7 +101,10 @@ def test_what_selects_no_indices_is_refused(indices):
 def test_words_name_what_the_effect_acts_on():
     assert JointDamping(0.5).describe() == "damping of all joints + 0.5 N·m·s/rad"
     assert GeomSize(2.0, geoms=("a*", "b")).describe() == "size of geoms a*, b × 2"
-    assert ObservationBias(1, entries=(0, 2)).describe() == "bias of 1 on entries 0, 2 of the observation"
+    bias = ObservationBias(1, entries=(0, 2))
+    assert bias.describe() == "bias of 1 on entries 0, 2 of the observation"
+    assert bias.describe({"entries": ["x", "y", "z"]}) == "bias of 1 on entries x, z of the observation"
+    assert bias.describe({"entries": ["x"]}) == "bias of 1 on entries x, 2 of the observation"
 
 
 def test_an_unknown_gap_is_answered_with_the_nine_names():

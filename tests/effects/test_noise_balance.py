@@ -92,4 +92,5 @@ def test_negative_noise_by_itself_cannot_be_executed():
 
 def test_negative_noise_is_described_as_taken_off():
     assert ActionNoise(-0.5, (0, 2)).describe() == "noise of standard deviation 0.5 taken off actuators 0, 2"
+    assert ActionNoise(-0.5, 1).describe({"actuators": "ab"}) == "noise of standard deviation 0.5 taken off actuators b"
     assert ActionNoise(0.5).describe() == "noise of standard deviation 0.5 on all actuators"

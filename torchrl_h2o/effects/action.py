@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from torchrl_h2o.effects.effect import ActionEffect, Process
+from torchrl_h2o.effects.effect import NO_NAMES, ActionEffect, EntryNames, Process
 from torchrl_h2o.effects.entries import Indices, entry_mask
 from torchrl_h2o.effects.parameter import parameter
 
@@ -43,11 +43,11 @@ class ActionNoise(ActionEffect):
     std: float = parameter(unit="1", bounds=(-10.0, 10.0), neutral=0.0)
     actuators: Indices = None
 
-    def describe(self) -> str:
+    def describe(self, names: EntryNames = NO_NAMES) -> str:
         if self.std >= 0.0:
-            return super().describe()
+            return super().describe(names)
         added = self.with_parameters({"std": -self.std})
-        return added.describe().replace(" on ", " taken off ")
+        return added.describe(names).replace(" on ", " taken off ")
 
     def process(self, dt: float, rng: np.random.Generator) -> Process:
         if self.std < 0.0:

@@ -7,8 +7,9 @@ touches is one of four kinds: the model, the actions, the forces or the observat
 import dataclasses
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import mujoco
@@ -21,6 +22,8 @@ from torchrl_h2o.effects.selection import Names, checked_names
 # by the types of the fields, as types and as text under ``from __future__ import annotations``
 _SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_indices, "Indices": checked_indices}
 
+EntryNames = Mapping[str, Sequence[str]]
+NO_NAMES: EntryNames = MappingProxyType({})
 Process = Callable[[np.ndarray], np.ndarray]
 Force = Callable[[mujoco.MjData], np.ndarray]
 BatchedForce = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -107,23 +110,32 @@ class Effect(ABC):
         """
         return dataclasses.replace(self, **values)
 
-    def describe(self) -> str:
-        """What the effect does, in words with units."""
+    def describe(self, names: EntryNames = NO_NAMES) -> str:
+        """What the effect does, in words with units.
+
+        Args:
+            names: what a simulator calls the entries chosen by index, by field (``"actuators"``, ``"entries"``).
+
+        Examples:
+            >>> from torchrl_h2o.effects import ActionGain
+            >>> ActionGain(0.7, (0, 1)).describe(), ActionGain(0.7, (0, 1)).describe({"actuators": ["hip", "knee"]})
+            ('actuators 0, 1 × 0.7', 'actuators hip, knee × 0.7')
+        """
         parameters = self.parameters
         chosen = {
-            field.name: _in_words(field.name, getattr(self, field.name))
+            field.name: _in_words(field.name, getattr(self, field.name), names.get(field.name, ()))
             for field in dataclasses.fields(self)
             if field.name not in parameters
         }
         return self.wording.format(**parameters, **chosen)
 
 
-def _in_words(field: str, chosen: str | tuple | None) -> str:
-    """``joints`` and ``"*"`` become "all joints", ``actuators`` and ``(0, 2)`` "actuators 0, 2"."""
+def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> str:
+    """``joints`` and ``"*"`` become "all joints", ``actuators`` and ``(0, 2)`` "actuators 0, 2", or their names."""
     if chosen is None or chosen == "*":
         return f"all {field}"
     chosen = (chosen,) if isinstance(chosen, str) else chosen
-    return f"{field} {', '.join(map(str, chosen))}"
+    return f"{field} {', '.join(names[i] if i in range(len(names)) else str(i) for i in chosen)}"
 
 
 class ModelEffect(Effect):

@@ -8,7 +8,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect
+from torchrl_h2o.effects.effect import NO_NAMES, BatchedForce, EntryNames, Force, ForceEffect
 from torchrl_h2o.effects.force_term import ForceTerm
 from torchrl_h2o.effects.parameter import Parameter
 
@@ -90,7 +90,7 @@ class ResidualForce(ForceEffect):
         ]
         return ResidualForce(tuple(map(str, terms)))
 
-    def describe(self) -> str:
+    def describe(self, names: EntryNames = NO_NAMES) -> str:
         return "; ".join(term.words() for term in self.parsed) or "no force"
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:

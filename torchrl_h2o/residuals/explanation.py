@@ -109,13 +109,6 @@ def _with_undeclared(
         return losses(problem.residual([part.effect for part in candidate], judged))
 
     first = Problem.pose(simulation, measured)
-
-    def matters(before: Sequence[Part], after: Sequence[Part]) -> bool:
-        nothing, without, with_it = (
-            losses(first.residual([part.effect for part in some], judged)).mean() for some in ((), before, after)
-        )
-        return without - with_it > _WORTH_A_WORD * (nothing - with_it)
-
     before = loss(parts)
     alone = find_undeclared(simulation, measured) if parts else None
     paying = []
@@ -127,7 +120,8 @@ def _with_undeclared(
             candidate = _found_anew(simulation, measured, _needed(problem, trace, candidate))
         after = loss(candidate)
         pays = after.mean() < (1.0 - _PAYS) * before.mean() and p_value_of_losses(before, after) < _LEVEL
-        if pays and matters(parts, candidate) and _beyond_noise(force, base, measured, rng):
+        matters = first.matters(*([part.effect for part in some] for some in (parts, candidate)), _WORTH_A_WORD)
+        if pays and matters and _beyond_noise(force, base, measured, rng):
             paying.append((candidate, after))
     if not paying:
         return parts

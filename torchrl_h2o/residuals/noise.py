@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import chi2, norm
 
-from torchrl_h2o.residuals.chance import ENOUGH, sensor_noise, stand_in
+from torchrl_h2o.residuals.chance import ENOUGH, stand_in
 from torchrl_h2o.residuals.initial_states import noise_levels
 from torchrl_h2o.residuals.linearised import one_step
 from torchrl_h2o.residuals.measured import Measured
@@ -65,9 +65,9 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     fitted = _Evidence.of(simulation, measured, measured.fitted())
     judged = _Evidence.of(simulation, measured, measured.judged(), fitted.scale)
     # what a reading adds to one residual and takes off the next is the sensors', whatever else would explain each
-    sensor = (noise_levels(simulation, measured.part(slice(0, ENOUGH))).sensor / fitted.scale) ** 2
-    estimate, left_out = _variances(fitted, sensor)
-    silent, _ = _variances(fitted.without_action(), sensor)
+    sensor_std = noise_levels(simulation, measured.part(slice(0, ENOUGH))).sensor
+    estimate, left_out = _variances(fitted, sensor_std)
+    silent, _ = _variances(fitted.without_action(), sensor_std)
     std = float(np.sqrt(estimate[0]))
     half_width = float(1.96 * np.sqrt(_BLOCKS - 1) * np.std(np.sqrt(left_out)))
     low, high = simulation.model.actuator_ctrlrange.T
@@ -75,7 +75,9 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     asked = float(np.sqrt((measured.action**2).mean()))
     if not max(_WORTH * reach, _FIRM * half_width) < std < _LIKELY * asked:
         return NoiseEstimate(std, half_width, 1.0)
-    if std < _BEYOND_SENSORS * _by_sensors_alone(simulation, measured):
+    sensors_alone = stand_in(simulation, measured, sensor_std, np.random.default_rng(0))
+    by_sensors, _ = _variances(_Evidence.of(simulation, sensors_alone, measured.fitted()), sensor_std)
+    if std < _BEYOND_SENSORS * np.sqrt(by_sensors[0]):
         return NoiseEstimate(std, half_width, 1.0)
     gain = _log_likelihood(estimate, judged) - _log_likelihood(silent, judged.without_action())
     return NoiseEstimate(std, half_width, p_value(gain))
@@ -120,10 +122,6 @@ class _Evidence:
     def without_action(self) -> _Evidence:
         return replace(self, by_action=self.by_action[:, :, :0], executed=self.executed[:, :0], limits=self.limits[:0])
 
-    def rows(self, chosen: np.ndarray) -> _Evidence:
-        arrays = ("residual", "by_action", "by_sensor", "executed")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in arrays})
-
     def clamped(self, std: float) -> np.ndarray:
         """By the action, (W, n, nu), with noise of this size as it is left by the limits of the control."""
         if std == 0.0 or not np.isfinite(self.limits).any():
@@ -162,15 +160,15 @@ def derivatives(
     return np.stack(by_action, axis=-1), by_sensor
 
 
-def _variances(evidence: _Evidence, sensor: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def _variances(evidence: _Evidence, sensor_std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The variances of the action (one for all; 0 without derivatives by it) and of each sensor, (1 + n).
 
-    Those of the sensors are at least as given. Beside them that of the action with one block of the data left out after
-    the other, (blocks). By Fisher scoring: the covariance of a residual is linear in the variances, and weighed by its
-    own inverse.
+    Those of the sensors are at least the squares of given standard deviations, (n), in their units. Beside them that of
+    the action with one block of the data left out after the other, (blocks). By Fisher scoring: the covariance of a
+    residual is linear in the variances, and weighed by its own inverse.
     """
     found, least = np.zeros((2, 1 + evidence.residual.shape[1]))
-    least[1:] = sensor
+    least[1:] = (sensor_std / evidence.scale) ** 2
     for _ in range(_ITERATIONS):
         inner, towards = _normal_equations(evidence, found)
         found = _at_least(least, inner.sum(0), towards.sum(0))
@@ -216,16 +214,6 @@ def _covariance(variances: np.ndarray, evidence: _Evidence) -> np.ndarray:
         + (by_sensor * variances[1:]) @ by_sensor.swapaxes(1, 2)
         + np.diag(variances[1:] + _FLOOR)
     )
-
-
-def _by_sensors_alone(simulation: Simulation, measured: Measured) -> float:
-    """What would be taken for noise of the action if nothing but the sensors' were there, a standard deviation."""
-    sensor_std = sensor_noise(simulation, measured)
-    if sensor_std is None:
-        return 0.0
-    data = stand_in(simulation, measured, sensor_std, np.random.default_rng(0))
-    found, _ = _variances(_Evidence.of(simulation, data, measured.fitted()))
-    return float(np.sqrt(found[0]))
 
 
 def _at_least(least: np.ndarray, inner: np.ndarray, towards: np.ndarray) -> np.ndarray:

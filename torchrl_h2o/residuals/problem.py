@@ -94,6 +94,12 @@ class Problem:
         """The size of residual to be expected of windows, (W, H, n) or (1, 1, n), in units."""
         return self.scale[starts] if len(self.scale) > 1 else self.scale
 
+    def matters(self, before: Sequence[Effect], after: Sequence[Effect], share: float) -> bool:
+        """Whether, on held-out windows, effects explain more than others do, by a share of all that they explain."""
+        judged = self.measured.judged(self.horizon)
+        nothing, without, with_them = (losses(self.residual(effects, judged)).mean() for effects in ((), before, after))
+        return without - with_them > share * (nothing - with_them)
+
     @property
     def within_rounding(self) -> bool:
         """Whether nothing is left to explain but that data are single precision."""

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from torchrl_h2o.effects import Effect, ResidualForce
+from torchrl_h2o.effects.effect import NO_NAMES, EntryNames
 
 if TYPE_CHECKING:
     from torchrl_h2o.residuals.report import ErrorSummary, FoundEffect, Report
 
 UNDECLARED = "not on any list"
-_INDICES = r"(\d+(?:, \d+)*)"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -114,43 +113,25 @@ def _selected(effect: Effect) -> list[str | int]:
     return [entry for entry in entries if isinstance(entry, str | int)]
 
 
-def effect_words(effect: Effect, sensors: Sequence[str] = (), actuators: Sequence[str] = ()) -> str:
+def effect_words(effect: Effect, names: EntryNames = NO_NAMES) -> str:
     """What the effect does, its values rounded to three digits.
 
     Args:
         effect: the effect.
-        sensors: names of the observation's entries, which stand in place of their indices if they are given.
-        actuators: names of the action's entries.
+        names: as :meth:`Effect.describe` takes them.
 
     Examples:
-        >>> from torchrl_h2o.effects import ActionGain, Gravity, ObservationGain
+        >>> from torchrl_h2o.effects import Gravity, ObservationGain
         >>> effect_words(Gravity(0.500123))
         'gravity × 0.5'
-        >>> effect_words(ObservationGain(1.04, (0,)), sensors=["pitch", "rate"])
-        'sensor pitch × 1.04'
-        >>> effect_words(ActionGain(0.7, (0, 1)), actuators=["hip", "knee"])
-        'actuators hip, knee × 0.7'
+        >>> effect_words(ObservationGain(1.04, (0,)), {"entries": ["pitch", "rate"]})
+        'entries pitch of the observation × 1.04'
     """
     rounded = {name: float(f"{parameter.value:.3g}") for name, parameter in effect.parameters.items()}
     try:
-        words = effect.with_parameters(rounded).describe()
+        return effect.with_parameters(rounded).describe(names)
     except ValueError:  # a bound may have more digits than three
-        words = effect.describe()
-    words = _named(words, rf"entries {_INDICES} of the observation", "sensor", sensors)
-    words = words.replace("all entries of the observation", "all sensors")
-    return _named(words, rf"actuators {_INDICES}", "actuator", actuators)
-
-
-def _named(words: str, pattern: str, what: str, names: Sequence[str]) -> str:
-    """The words with names in place of indices, if there are names for them."""
-
-    def in_words(match: re.Match) -> str:
-        indices = [int(index) for index in match[1].split(", ")]
-        if not all(index < len(names) for index in indices):
-            return match[0]
-        return f"{what}{'s' if len(indices) > 1 else ''} {', '.join(names[index] for index in indices)}"
-
-    return re.sub(pattern, in_words, words)
+        return effect.describe(names)
 
 
 def sentence(report: Report) -> str:

@@ -192,7 +192,8 @@ class Search:
                 after = self._held_out(candidate.effects)
                 p = p_value_of_losses(lowest, after)
                 pays = after.mean() < (1.0 - least) * lowest.mean() and p < _LEVEL / len(self.catalogue)
-                if pays and self._matters(base, candidate.effects, size - added):
+                # a share worth a word each of all that has been explained since the start
+                if pays and self.first.matters(base, candidate.effects, (size - added) * _WORTH_A_WORD):
                     winner, added, lowest, base = (together, candidate), size, after, candidate.effects
         if winner is None:
             return None
@@ -233,13 +234,6 @@ class Search:
 
     def _possible(self, best: Fit, chosen: Sequence[Lead]) -> bool:
         return is_possible(self.problem, [*best.effects, *(lead.effect for lead in chosen)])
-
-    def _matters(self, before: Sequence[Effect], after: Sequence[Effect], number: int) -> bool:
-        """Whether additions explain a share worth a word each of all that has been explained since the start."""
-        nothing, without, with_it = (
-            losses(self.first.residual(effects, self.judged)).mean() for effects in ((), before, after)
-        )
-        return without - with_it > number * _WORTH_A_WORD * (nothing - with_it)
 
     def _explained_by_noise(self, best: Fit, entries: Sequence[CatalogueEntry], candidate: Fit, added: int) -> float:
         """The share of the loss that the last entries would explain if nothing but noise were there."""

@@ -65,7 +65,8 @@ def summarise(
     mended = simulation.with_effects(*(effect for effect in effects if not _scatters(effect)))
     sensor_std = sensor_noise(mended, measured)
     alike = {attempt.entry.name for group in trace.groups for attempt in group}
-    in_words = partial(effect_words, sensors=simulation.state_map.names, actuators=simulation.actuators)
+    names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
+    in_words = partial(effect_words, names=names)
     return Report(
         simulator=simulation.name,
         data=DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out),
