@@ -57,22 +57,30 @@ def test_what_the_simulator_lacks_is_no_push(simulation, effects):
     assert outside_rows(intervals, ROWS).mean() < 0.01
 
 
-RARE = pytest.mark.xfail(
-    reason="two hits, both in held-out rows: no effect may be fitted to them, so they are set aside"
-)
-
-
-@pytest.mark.parametrize("quantile", [0.7, pytest.param(0.97, marks=RARE)])
-def test_a_limit_that_is_hit_now_and_then_is_no_push(tmp_path, quantile):
-    path = tmp_path / "stopped.xml"
+def stopped(directory, quantile):
+    """A pendulum that a stop, which the simulator has further away, keeps from a share of where it would swing."""
+    path = directory / "stopped.xml"
     path.write_text(PENDULUM.read_text().replace('name="hinge" type', 'name="hinge" range="-3 3" type'))
     simulation = Simulation.from_mjcf(path, ["hinge", "hinge_velocity"], 0.005)
     free = swings(simulation, torque=0.3)
     furthest = float(np.quantile(np.abs(free.observation[:, 0]), quantile))
-    reality = simulation.with_effects(JointRange(furthest / 3.0))
-    data = swings(reality, torque=0.3)
+    data = swings(simulation.with_effects(JointRange(furthest / 3.0)), torque=0.3)
     assert np.abs(data.observation[:, 0]).max() < np.abs(free.observation[:, 0]).max()
+    return simulation, data, np.abs(data.observation[:, 0]) > furthest - 0.02
+
+
+def test_a_limit_that_is_hit_again_and_again_is_no_push(tmp_path):
+    simulation, data, _ = stopped(tmp_path, 0.7)
     assert outside_rows(outside_intervals(simulation, data), ROWS).mean() < 0.01
+
+
+def test_a_limit_that_is_hit_twice_in_held_out_rows_is_set_aside_there_and_nowhere_else(tmp_path):
+    """Two events are no pattern yet, and no effect may be fitted to rows that are held out."""
+    simulation, data, at_the_stop = stopped(tmp_path, 0.97)
+    assert data.held_out[at_the_stop].all()
+    intervals = outside_intervals(simulation, data)
+    assert len(intervals) == 2
+    assert all(at_the_stop[interval.start : interval.stop].any() for interval in intervals)
 
 
 def test_intervals_end_where_their_runs_do(simulation):

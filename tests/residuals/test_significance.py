@@ -52,7 +52,7 @@ def test_no_gain_at_all_proves_nothing_and_the_same_everywhere_everything():
     assert p_value(np.full(50, 0.5)) == 0.0
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000), scale=st.floats(1e-6, 1e6), windows=st.integers(2, 400))
 def test_the_unit_of_the_loss_does_not_matter_and_a_gain_one_way_is_none_the_other(seed, scale, windows):
     gain = noise(seed, windows)

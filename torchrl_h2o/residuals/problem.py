@@ -29,6 +29,7 @@ class Problem:
         horizon: control steps of the windows that residuals are taken over.
         scale: (T, H, n) or (1, 1, n), the size of residual to be expected of each window, in units.
         states: (T, nq + nv), where windows start from.
+        observer: whose sensors the states were read by.
         sensor_std: (n), noise of the readings, in their units; None where it makes no difference.
     """
 
@@ -37,6 +38,7 @@ class Problem:
     horizon: int
     scale: np.ndarray
     states: np.ndarray
+    observer: Simulation
     sensor_std: np.ndarray | None = None
 
     @classmethod
@@ -66,7 +68,7 @@ class Problem:
         fitted = measured.fitted(horizon)
         states = start_states(simulation, measured, np.concatenate([fitted, measured.judged(horizon)]))
         one = np.ones((1, 1, measured.observation.shape[1]))
-        problem = cls(simulation, measured, horizon, one, states, sensor_std)
+        problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std)
         found, rounding = problem._missed((), fitted), problem._rounding(fitted)
         size = np.maximum(np.nanmean(np.abs(found), axis=(0, 1)), rounding)
         if sensor_std is None:
@@ -110,12 +112,12 @@ class Problem:
     def _missed(self, effects: Sequence[Effect], starts: np.ndarray) -> np.ndarray:
         """Residuals in units, (W, H, n), NaN where the simulation diverges."""
         simulation, states = self.simulation.with_effects(*effects), self.states
-        if any(isinstance(effect, ObservationEffect) and not effect.is_neutral for effect in effects):
+        if _sensors(simulation) != _sensors(self.observer):
             # other sensors, other states behind what they said
             run_by_run = [self.measured.observation[run] for run in self.measured.runs]
             before, after = (
                 np.concatenate([which.true_observations(run) for run in run_by_run])
-                for which in (self.simulation, simulation)
+                for which in (self.observer, simulation)
             )
             states = states + (after - before) @ self.simulation.state_map.restore.T
         return residuals(simulation, self.measured, starts, self.horizon, states=states)
@@ -145,6 +147,10 @@ class Problem:
         rounded_by = _ROUNDING * rng.uniform(-1.0, 1.0, observation.shape) * observation
         made = np.nanmean(np.abs(self._moved(rounded_by, starts)), axis=(0, 1))
         return made + _ROUNDING * np.abs(observation).max(0) + 1e-12
+
+
+def _sensors(simulation: Simulation) -> list[Effect]:
+    return [e for e in simulation.effects if isinstance(e, ObservationEffect) and not e.is_neutral]
 
 
 def losses(residual: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from torchrl_h2o.effects import Effect, ResidualForce
+from torchrl_h2o.effects import Effect, Parameter, ResidualForce
 from torchrl_h2o.effects.effect import NO_NAMES, EntryNames
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _selected(effect: Effect) -> list[str | int]:
 
 
 def effect_words(effect: Effect, names: EntryNames = NO_NAMES) -> str:
-    """What the effect does, its values rounded to three digits.
+    """What the effect does, its values rounded to three digits, or more where those would hide that it does anything.
 
     Args:
         effect: the effect.
@@ -124,14 +124,24 @@ def effect_words(effect: Effect, names: EntryNames = NO_NAMES) -> str:
         >>> from torchrl_h2o.effects import Gravity, ObservationGain
         >>> effect_words(Gravity(0.500123))
         'gravity × 0.5'
+        >>> effect_words(Gravity(1.003812))
+        'gravity × 1.0038'
         >>> effect_words(ObservationGain(1.04, (0,)), {"entries": ["pitch", "rate"]})
         'entries pitch of the observation × 1.04'
     """
-    rounded = {name: float(f"{parameter.value:.3g}") for name, parameter in effect.parameters.items()}
+    rounded = {name: _rounded(parameter) for name, parameter in effect.parameters.items()}
     try:
         return effect.with_parameters(rounded).describe(names)
     except ValueError:  # a bound may have more digits than three
         return effect.describe(names)
+
+
+def _rounded(parameter: Parameter) -> float:
+    value, neutral = parameter.value, parameter.neutral
+    rounded = float(f"{value:.3g}")
+    if rounded != neutral or value == neutral:
+        return rounded
+    return neutral + float(f"{value - neutral:.2g}")
 
 
 def sentence(report: Report) -> str:

@@ -183,25 +183,31 @@ class Search:
         before = self._held_out(best.effects)
         least = _PAYS if self.problem.sensor_std is None else _PAYS_UNDER_NOISE
         winner, added, lowest, base = None, 0, before, best.effects
-        for size, finalists in enumerate(self._finalists(best, leads), start=1):
+        for size, sketched in enumerate(self._sketches(best, leads), start=1):
             if len(entries) + size > _MOST:
                 break
-            for chosen, start in finalists:
+            finalists = 0
+            for chosen, start in sketched:
                 together = [*entries, *(lead.entry for lead in chosen)]
                 candidate = self._fitted(together, start.effects)
+                # a share worth a word each of all that has been explained since the start
+                if not self.first.matters(best.effects, candidate.effects, size * _WORTH_A_WORD):
+                    continue  # what does not matter takes nobody's place
                 after = self._held_out(candidate.effects)
                 p = p_value_of_losses(lowest, after)
                 pays = after.mean() < (1.0 - least) * lowest.mean() and p < _LEVEL / len(self.catalogue)
-                # a share worth a word each of all that has been explained since the start
                 if pays and self.first.matters(base, candidate.effects, (size - added) * _WORTH_A_WORD):
                     winner, added, lowest, base = (together, candidate), size, after, candidate.effects
+                finalists += 1
+                if finalists == _FINALISTS:
+                    break
         if winner is None:
             return None
         explained = 1.0 - lowest.mean() / before.mean()
         return winner if explained > _BEYOND_NOISE * self._explained_by_noise(best, *winner, added) else None
 
-    def _finalists(self, best: Fit, leads: Sequence[Lead]) -> Iterator[list[tuple[tuple[Lead, ...], Fit]]]:
-        """The sets of one, two and three leads that are worth a fit on all windows, each with where to start it."""
+    def _sketches(self, best: Fit, leads: Sequence[Lead]) -> Iterator[list[tuple[tuple[Lead, ...], Fit]]]:
+        """The sets of one, two and three leads that promise most, fitted on few windows, the best first."""
         kept = [() for _ in best.effects]
         for size, tried in _SETS:
             among = [lead for lead in leads[:_AMONG] if lead.promise > 0.0]
@@ -222,7 +228,7 @@ class Search:
             ]
             if size == 1:
                 self._remember(best, sketches)
-            yield sorted(sketches, key=lambda pair: pair[1].loss)[:_FINALISTS]
+            yield sorted(sketches, key=lambda pair: pair[1].loss)
 
     def _remember(self, best: Fit, sketches: Sequence[tuple[tuple[Lead, ...], Fit]]) -> None:
         """Notes what entries explain by themselves beside those found, for the report."""
@@ -288,8 +294,14 @@ class Search:
         return sorted(others, key=lambda lead: abs(lead.promise - promise))[:_FITTED]
 
     def _as_good(self, entries: Sequence[CatalogueEntry], best: Fit, index: int) -> tuple[Attempt, ...]:
-        """Which other entries do as well as one of those found, in its place."""
+        """Which other entries do as well as one of those found, in its place.
+
+        More parameters have to earn their place: what has fewer, and seems worse by the size that residuals have without
+        the effect, is as good where it is no worse by the size that they have with it and misses nothing worth a word.
+        """
         kept = [effect for i, effect in enumerate(best.effects) if i != index]
+        self._weigh_by(best.effects)
+        by_what_is_left = self.problem
         self._weigh_by(kept)
         with_it = self._held_out(best.effects)
         explained = self._held_out(kept).mean() - with_it.mean()
@@ -304,13 +316,21 @@ class Search:
             effects = [*kept[:index], lead.effect, *kept[index:]]
             if not is_possible(self.problem, effects):
                 continue
-            start = self._sketched(effects, [lead.free if i == index else () for i in range(len(effects))])
+            start = self._sketched(effects, [free_parameters(entry) for entry in instead])
             if few_without - start.loss < _WORTH_A_FIT * (few_without - few_with_it):
                 continue
             candidate = self._fitted(instead, start.effects)
             after = self._held_out(candidate.effects)
             p = p_value_of_losses(after, with_it)
+            simpler = len(lead.free) < len(free_parameters(entries[index]))
+            if simpler and not self.first.matters(candidate.effects, best.effects, _WORTH_A_WORD):
+                p = max(p, self._p_value(by_what_is_left, candidate, best))
             worse = (after.mean() - with_it.mean()) / explained
             if worse < _SAME or (worse < _ALIKE and p > _LEVEL):
                 as_good.append(Attempt(lead.entry, candidate, index, float(after.mean()), p))
         return tuple(sorted(as_good, key=lambda attempt: attempt.loss))
+
+    def _p_value(self, problem: Problem, worse: Fit, better: Fit) -> float:
+        """Of a difference as large between two fits on held-out windows, as a problem weighs them."""
+        before, after = (losses(problem.residual(fitted.effects, self.judged)) for fitted in (worse, better))
+        return p_value_of_losses(before, after)

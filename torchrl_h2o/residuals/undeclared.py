@@ -56,9 +56,9 @@ def find_undeclared(
 
     The residual is read as a force on each degree of freedom and regressed, sparsely, on a library of terms. The terms
     found are then fitted in the simulation, to the residual itself, and those that are not needed are taken out. The
-    result must pay on held-out data: two one-sided tests, paired over blocks of neighbouring transitions, at 1 %, and
-    at least 1 % of the loss, one step ahead and further. Further, because noise of the sensors has a bias one step
-    ahead that terms can imitate: they pay there, and do harm where the simulation runs on.
+    result must pay on held-out data: the one-sided tests of the search, paired over blocks of neighbouring transitions,
+    at 1 %, and at least 1 % of the loss, one step ahead and further. Further, because noise of the sensors has a bias
+    one step ahead that terms can imitate: they pay there, and do harm where the simulation runs on.
 
     Args:
         simulation: with all effects found so far.
