@@ -19,6 +19,9 @@ from torchrl_h2o.effects import (
     JointSpring,
 )
 from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals.problem import Problem
+from torchrl_h2o.residuals.screening import screen
+from torchrl_h2o.residuals.search import Search
 
 SIMULATION = pendulum()
 FACTORS = ({"scale": 0.8}, {"scale": 1.25})
@@ -87,6 +90,21 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
     armature = next(e for e in (trace.fit.effects[0], other.effect) if isinstance(e, Armature))
     assert armature.inertia == pytest.approx(0.01, rel=0.01)
     assert traced(Gravity(1.3)).groups == ((),)
+
+
+def test_what_was_as_good_once_makes_way_for_what_is_better_now():
+    """An effect may be chosen while another is not in yet; of a group the first in the catalogue is."""
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(0.03)), 1000)
+    catalogue = [DAMPING, FRICTION, GRAVITY]
+    with tqdm(disable=True) as progress:
+        search = Search(Problem.pose(SIMULATION, measured), catalogue, np.random.default_rng(0), progress)
+        known = (Gravity(1.3),)
+        search.rivals[DAMPING.name] = screen(search.problem, known, [DAMPING, FRICTION], search.screened)
+        damped = search._fitted([GRAVITY, DAMPING], [*known, JointDamping(0.01)])
+        entries, best, group = search._simplest([GRAVITY, DAMPING], damped, 1)
+    assert names(entries) == [GRAVITY.name, FRICTION.name]
+    assert best.effects[1].torque == pytest.approx(0.03, rel=0.01)
+    assert group == ()
 
 
 def test_what_was_tried_is_told_with_its_loss_and_chance():

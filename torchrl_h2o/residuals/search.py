@@ -276,14 +276,26 @@ class Search:
         self, entries: list[CatalogueEntry], best: Fit, index: int
     ) -> tuple[list[CatalogueEntry], Fit, tuple[Attempt, ...]]:
         """Puts in an effect's place, of those that do as well, one with the fewest parameters; the rest beside it."""
+        seen = set()
+        while True:
+            seen.add(entries[index].name)
+            as_good = self._as_good(entries, best, index)
+            better = [a for a in as_good if self._p_value(self.problem, best, a.fit) < _LEVEL]
+            if not better or better[0].entry.name in seen:
+                break
+            # chosen while less was known, as good then, and no longer
+            entries, best = self._instead(entries, index, better[0].entry), better[0].fit
         own = Attempt(entries[index], best, index, float(self._held_out(best.effects).mean()), 1.0)
-        group = [own, *self._as_good(entries, best, index)]
+        group = [own, *as_good]
         order = {entry.name: place for place, entry in enumerate(self.catalogue)}
         simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), order[a.entry.name]))
         rest = tuple(attempt for attempt in group if attempt is not simplest)
-        instead = [simplest.entry if i == index else entry for i, entry in enumerate(entries)]
-        self.rivals[simplest.entry.name] = self.rivals[entries[index].name]
-        return instead, simplest.fit, rest
+        return self._instead(entries, index, simplest.entry), simplest.fit, rest
+
+    def _instead(self, entries: list[CatalogueEntry], index: int, other: CatalogueEntry) -> list[CatalogueEntry]:
+        """The entries with another in one's place, whose rivals are then its own."""
+        self.rivals[other.name] = self.rivals[entries[index].name]
+        return [other if i == index else entry for i, entry in enumerate(entries)]
 
     def _rivals(self, entries: Sequence[CatalogueEntry], index: int) -> list[Lead]:
         """The entries that promised about as much as one of those found did when it was added."""
