@@ -62,6 +62,14 @@ def test_the_sentence_names_a_group_as_a_group_and_marks_what_is_on_no_list():
     assert sentence.count("either") == 1
 
 
+def test_the_sentence_counts_what_else_it_could_be_where_naming_all_would_bury_it():
+    report = full_report()
+    (group,) = [g for g in report.indistinguishable if len(g.words) == 2]
+    more = dataclasses.replace(group, words=(*group.words, "gravity × 1.1"))
+    sentence = dataclasses.replace(report, indistinguishable=(more,)).sentence()
+    assert "mass of bodies pole × 1.2 or one of 2 others (these data cannot tell them apart)" in sentence
+
+
 def test_a_report_without_effects_says_whether_nothing_is_missing_or_nothing_can_be_said():
     assert nothing_missing().sentence() == (
         "Nothing is missing: what was tried explains no more than chance would; "

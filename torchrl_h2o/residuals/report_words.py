@@ -165,8 +165,9 @@ def _found_words(report: Report) -> list[str]:
 def _one_of(found: FoundEffect, others: Sequence[str]) -> str:
     if not others:
         return found.words
-    words = [found.words, *others]
-    return f"either {', '.join(words[:-1])} or {words[-1]} (these data cannot tell them apart)"
+    if len(others) == 1:
+        return f"either {found.words} or {others[0]} (these data cannot tell them apart)"
+    return f"{found.words} or one of {len(others)} others (these data cannot tell them apart)"
 
 
 def _listed(words: Sequence[str]) -> str:

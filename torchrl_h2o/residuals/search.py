@@ -308,8 +308,9 @@ class Search:
     def _as_good(self, entries: Sequence[CatalogueEntry], best: Fit, index: int) -> tuple[Attempt, ...]:
         """Which other entries do as well as one of those found, in its place.
 
-        More parameters have to earn their place: what has fewer, and seems worse by the size that residuals have without
-        the effect, is as good where it is no worse by the size that they have with it and misses nothing worth a word.
+        More parameters have to earn their place: what has fewer, and seems worse by the size that residuals have
+        without the effect, is as good where it is no worse by the size that they have with it and misses nothing worth
+        a word.
         """
         kept = [effect for i, effect in enumerate(best.effects) if i != index]
         self._weigh_by(best.effects)
