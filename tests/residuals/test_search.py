@@ -9,6 +9,8 @@ from tqdm import tqdm
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import (
+    ActionBacklash,
+    ActionDelay,
     ActionGain,
     Armature,
     BodyInertia,
@@ -90,6 +92,21 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
     armature = next(e for e in (trace.fit.effects[0], other.effect) if isinstance(e, Armature))
     assert armature.inertia == pytest.approx(0.01, rel=0.01)
     assert traced(Gravity(1.3)).groups == ((),)
+
+
+def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_reality():
+    """What is late and then has play is not what has play and then is late; by itself, the play shows more."""
+    play, late = ActionBacklash(0.4), ActionDelay(0.013)
+    catalogue = [
+        CatalogueEntry(ActionBacklash(), ({"width": 0.1}, {"width": 0.5})),
+        CatalogueEntry(ActionDelay(), ({"delay": 0.005}, {"delay": 0.02})),
+    ]
+    for truth in ((late, play), (play, late)):
+        trace = traced(*truth, catalogue=catalogue)
+        assert [type(effect) for effect in trace.fit.effects] == [type(effect) for effect in truth]
+        for found, true in zip(trace.fit.effects, truth, strict=True):
+            for name, parameter in true.parameters.items():
+                assert found.parameters[name].value == pytest.approx(parameter.value, rel=1e-3)
 
 
 def test_what_was_as_good_once_makes_way_for_what_is_better_now():

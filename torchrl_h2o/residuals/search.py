@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 from tqdm import tqdm
 
-from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.effects import ActionEffect, CatalogueEntry, Effect, ObservationEffect
 from torchrl_h2o.residuals.chance import stand_in
 from torchrl_h2o.residuals.fit import Fit, Free, fit
 from torchrl_h2o.residuals.horizon import choose_horizon
@@ -120,7 +121,7 @@ class Search:
             # which trial shows an entry's direction best is known by now
             known = {lead.entry.name: replace(lead.entry, trials=(dict(lead.trial),)) for lead in leads}
             self.catalogue = [known.get(entry.name, entry) for entry in self.catalogue]
-            entries, best = self._eliminated(*added)
+            entries, best = self._in_best_order(*self._eliminated(*added))
             entries, best, exact = self._weighed(entries, best)
             self.progress.set_postfix_str(", ".join(entry.name for entry in entries))
         return entries, best, exact
@@ -254,6 +255,21 @@ class Search:
         refitted = fit(posed, candidate.effects[-added:], free, self.fitted)
         before = losses(posed.residual((), self.judged)).mean()
         return 1.0 - float(losses(posed.residual(refitted.effects, self.judged)).mean() / before)
+
+    def _in_best_order(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit]:
+        """The effects in the order in which actions, and observations, pass through them best: some do not commute."""
+        lowest = self._held_out(best.effects)
+        for kind in (ActionEffect, ObservationEffect):
+            places = [index for index, entry in enumerate(entries) if isinstance(entry.effect, kind)]
+            for one, other in combinations(places, 2):
+                order = list(range(len(entries)))
+                order[one], order[other] = other, one
+                swapped = [entries[index] for index in order]
+                candidate = self._fitted(swapped, [best.effects[index] for index in order])
+                after = self._held_out(candidate.effects)
+                if after.mean() < lowest.mean() and p_value_of_losses(lowest, after) < _LEVEL:
+                    entries, best, lowest = swapped, candidate, after
+        return entries, best
 
     def _eliminated(self, entries: list[CatalogueEntry], best: Fit) -> tuple[list[CatalogueEntry], Fit]:
         """Takes out, one by one, what the others make up for."""
