@@ -28,7 +28,8 @@ _SCREENED = 400  # control steps, in windows of any length
 _FEWEST = 100  # windows
 _FITTED_STEPS = 1200  # in windows, while searching; what was found is fitted to all of them in the end
 _FEWEST_FITTED = 200  # windows
-_FITTED = 12  # rivals of an effect that are tried in its place
+_FITTED = 12  # rivals of an effect that are tried in its place: those that promised about as much as it did,
+_PROMISING = 6  # and those that promised most
 _FINALISTS = 3  # sets of leads of one size that are fitted on all windows
 _AMONG = 60  # leads that sets are made of
 _SETS = ((1, 12), (2, 4), (3, 4))  # how many entries may be added at once, and how many such sets are sketched
@@ -167,9 +168,9 @@ class Search:
             return Fit((), (), float(losses(self.problem.residual((), starts)).mean()), ())
         return fit(self.problem, start, [free_parameters(entry) for entry in entries], starts)
 
-    def _sketched(self, effects: Sequence[Effect], free: Sequence[Free]) -> Fit:
+    def _sketched(self, effects: Sequence[Effect], free: Sequence[Free], max_evaluations: int = 6) -> Fit:
         """Some of the effects fitted, the others as they are, on few windows."""
-        return fit(self.problem, effects, free, self.screened, max_evaluations=6)
+        return fit(self.problem, effects, free, self.screened, max_evaluations=max_evaluations)
 
     def _held_out(self, effects: Sequence[Effect]) -> np.ndarray:
         return losses(self.problem.residual(effects, self.judged))
@@ -314,12 +315,13 @@ class Search:
         return [other if i == index else entry for i, entry in enumerate(entries)]
 
     def _rivals(self, entries: Sequence[CatalogueEntry], index: int) -> list[Lead]:
-        """The entries that promised about as much as one of those found did when it was added."""
+        """The entries that promised most, or about as much as one of those found did, when it was added."""
         leads = self.rivals[entries[index].name]
         names = {entry.name for entry in entries}
         promise = next(lead.promise for lead in leads if lead.entry.name == entries[index].name)
         others = [lead for lead in leads if lead.entry.name not in names]
-        return sorted(others, key=lambda lead: abs(lead.promise - promise))[:_FITTED]
+        nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[:_FITTED]
+        return list({lead.entry.name: lead for lead in (*nearest, *others[:_PROMISING])}.values())
 
     def _as_good(self, entries: Sequence[CatalogueEntry], best: Fit, index: int) -> tuple[Attempt, ...]:
         """Which other entries do as well as one of those found, in its place.
@@ -345,7 +347,8 @@ class Search:
             effects = [*kept[:index], lead.effect, *kept[index:]]
             if not is_possible(self.problem, effects):
                 continue
-            start = self._sketched(effects, [free_parameters(entry) for entry in instead])
+            free = [free_parameters(entry) for entry in instead]
+            start = self._sketched(effects, free, max_evaluations=20)  # the others may have far to go
             if few_without - start.loss < _WORTH_A_FIT * (few_without - few_with_it):
                 continue
             candidate = self._fitted(instead, start.effects)
