@@ -74,6 +74,9 @@ class Parts:
         loss = H2OPlusLoss(self.actor, self.qvalues, value_loss(self.value), ratio_loss, **kwargs)
         return _move_targets(loss)
 
+    def sac(self, **kwargs) -> H2OPlusLoss:
+        return _move_targets(H2OPlusLoss(self.actor, self.qvalues, None, mixing=0.0, **kwargs))
+
 
 def _move_targets(loss):
     """Targets apart from the online networks, so that reading the wrong one shows."""

@@ -146,6 +146,22 @@ def test_swapping_the_backbone_is_one_argument(parts, batch, backbone):
     assert loss(batch)["loss_value"] < before
 
 
+def test_without_a_value_loss_it_is_mixing_zero_without_v(batch):
+    with_v, without_v = Parts().h2o_plus(ratio=False, mixing=0.0), Parts().sac()
+    got = []
+    for loss in (with_v, without_v):
+        torch.manual_seed(3)
+        got.append(loss(batch.copy()))
+    torch.testing.assert_close(got[1], got[0].exclude("loss_value"))
+    assert "loss_value" not in got[1].keys()
+    assert not any("value_loss" in name for name, _ in without_v.named_parameters())
+
+
+def test_without_a_value_loss_mixing_has_nothing_to_weigh(parts):
+    with pytest.raises(ValueError, match=r"no value network: pass one, or mixing=0\.0"):
+        H2OPlusLoss(parts.actor, parts.qvalues, None, mixing=0.1)
+
+
 def test_an_update_moves_every_network_and_the_targets_follow(parts, batch):
     loss = parts.h2o_plus()
     targets = SoftUpdate(loss, tau=0.005)

@@ -30,6 +30,7 @@ LOSSES = {
     "ratio": lambda parts: DynamicsRatioLoss(parts.estimator, input_noise=None),
     "bellman": lambda parts: parts.bellman(),
     "h2o_plus": lambda parts: parts.h2o_plus(),
+    "without_value": lambda parts: parts.sac(),
 }
 losses = pytest.mark.parametrize("name", LOSSES)
 

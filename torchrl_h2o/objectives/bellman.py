@@ -18,8 +18,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
-from torchrl.objectives.utils import _vmap_func
 
+from torchrl_h2o.objectives.functional import distribution, run
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, like_rows
 
 
@@ -71,7 +71,8 @@ class MixedBellmanLoss(HybridLoss):
         actor_network (ProbabilisticTensorDictSequential): π(a|s), with a reparameterised distribution.
         qvalue_network (TensorDictModule or list of them): Q(s, a); writes ``"state_action_value"``, ``[*B, 1]``. A
             list is an ensemble of independent initialisations; one module is expanded to ``num_qvalue_nets``.
-        value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
+        value_network (TensorDictModule or None): V(s); writes ``"state_value"``, ``[*B, 1]``. With λ = 0 there need be
+            none, and λ stays 0 then.
         mixing (float, optional): λ in [0, 1]. Defaults to 0.1, the paper's. ``loss.mixing = x`` changes it later.
 
     Keyword Args:
@@ -81,7 +82,7 @@ class MixedBellmanLoss(HybridLoss):
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`.
 
     Raises:
-        ValueError: if λ is outside [0, 1] or β is not positive.
+        ValueError: if λ is outside [0, 1] or not 0 where there is no V, or β is not positive.
 
     Reads observation, action, ``real`` ``[*B]``, ``("next", ...)`` observation, reward ``[*B, 1]`` and terminated
     ``[*B, 1]``, and ``dynamics_ratio`` ``[*B]`` if it is there (else 1). Writes ``loss_qvalue``, the sum over the
@@ -140,7 +141,7 @@ class MixedBellmanLoss(HybridLoss):
     qvalue_network: TensorDictModule
     qvalue_network_params: TensorDictParams
     target_qvalue_network_params: TensorDictParams
-    value_network: TensorDictModule
+    value_network: TensorDictModule | None
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
@@ -148,7 +149,7 @@ class MixedBellmanLoss(HybridLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        value_network: TensorDictModule,
+        value_network: TensorDictModule | None,
         mixing: float = 0.1,
         *,
         exploration: TensorDictModuleBase | None = None,
@@ -166,6 +167,8 @@ class MixedBellmanLoss(HybridLoss):
         if isinstance(qvalue_network, Sequence):
             num_qvalue_nets = len(qvalue_network)
         self.convert_to_functional(qvalue_network, "qvalue_network", num_qvalue_nets, create_target_params=True)
+        if value_network is None and mixing:
+            raise ValueError(f"mixing={mixing} weighs V(s'), and there is no value network: pass one, or mixing=0.0.")
         self._hold_value_network(value_network)
         self.exploration = EntropyBonus() if exploration is None else exploration
         dtype = next(iter(self.qvalue_network_params.values(True, True))).dtype
@@ -173,8 +176,11 @@ class MixedBellmanLoss(HybridLoss):
         self.register_coeff_buffer("gamma", 0.99, dtype=dtype)
         self.register_buffer("log_alpha", torch.tensor(math.log(alpha_init), dtype=dtype))
 
-    def _hold_value_network(self, value_network: TensorDictModule) -> None:
-        self.convert_to_functional(value_network, "value_network")
+    def _hold_value_network(self, value_network: TensorDictModule | None) -> None:
+        if value_network is None:
+            self.value_network = None
+        else:
+            self.convert_to_functional(value_network, "value_network")
 
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams) -> None:
         """Sets γ of Eq. (7): ``loss.make_value_estimator(gamma=0.98)``.
@@ -190,7 +196,8 @@ class MixedBellmanLoss(HybridLoss):
 
     def _read_keys(self) -> Iterable[NestedKey]:
         keys = self.tensor_keys
-        states = (*self.actor_network.in_keys, *self.value_network.in_keys)
+        value_keys = () if self.value_network is None else self.value_network.in_keys
+        states = (*self.actor_network.in_keys, *value_keys)
         return (
             *self.qvalue_network.in_keys,
             keys.action,
@@ -221,25 +228,24 @@ class MixedBellmanLoss(HybridLoss):
         td_error = qvalues - self.mixed_target(tensordict)
         tensordict.set(self.tensor_keys.priority, td_error.detach().abs().amax(0))
         terms = (td_error**2).sum(0)
-        return self._expectation(self._weight(terms, tensordict, rows), *rows)  # Eq. (8)
+        return self._expectation(self._weight(terms, tensordict, rows), rows)  # Eq. (8)
 
     @torch.no_grad()
     def mixed_target(self, tensordict: TensorDictBase) -> Tensor:
         """Eq. (7): the target of Q(s, a), a constant, ``[*B]``."""
         keys = self.tensor_keys
         next_states = tensordict.get("next")
-        exploit = self._next_value(next_states)
-        explore = self._next_policy_value(next_states)
-        reward = like_rows(self._entry(next_states, keys.reward), exploit)
-        terminated = like_rows(self._entry(next_states, keys.terminated).bool(), exploit)
-        next_value = self.mixing * exploit + (1 - self.mixing) * explore
+        next_value = self._next_policy_value(next_states)
+        if self.value_network is not None:
+            next_value = self.mixing * self._next_value(next_states) + (1 - self.mixing) * next_value
+        reward = like_rows(self._entry(next_states, keys.reward), next_value)
+        terminated = like_rows(self._entry(next_states, keys.terminated).bool(), next_value)
         return reward + self.gamma * torch.where(terminated, 0.0, next_value)  # Eq. (7)
 
     def _next_value(self, next_states: TensorDictBase) -> Tensor:
         """V(s') of the online value network."""
-        states = next_states.select(*self.value_network.in_keys)
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            return self._entry(self.value_network(states), self.tensor_keys.value).squeeze(-1)
+        out = run(self.value_network, next_states, self.value_network_params)
+        return self._entry(out, self.tensor_keys.value).squeeze(-1)
 
     def _next_policy_value(self, next_states: TensorDictBase) -> Tensor:
         """Q̂(s', a') of the target networks' minimum plus the exploration term, a' from the policy."""
@@ -253,18 +259,14 @@ class MixedBellmanLoss(HybridLoss):
 
     def _sample_action(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Reparameterised a ~ π(.|s) and log π(a|s), ``[*B]``."""
-        with (
-            set_exploration_type(ExplorationType.RANDOM),
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
-        ):
-            policy = self.actor_network.get_dist(states.select(*self.actor_network.in_keys))
+        with set_exploration_type(ExplorationType.RANDOM):
+            policy = distribution(self.actor_network, states, self.actor_network_params)
         return rsample_and_log_prob(policy)
 
     def _qvalues(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
         """Q(s, a) of every member of the ensemble, ``[num_qvalue_nets, *B]``."""
-        inputs = tensordict.select(*self.qvalue_network.in_keys)
-        qvalue = _vmap_func(self.qvalue_network, (None, 0), randomness=self.vmap_randomness)
-        return self._entry(qvalue(inputs, params), self.tensor_keys.state_action_value).squeeze(-1)
+        out = run(self.qvalue_network, tensordict, params, self.vmap_randomness)
+        return self._entry(out, self.tensor_keys.state_action_value).squeeze(-1)
 
     def _weight(self, terms: Tensor, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Terms of simulated rows times P / P̂, real rows as they are; both times the priority's weight."""

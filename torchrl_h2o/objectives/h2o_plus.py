@@ -29,7 +29,8 @@ class H2OPlusLoss(MixedBellmanLoss):
     Args:
         actor_network (ProbabilisticTensorDictSequential): π(a|s), with a reparameterised distribution.
         qvalue_network (TensorDictModule or list of them): see :class:`MixedBellmanLoss`.
-        value_loss (InSampleValueLoss): the backbone, holding V. Swapping it swaps the backbone.
+        value_loss (InSampleValueLoss or None): the backbone, holding V. Swapping it swaps the backbone. None, with
+            λ = 0, is SAC on both streams, Eq. (6): there is no V then.
         ratio_loss (DynamicsRatioLoss, optional): holding the discriminators, whose ratio then weighs the simulated
             rows. Without it the batch's own ``dynamics_ratio`` does, and without that the weight is 1.
         mixing (float, optional): λ. Defaults to 0.1.
@@ -74,14 +75,14 @@ class H2OPlusLoss(MixedBellmanLoss):
         >>> targets.step()
     """
 
-    value_loss: InSampleValueLoss
+    value_loss: InSampleValueLoss | None
     ratio_loss: DynamicsRatioLoss | None
 
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModule | Sequence[TensorDictModule],
-        value_loss: InSampleValueLoss,
+        value_loss: InSampleValueLoss | None,
         ratio_loss: DynamicsRatioLoss | None = None,
         mixing: float = 0.1,
         *,
@@ -117,18 +118,19 @@ class H2OPlusLoss(MixedBellmanLoss):
             target_entropy = -float(_action_dim(actor_network, self.tensor_keys.action))
         self.register_coeff_buffer("target_entropy", target_entropy, dtype=self.mixing.dtype)
 
-    def _hold_value_network(self, value_loss: InSampleValueLoss) -> None:
+    def _hold_value_network(self, value_loss: InSampleValueLoss | None) -> None:
         # V belongs to the loss that trains it; Eq. (7) reads it there, through the two properties below.
         self.value_loss = value_loss
-        self.tensor_keys.value = value_loss.tensor_keys.value
+        if value_loss is not None:
+            self.tensor_keys.value = value_loss.tensor_keys.value
 
     @property
     def _parts(self) -> list[HybridLoss]:
-        return [self.value_loss] + ([] if self.ratio_loss is None else [self.ratio_loss])
+        return [part for part in (self.value_loss, self.ratio_loss) if part is not None]
 
     @property
-    def value_network(self) -> TensorDictModule:
-        return self.value_loss.value_network
+    def value_network(self) -> TensorDictModule | None:
+        return None if self.value_loss is None else self.value_loss.value_network
 
     @property
     def value_network_params(self) -> TensorDictBase:
@@ -153,7 +155,7 @@ class H2OPlusLoss(MixedBellmanLoss):
         return (
             *super()._read_keys(),
             *self.actor_network.in_keys,
-            *self.value_network.in_keys,
+            *(() if self.value_network is None else self.value_network.in_keys),
             *ratio_keys,
         )
 
@@ -162,7 +164,10 @@ class H2OPlusLoss(MixedBellmanLoss):
         return (keys.priority_weight,) if self.ratio_loss else (keys.dynamics_ratio, keys.priority_weight)
 
     def _written_keys(self) -> Iterable[NestedKey]:
-        yield from ("loss_actor", "loss_qvalue", "loss_value", "loss_alpha")
+        yield from ("loss_actor", "loss_qvalue")
+        if self.value_loss is not None:
+            yield "loss_value"
+        yield "loss_alpha"
         if self.ratio_loss is not None:
             yield from (
                 "loss_ratio_sa",
@@ -180,13 +185,12 @@ class H2OPlusLoss(MixedBellmanLoss):
         ratio_terms = {} if self.ratio_loss is None else self._ratio_terms(batch, rows)
         loss_qvalue = self.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
-        batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
-        loss_value = self.value_loss.value_loss(batch)
+        value_terms = {} if self.value_loss is None else self._value_terms(batch)
         loss_actor, log_prob = self.actor_loss(batch, rows)
         terms = {
             "loss_actor": loss_actor,
             "loss_qvalue": loss_qvalue,
-            "loss_value": loss_value,
+            **value_terms,
             "loss_alpha": self.alpha_loss(log_prob, rows),
             **ratio_terms,
         }
@@ -198,8 +202,13 @@ class H2OPlusLoss(MixedBellmanLoss):
         """Eq. (9): writes the ratio into the batch and returns the discriminators' losses."""
         ratio = self.ratio_loss.dynamics_ratio(batch)
         batch.set(self.tensor_keys.dynamics_ratio, ratio)
-        shown = ratio if self.reduction == "none" else self._expectation(ratio, rows.sim, reduction="mean")
+        shown = ratio if self.reduction == "none" else self._expectation(ratio, rows, rows.sim, reduction="mean")
         return {**self.ratio_loss(batch), "dynamics_ratio": shown}
+
+    def _value_terms(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Eq. (4): writes the target Q at the data's own actions into the batch and returns V's loss."""
+        batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
+        return {"loss_value": self.value_loss.value_loss(batch)}
 
     @torch.no_grad()
     def _data_qvalue(self, batch: TensorDictBase) -> Tensor:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -18,11 +17,31 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 
-class Rows(NamedTuple):
-    """The rows of a batch by stream, masks ``[*B]``; one that ``loss_mask_key`` excludes is in neither."""
+class Rows:
+    """Which rows of a batch belong to which stream, and what each weighs in a mean over its own.
 
-    real: Tensor
-    sim: Tensor
+    Args:
+        real: the rows of measured data, a mask ``[*B]``.
+        sim: the simulated rows. One that ``loss_mask_key`` excludes is in neither.
+    """
+
+    def __init__(self, real: Tensor, sim: Tensor) -> None:
+        self.real, self.sim, self.either = real, sim, real | sim
+        self._weights: dict[torch.dtype, Tensor] = {}
+        self._streams: dict[torch.dtype, Tensor] = {}
+
+    def weights(self, dtype: torch.dtype) -> Tensor:
+        """One over the number of rows in each row's own stream, ``[*B]``."""
+        if dtype not in self._weights:
+            n_real, n_sim = (rows.sum().clamp_min(1).to(dtype) for rows in (self.real, self.sim))
+            self._weights[dtype] = self.real / n_real + self.sim / n_sim
+        return self._weights[dtype]
+
+    def streams(self, dtype: torch.dtype) -> Tensor:
+        """How many of the two streams have rows, at least one, ``[]``."""
+        if dtype not in self._streams:
+            self._streams[dtype] = sum(rows.any().to(dtype) for rows in (self.real, self.sim)).clamp_min(1)
+        return self._streams[dtype]
 
 
 class HybridLoss(LossModule):
@@ -131,28 +150,28 @@ class HybridLoss(LossModule):
                 real, sim = real & valid, sim & valid
         return Rows(real, sim)
 
-    def _expectation(self, terms: Tensor, *streams: Tensor, reduction: str | None = None) -> Tensor:
-        """The sum over streams of the mean of the terms over each: :math:`E_𝒟[.]`, or :math:`E_𝒟[.] + E_B[.]`.
+    def _expectation(
+        self, terms: Tensor, rows: Rows, among: Tensor | None = None, *, reduction: str | None = None
+    ) -> Tensor:
+        """The sum over streams of the mean of the terms over each: :math:`E_𝒟[.] + E_B[.]`, or one of the two.
 
         Args:
             terms: one a row, ``[*B]``.
-            *streams: the rows of each expectation, masks ``[*B]``. One without any row contributes zero.
+            rows: of the batch. A stream without any contributes zero.
+            among: ``rows.real`` or ``rows.sim``, for one expectation alone.
             reduction: instead of the loss's own.
         """
         # Selected, not multiplied: 0 * inf is NaN.
-        selected = [torch.where(rows, terms, 0.0) for rows in streams]
+        selected = torch.where(rows.either if among is None else among, terms, 0.0)
         reduction = reduction or self.reduction
-        if reduction == "mean":
-            selected = [part.sum() / rows.sum().clamp_min(1) for part, rows in zip(selected, streams, strict=True)]
-        total = sum(selected)
-        return total.sum() if reduction == "sum" else total
+        if reduction == "none":
+            return selected
+        return (selected * rows.weights(terms.dtype) if reduction == "mean" else selected).sum()
 
     def _union_expectation(self, terms: Tensor, rows: Rows, reduction: str | None = None) -> Tensor:
         """:math:`E_{𝒟∪B}[.]`: both streams weigh the same, however many rows each has; one alone is that stream."""
-        total = self._expectation(terms, *rows, reduction=reduction)
-        if (reduction or self.reduction) != "mean":
-            return total
-        return total / sum(stream.any().to(terms.dtype) for stream in rows).clamp_min(1)
+        total = self._expectation(terms, rows, reduction=reduction)
+        return total / rows.streams(terms.dtype) if (reduction or self.reduction) == "mean" else total
 
     def _metric(self, terms: Tensor, rows: Rows) -> Tensor:
         """A figure to log: a mean whatever the losses' reduction, or one value a row beside one loss a row."""

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
+from torchrl_h2o.objectives.functional import LastAxis
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 HIDDEN = (256, 256)
@@ -22,7 +23,7 @@ def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
     return network
 
 
-class GaussianParameters(nn.Module):
+class GaussianParameters(LastAxis):
     """Splits a network's output ``[*B, 2 n]`` into the mean and the standard deviation of a Gaussian, ``[*B, n]`` each.
 
     The log standard deviation is clamped to [-20, 2], as in the authors' code: it can neither vanish nor overflow.

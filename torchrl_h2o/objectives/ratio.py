@@ -196,7 +196,7 @@ class DynamicsRatioLoss(HybridLoss):
 
     def _cross_entropy(self, log_odds: Tensor, rows: Rows) -> Tensor:
         terms = F.softplus(torch.where(rows.real, -log_odds, log_odds))  # -log p(own stream)
-        return self._expectation(terms, *rows)
+        return self._expectation(terms, rows)
 
     def _accuracy(self, log_odds: Tensor, rows: Rows) -> Tensor:
         hits = ((log_odds > 0) == rows.real).to(log_odds.dtype)

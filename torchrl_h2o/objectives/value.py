@@ -14,6 +14,7 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 
+from torchrl_h2o.objectives.functional import run
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
@@ -91,11 +92,11 @@ class InSampleValueLoss(HybridLoss):
 
     def value_loss(self, tensordict: TensorDictBase) -> Tensor:
         """Eq. (4), reduced."""
-        states = tensordict.select(*self.value_network.in_keys)
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            value = self._entry(self.value_network(states), self.tensor_keys.value).squeeze(-1)
+        out = run(self.value_network, tensordict, self.value_network_params)
+        value = self._entry(out, self.tensor_keys.value).squeeze(-1)
         qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
-        return self._expectation(self.penalty(qvalue - value), self._rows(tensordict).real)  # Eq. (4)
+        rows = self._rows(tensordict)
+        return self._expectation(self.penalty(qvalue - value), rows, rows.real)  # Eq. (4)
 
 
 class ExpectileValueLoss(InSampleValueLoss):

@@ -1,0 +1,81 @@
+"""Networks as functions of their parameters: written out or TorchRL's way, the same numbers and gradients."""
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictParams, from_modules
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import MLP, ValueOperator
+
+from torchrl_h2o.objectives import functional, make_actor
+
+KEYS = ["observation", "action"]
+
+
+def qvalue(**kwargs):
+    return ValueOperator(MLP(5, 1, num_cells=[8, 8], **kwargs), in_keys=KEYS)
+
+
+def two_headed():
+    trunk = nn.Sequential(MLP(3, 8, num_cells=[8]), nn.ReLU(), nn.Linear(8, 2, bias=False))
+    return TensorDictModule(trunk, in_keys=["observation"], out_keys=["out"])
+
+
+NETWORKS = {
+    "perceptron": qvalue,
+    "tanh": lambda: qvalue(activation_class=nn.Tanh),
+    "sequential without a bias": two_headed,
+    "normalised": lambda: qvalue(norm_class=nn.LayerNorm, norm_kwargs={"normalized_shape": 8}),
+}
+
+
+def transitions(*batch_size):
+    return TensorDict(
+        observation=torch.randn(*batch_size, 3),
+        action=torch.randn(*batch_size, 2),
+        other=torch.ones(batch_size),
+        batch_size=batch_size,
+    )
+
+
+@pytest.mark.parametrize("batch_size", [(), (5,), (4, 3)], ids=str)
+@pytest.mark.parametrize("name", NETWORKS)
+def test_an_ensemble_gives_what_its_members_give(name, batch_size):
+    members, batch = [NETWORKS[name]() for _ in range(3)], transitions(*batch_size)
+    params = from_modules(*members, as_module=True)
+    out = functional.run(members[0], batch, params)
+    (key,) = members[0].out_keys
+    assert out.batch_size == (3, *batch_size)
+    expected = torch.stack([member(batch.copy())[key] for member in members])
+    torch.testing.assert_close(out[key], expected)
+    out[key].square().sum().backward()
+    expected.square().sum().backward()
+    for path, gradient in params.items(True, True):
+        own = torch.stack([TensorDict.from_module(member).get(path).grad for member in members])
+        torch.testing.assert_close(gradient.grad, own)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_one_network_runs_with_other_parameters_than_its_own(name):
+    network, other, batch = NETWORKS[name](), NETWORKS[name](), transitions(4)
+    (key,) = network.out_keys
+    got = functional.run(network, batch, TensorDictParams(TensorDict.from_module(other)))[key]
+    torch.testing.assert_close(got, other(batch.copy())[key])
+    assert not torch.allclose(got, network(batch.copy())[key])
+
+
+def test_a_hook_is_called():
+    network, batch = qvalue(), transitions(4)
+    network.module[0].register_forward_hook(lambda module, inputs, output: output + 1.0)
+    got = functional.run(network, batch, TensorDictParams(TensorDict.from_module(network)))["state_action_value"]
+    torch.testing.assert_close(got, network(batch.copy())["state_action_value"])
+
+
+def test_a_policy_with_other_parameters():
+    actor, other = (make_actor(3, Bounded(-2, 2, (2,)), (8, 8)) for _ in range(2))
+    batch = transitions(6)
+    got = functional.distribution(actor, batch, TensorDictParams(TensorDict.from_module(other)))
+    expected = other.get_dist(batch.select("observation"))
+    action = 1.9 * torch.rand(6, 2)
+    torch.testing.assert_close(got.log_prob(action), expected.log_prob(action))
