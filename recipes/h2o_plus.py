@@ -19,6 +19,7 @@ import hydra
 import torch
 from environments import as_observed, learning_reward, make_reality, make_simulator, measure_observation_norm
 from evaluation import evaluate
+from learner import Learner, adam
 from learning_curve import draw_learning_curve
 from omegaconf import DictConfig
 from real_data import behaviour_in, read_real_data
@@ -29,6 +30,7 @@ from sac import train_sac
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import Collector
+from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
@@ -46,14 +48,13 @@ from torchrl_h2o.objectives import (
 )
 
 
-def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
+def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """The method: real and simulated batches, one loss, one optimiser."""
-    simulator, reality = make_simulator(cfg), make_reality(cfg)
-    observation_dim, action_dim = simulator.observation_spec["observation"].shape[-1], simulator.action_spec.shape[-1]
+    torch.manual_seed(cfg.seed)
+    action_dim = action_spec.shape[-1]
 
     # Networks. Each is held by the loss that trains it.
-    torch.manual_seed(cfg.seed)
-    actor = make_actor(observation_dim, simulator.action_spec_unbatched, cfg.num_cells)
+    actor = make_actor(observation_dim, action_spec, cfg.num_cells)
     qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
     value_loss = make_value_loss(cfg, observation_dim)
     estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
@@ -62,59 +63,57 @@ def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tu
     loss = H2OPlusLoss(actor, qvalues, value_loss, mixing=cfg.mixing, target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
-    optimiser = torch.optim.Adam([*loss.parameters(), *ratio_loss.parameters()], lr=cfg.lr)
-    schedule = LinearLR(optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
-    targets = SoftUpdate(loss, tau=cfg.tau)
 
-    # Data. Both streams show observations and rewards in the same way.
-    real = as_observed(cfg, real)
+    def evaluate(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
+        ratio_losses = ratio_loss(pairs)
+        if cfg.ratio:
+            estimator(batch)  # Eq. (9): writes the dynamics ratio
+        return {**loss(batch), **ratio_losses}
+
+    return Learner(
+        actor,
+        {"loss": loss, "ratio_loss": ratio_loss},
+        adam(loss, ratio_loss, lr=cfg.lr),
+        SoftUpdate(loss, tau=cfg.tau),
+        replay,
+        [cfg.batch_size, cfg.discriminator_batch_size],
+        evaluate,
+    )
+
+
+def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
+    """Simulate, update, look at it, again and again."""
+    simulator, reality = make_simulator(cfg), make_reality(cfg)
+    real = as_observed(cfg, real)  # both streams show observations and rewards in the same way
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
-    collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
+    observation_dim = simulator.observation_spec["observation"].shape[-1]
+    learner = make_learner(cfg, observation_dim, simulator.action_spec_unbatched, replay)
+    estimator = learner.losses["ratio_loss"].estimator
+    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
+    collector = Collector(simulator, learner.actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
     rollouts = iter(collector)
 
-    training = Training(
-        "H2O+",
-        cfg,
-        directory,
-        actor=actor,
-        loss=loss,
-        ratio_loss=ratio_loss,
-        optimiser=optimiser,
-        schedule=schedule,
-        replay=replay,
-    )
+    training = Training("H2O+", cfg, directory, **learner.components, schedule=schedule)
     for epoch, evaluating in training.epochs(simulator):
         simulated = next(rollouts)
         simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
         replay.extend(simulated)
         for _ in training.epoch_updates():
-            batch = replay.sample()
-            ratio_losses = ratio_loss(replay.sample(cfg.discriminator_batch_size))
-            if cfg.ratio:
-                estimator(batch)  # Eq. (9): writes the dynamics ratio
-            losses = loss(batch)
-            total = sum(term for name, term in (*losses.items(), *ratio_losses.items()) if name.startswith("loss_"))
-            optimiser.zero_grad()
-            total.backward()
-            optimiser.step()
-            targets.step()
+            losses = learner.update()
         schedule.step()
         if evaluating:
-            evaluation = evaluate(reality, actor, cfg.eval_episodes)
-            sim = ~batch["real"]
+            evaluation = evaluate(reality, learner.actor, cfg.eval_episodes)
+            batch = learner.batches[0]
             training.log(
                 epoch,
                 return_real=evaluation.mean,
                 return_real_std=evaluation.std,
                 length_real=evaluation.mean_length,
-                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][sim].mean()),
-                accuracy_sa=float(ratio_losses["accuracy_sa"]),
-                accuracy=float(ratio_losses["accuracy"]),
+                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
                 **{name: value.item() for name, value in losses.items()},
-                **{name: value.item() for name, value in ratio_losses.items() if name.startswith("loss_")},
             )
     collector.shutdown()
-    return actor, training
+    return learner.actor, training
 
 
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:

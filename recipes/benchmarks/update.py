@@ -1,0 +1,176 @@
+"""Measures updates a second: ours beside a textbook's, and beside what matrix products alone would allow.
+
+python recipes/benchmarks/update.py                        # two minutes; HalfCheetah's sizes, the authors' batches
+python recipes/benchmarks/update.py compiled=false seconds=1
+python recipes/benchmarks/update.py device=cuda
+
+Contenders take turns, so that what else the machine does falls on all of them. Leaves update.json in the run's folder.
+Compare ratios from one machine to another, not updates a second.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import h2o_plus
+import hydra
+import sac
+import torch
+from hydra.core.hydra_config import HydraConfig
+from learner import Learner, adam
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
+from textbook import TextbookH2OPlus
+from torch.utils.flop_counter import FlopCounterMode
+from torchrl.data import Bounded
+from torchrl.objectives import SoftUpdate
+from tqdm import tqdm
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import H2OPlusLoss, make_actor, make_qvalue
+
+PRODUCT = 2048  # rows and columns of the matrices whose product is timed
+WARM_UP = 10  # updates
+
+
+def some_transitions(cfg: DictConfig) -> TensorDict:
+    """Transitions of the right sizes; what they say does not matter for speed."""
+    shape = (cfg.transitions, cfg.observation_dim)
+    done = torch.zeros(cfg.transitions, 1, dtype=torch.bool)
+    return TensorDict(
+        observation=torch.randn(shape),
+        action=torch.rand(cfg.transitions, cfg.action_dim) * 2.0 - 1.0,
+        next=TensorDict(
+            observation=torch.randn(shape), reward=torch.randn(cfg.transitions, 1), done=done, terminated=done.clone()
+        ),
+        batch_size=[cfg.transitions],
+    )
+
+
+def textbook(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Callable[[], object]:
+    """(a): plain tensors, drawn by index."""
+    method = TextbookH2OPlus(cfg.observation_dim, cfg.action_dim, run.num_cells[0])
+    real, sim = (
+        {
+            "observation": stored["observation"],
+            "action": stored["action"],
+            "reward": stored["next", "reward"].squeeze(-1),
+            "terminated": stored["next", "terminated"].squeeze(-1).float(),
+            "next_observation": stored["next", "observation"],
+        }
+        for stored in (replay.real.storage[:], replay.sim.storage[:])
+    )
+    (n_real, n_sim), (pairs_real, pairs_sim) = run.batch_size, run.discriminator_batch_size
+
+    def draw(stream: dict[str, torch.Tensor], size: int) -> dict[str, torch.Tensor]:
+        index = torch.randint(cfg.transitions, (size,))
+        return {key: value[index] for key, value in stream.items()}
+
+    return lambda: method.update(draw(real, n_real), draw(sim, n_sim), draw(real, pairs_real), draw(sim, pairs_sim))
+
+
+def ours_on_one_loss(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Learner:
+    """SAC of this library's parts: Eq. (6) on both streams, no V and no ratio."""
+    actor = make_actor(cfg.observation_dim, action_spec(cfg), run.num_cells)
+    qvalues = [make_qvalue(cfg.observation_dim, cfg.action_dim, run.num_cells) for _ in range(2)]
+    loss = H2OPlusLoss(actor, qvalues, None, mixing=0.0)
+    targets = SoftUpdate(loss, tau=run.tau)
+    return Learner(actor, {"loss": loss}, adam(loss, lr=run.lr), targets, replay, [run.batch_size], loss)
+
+
+def action_spec(cfg: DictConfig) -> Bounded:
+    return Bounded(-1.0, 1.0, (cfg.action_dim,))
+
+
+def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], object]]:
+    """What is compared, each a function that makes one update."""
+    replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
+    replay.extend(some_transitions(cfg))
+    make = partial(h2o_plus.make_learner, run, cfg.observation_dim, action_spec(cfg), replay)
+    chosen = {"textbook": textbook(cfg, run, replay), "ours": make().update}
+    if cfg.compiled:
+        learner = make()
+        learner.evaluate = torch.compile(learner.evaluate)
+        chosen["ours, compiled"] = learner.update
+    torchrl_sac = sac.make_learner(run, cfg.observation_dim, action_spec(cfg), replay)
+    torchrl_sac.batch_sizes = [run.batch_size]
+    chosen["SAC, TorchRL's loss"] = torchrl_sac.update
+    chosen["SAC of our parts"] = ours_on_one_loss(cfg, run, replay).update
+    return chosen
+
+
+def matrix_product(device: str) -> Callable[[], object]:
+    a, b = torch.randn(2, PRODUCT, PRODUCT, device=device)
+    return lambda: a @ b
+
+
+def products_of(update: Callable[[], object]) -> int:
+    """Floating-point operations of one update's matrix products."""
+    with FlopCounterMode(display=False) as counter:
+        update()
+    return counter.get_total_flops()
+
+
+def rates(functions: Mapping[str, Callable[[], object]], cfg: DictConfig) -> dict[str, float]:
+    """Calls a second of each, the best of several turns."""
+    best = dict.fromkeys(functions, 0.0)
+    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
+    bar = tqdm(desc="measuring", total=len(functions) * (1 + cfg.turns), unit=" turns")
+    for turn in range(1 + cfg.turns):
+        for name, function in functions.items():
+            bar.set_postfix_str(name)
+            synchronise()
+            start, calls = time.perf_counter(), 0
+            while calls < WARM_UP or (turn and time.perf_counter() - start < cfg.seconds):
+                function()
+                calls += 1
+            synchronise()
+            if turn:  # the first is to warm up
+                best[name] = max(best[name], calls / (time.perf_counter() - start))
+            bar.update()
+    bar.close()
+    return best
+
+
+def print_table(result: dict) -> None:
+    print(f"\n{'an update of H2O+':<34}{'a second':>10}{'× textbook':>12}{'of the limit':>14}")
+    for name, rate in result["updates_per_second"].items():
+        if name.startswith("SAC"):
+            continue
+        of_limit = rate / result["limit"]
+        print(f"{name:<34}{rate:>10.1f}{rate / result['updates_per_second']['textbook']:>12.2f}{of_limit:>14.0%}")
+    gflop = result["flop"] / 1e9
+    print(f"{f'matrix products alone ({gflop:.2f} GFLOP)':<34}{result['limit']:>10.1f}")
+    sac_rates = {name: rate for name, rate in result["updates_per_second"].items() if name.startswith("SAC")}
+    print(f"\n{'an update of SAC':<34}{'a second':>10}")
+    for name, rate in sac_rates.items():
+        print(f"{name:<34}{rate:>10.1f}")
+
+
+@hydra.main(config_path="../config", config_name="update_benchmark", version_base=None)
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    torch.set_default_device(cfg.device)
+    run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")  # the recipe's own constants
+    functions = contenders(cfg, run)
+    flop = products_of(functions["textbook"])
+    measured = rates({**functions, "product": matrix_product(cfg.device)}, cfg)
+    gflops = 2.0 * PRODUCT**3 * measured.pop("product") / 1e9
+    result = {"updates_per_second": measured, "flop": flop, "gflop_per_second": gflops, "limit": gflops * 1e9 / flop}
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    result |= {"torch": torch.__version__, "threads": cfg.threads, "device": cfg.device}
+    (directory / "update.json").write_text(json.dumps(result, indent=2) + "\n")
+    print_table(result)
+    print(f"\nresults    {os.path.relpath(directory)}/update.json")
+
+
+if __name__ == "__main__":
+    main()

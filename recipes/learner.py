@@ -1,0 +1,55 @@
+"""What is trained, and one update of it: batches, losses, a step of the optimiser, a step of the targets."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.objectives import LossModule, SoftUpdate
+
+from torchrl_h2o.data import HybridReplayBuffer
+
+
+@dataclass
+class Learner:
+    """Networks with their losses, their optimiser and their data.
+
+    Args:
+        actor: the policy.
+        losses: by the name that a checkpoint gives them; each holds the networks that it trains.
+        optimiser: of all of their parameters.
+        targets: moves the target networks.
+        replay: where batches come from.
+        batch_sizes: of the batches of one update, (real, simulated) rows each.
+        evaluate: takes these batches; returns terms named ``loss_*``, to be added up, and figures to be logged.
+        batches: those of the last update.
+    """
+
+    actor: torch.nn.Module
+    losses: dict[str, LossModule]
+    optimiser: torch.optim.Optimizer
+    targets: SoftUpdate
+    replay: HybridReplayBuffer
+    batch_sizes: Sequence[tuple[int, int]]
+    evaluate: Callable[..., dict[str, torch.Tensor]]
+    batches: list[TensorDictBase] = field(default_factory=list)
+
+    def update(self) -> dict[str, torch.Tensor]:
+        """One update of everything; returns what ``evaluate`` did."""
+        self.batches = [self.replay.sample(size) for size in self.batch_sizes]
+        losses = self.evaluate(*self.batches)
+        self.optimiser.zero_grad()
+        sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
+        self.optimiser.step()
+        self.targets.step()
+        return losses
+
+    @property
+    def components(self) -> dict:
+        """What a checkpoint holds."""
+        return {"actor": self.actor, **self.losses, "optimiser": self.optimiser, "replay": self.replay}
+
+
+def adam(*losses: LossModule, lr: float) -> torch.optim.Adam:
+    """One Adam for all parameters, in one pass over them."""
+    return torch.optim.Adam([p for loss in losses for p in loss.parameters()], lr=lr, fused=True)
