@@ -4,6 +4,7 @@ Needs MuJoCo, and Gymnasium or dm_control for their tasks (``pip install torchrl
 """
 
 from torchrl_h2o.envs.balance_controller import BalanceController, noisy_balance_controller
+from torchrl_h2o.envs.batched_env import BatchedMujocoEnv
 from torchrl_h2o.envs.dynamics_gap import DynamicsGap, dynamics_gap
 from torchrl_h2o.envs.mujoco_model import mujoco_model
 from torchrl_h2o.envs.recording import record
@@ -11,6 +12,7 @@ from torchrl_h2o.envs.wheel_legged import WheelLeggedEnv, WheelLeggedMujocoEnv
 
 __all__ = [
     "BalanceController",
+    "BatchedMujocoEnv",
     "DynamicsGap",
     "WheelLeggedEnv",
     "WheelLeggedMujocoEnv",

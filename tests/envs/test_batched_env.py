@@ -1,0 +1,170 @@
+"""Many worlds at once: what Gymnasium's own task does from the same states under the same actions, in each of them."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_h2o.effects import ActionDelay, ActionNoise, Gravity, LinearDrag, ObservationGain
+from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap, WheelLeggedEnv, dynamics_gap, mujoco_model
+
+TASKS = {
+    "HalfCheetah": lambda: GymEnv("HalfCheetah-v5"),
+    "Hopper": lambda: GymEnv("Hopper-v5"),
+    "Walker2d": lambda: GymEnv("Walker2d-v5"),
+    "standing still": lambda: WheelLeggedEnv("standing_still"),
+    "moving forward": lambda: WheelLeggedEnv("moving_forward"),
+}
+WORLDS = 3
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_step_is_that_of_the_task_from_the_same_state(name):
+    torch.manual_seed(0)
+    env, single = BatchedMujocoEnv(TASKS[name](), WORLDS), TASKS[name]()
+    task = single._env.unwrapped
+    task.reset(seed=0)
+    td, ended = env.reset(), 0
+    for _ in range(60):
+        td = env.rand_action(td)
+        if name in ("standing still", "moving forward"):
+            td["action"] *= 0.1
+        before, td = env._states.copy(), env.step(td)
+        for world in range(WORLDS):
+            mujoco.mj_setState(task.model, task.data, before[world], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            observation, reward, terminated, _, _ = task.step(td["action"][world].numpy())
+            np.testing.assert_allclose(td["next", "observation"][world].numpy(), observation, atol=1e-9)
+            assert td["next", "reward"][world].item() == pytest.approx(float(np.float32(reward)), abs=1e-9)
+            assert td["next", "terminated"][world].item() == terminated
+            ended += terminated
+        td = env.maybe_reset(env.step_mdp(td))
+    assert ended or name not in ("Hopper", "Walker2d")
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_an_episode_begins_as_gymnasium_begins_it(name):
+    env = BatchedMujocoEnv(TASKS[name](), 1)
+    env.set_seed(7)
+    observation, _ = TASKS[name]()._env.unwrapped.reset(seed=7)
+    np.testing.assert_array_equal(env.reset()["observation"][0].numpy(), observation)
+
+
+def test_worlds_begin_differently_and_seeds_repeat_them():
+    env = BatchedMujocoEnv(TASKS["HalfCheetah"](), WORLDS)
+    env.set_seed(1)
+    first = env.reset()["observation"]
+    assert len(first.unique(dim=0)) == WORLDS
+    assert not torch.equal(env.reset()["observation"], first)
+    env.set_seed(1)
+    assert torch.equal(env.reset()["observation"], first)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_specs_are_kept(name):
+    env = BatchedMujocoEnv(TASKS[name](), WORLDS)
+    check_env_specs(env)
+    single = TASKS[name]()
+    assert env.observation_spec["observation"].dtype == single.observation_spec["observation"].dtype
+    assert env.reward_spec.dtype == single.reward_spec.dtype
+
+
+def test_an_episode_is_truncated_at_the_task_s_limit_and_worlds_are_reset_one_by_one():
+    env = BatchedMujocoEnv(WheelLeggedEnv(max_episode_steps=5), WORLDS)
+    td = env.reset()
+    reset = td.clone().set("_reset", torch.tensor([[False], [True], [False]]))
+    for _ in range(3):
+        td = env.step(td.set("action", torch.zeros(WORLDS, 1)))["next"]
+    before = td["observation"].clone()
+    td = env.reset(td.exclude("reward").update(reset.select("_reset")))
+    assert torch.equal(td["observation"][[0, 2]], before[[0, 2]])
+    assert not torch.equal(td["observation"][1], before[1])
+    for _ in range(2):
+        td = env.step(td.set("action", torch.zeros(WORLDS, 1)))["next"]
+    assert td["truncated"].squeeze(-1).tolist() == [True, False, True]
+    assert td["done"].squeeze(-1).tolist() == [True, False, True]
+    assert not td["terminated"].any()
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [(Gravity(1.5),), (ActionDelay(0.13),), (LinearDrag(3.0, bodies="torso"),), (ObservationGain(1.2, (3,)),)],
+    ids=lambda effects: type(effects[0]).__name__,
+)
+@pytest.mark.parametrize("inside", [True, False], ids=["of the env", "beside it"])
+def test_effects_do_what_a_dynamics_gap_does(effects, inside):
+    single = TransformedEnv(TASKS["HalfCheetah"](), DynamicsGap(*effects))
+    env = BatchedMujocoEnv(
+        TransformedEnv(TASKS["HalfCheetah"](), DynamicsGap(*effects)) if inside else TASKS["HalfCheetah"](),
+        2,
+        () if inside else effects,
+    )
+    env.set_seed(3)
+    task = single.base_env._env.unwrapped
+    together, alone = env.reset(), single.reset()
+    mujoco.mj_setState(task.model, task.data, env._states[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    for _ in range(8):
+        action = 2.0 * torch.rand(6) - 1.0
+        together = env.step(together.set("action", action.expand(2, 6).clone()))["next"]
+        alone = single.step(alone.set("action", action))["next"]
+        torch.testing.assert_close(together["observation"][0], alone["observation"], rtol=0.0, atol=1e-8)
+
+
+def test_every_world_can_have_effects_of_its_own():
+    scales = np.linspace(0.5, 2.0, WORLDS)
+    env = BatchedMujocoEnv(TASKS["HalfCheetah"](), WORLDS, [[Gravity(scale)] for scale in scales])
+    assert [model.opt.gravity[2] for model in env.models] == pytest.approx(list(-9.81 * scales))
+    env.reset()
+    env._states[:] = env._states[0]
+    td = env.step(env.reset().set("action", torch.zeros(WORLDS, 6)))
+    falls = td["next", "observation"][:, 9]  # vertical velocity
+    assert falls[0] > falls[1] > falls[2]
+    with pytest.raises(ValueError, match="2 lists of effects for 3 worlds"):
+        BatchedMujocoEnv(TASKS["HalfCheetah"](), WORLDS, [[Gravity(2.0)], []])
+
+
+def test_noise_of_the_action_differs_from_world_to_world_and_is_seeded_by_torch():
+    env = BatchedMujocoEnv(TransformedEnv(TASKS["HalfCheetah"](), dynamics_gap("joint_noise")), WORLDS)
+
+    def reached():
+        torch.manual_seed(5)
+        env.set_seed(0)
+        return env.step(env.reset().set("action", torch.zeros(WORLDS, 6)))["next", "observation"]
+
+    first = reached()
+    assert torch.equal(reached(), first)
+    quiet = BatchedMujocoEnv(TASKS["HalfCheetah"](), WORLDS)
+    quiet.set_seed(0)
+    still = quiet.step(quiet.reset().set("action", torch.zeros(WORLDS, 6)))["next", "observation"]
+    assert len((first - still).unique(dim=0)) == WORLDS
+
+
+def test_noise_that_the_simulator_should_not_have_is_taken_away():
+    noisy = TransformedEnv(TASKS["HalfCheetah"](), dynamics_gap("joint_noise"))
+    env = BatchedMujocoEnv(noisy, 2, [ActionNoise(-1.0)])
+    assert not env._alters_actions
+
+
+def test_it_feeds_a_collector():
+    env = BatchedMujocoEnv(TASKS["Walker2d"](), 4)
+    collector = Collector(env, frames_per_batch=400, total_frames=400)
+    (batch,) = list(collector)
+    assert batch.shape == (4, 100)
+    assert batch["next", "terminated"].any()
+    following, begun = batch["next", "observation"][:, :-1], batch["observation"][:, 1:]
+    done = batch["next", "done"][:, :-1, 0]
+    assert torch.equal(following[~done], begun[~done])
+    assert not torch.equal(following[done], begun[done])
+
+
+def test_a_task_whose_rules_are_not_known_says_what_to_do():
+    with pytest.raises(ValueError, match=r"rules of AntEnv are not known.*TaskRules"):
+        BatchedMujocoEnv(GymEnv("Ant-v5"), 2)
+
+
+def test_the_model_of_the_env_that_was_given_stays_as_it_was():
+    given = TASKS["HalfCheetah"]()
+    BatchedMujocoEnv(given, 2, [Gravity(2.0)]).rollout(3)
+    assert mujoco_model(given).opt.gravity[2] == pytest.approx(-9.81)

@@ -1,0 +1,280 @@
+"""Many MuJoCo worlds of one task in one TorchRL env, stepped at once by ``mujoco.rollout``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import cpu_count
+
+import mujoco
+import numpy as np
+import torch
+from gymnasium.utils import seeding
+from gymnasium.wrappers import TimeLimit
+from mujoco.rollout import Rollout
+from tensordict import TensorDict, TensorDictBase
+from torchrl._utils import seed_generator
+from torchrl.data import Composite
+from torchrl.envs import EnvBase
+
+from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect, balanced, compile_model
+from torchrl_h2o.effects.effect import BatchedForce, Process
+from torchrl_h2o.envs.gymnasium_simulator import GymnasiumSimulator
+from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.task_rules import rules_of
+
+_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_CTRL_AND_FORCE = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+
+
+class BatchedMujocoEnv(EnvBase):
+    """N worlds of a Gymnasium MuJoCo task, stepped at once on all processors.
+
+    Observations, rewards, terminations, resets and the time limit are those of the task: from the same states and
+    actions they agree with Gymnasium's to rounding. Worlds are reset one by one, through TorchRL's ``"_reset"``.
+
+    Effects that are in the env that is given (its :class:`~torchrl_h2o.envs.DynamicsGap`) are in every world. Further
+    ones may be the same for all or differ from world to world, which makes domain randomisation one line.
+
+    Args:
+        env: one env of the task, with or without dynamics gaps. It is kept, and not stepped.
+        num_worlds: N.
+        effects: more effects, for all worlds, or one list of them a world.
+
+    Keyword Args:
+        num_threads: of ``mujoco.rollout``. As many as there are processors by default.
+
+    Raises:
+        ValueError: if the env is no Gymnasium MuJoCo task whose rules are known, or there is not one list of effects
+            a world.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.effects import Gravity
+        >>> from torchrl_h2o.envs import BatchedMujocoEnv
+        >>> env = BatchedMujocoEnv(GymEnv("HalfCheetah-v5"), 4, [[Gravity(g)] for g in np.linspace(0.5, 2.0, 4)])
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([4, 3, 1])
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        num_worlds: int,
+        effects: Sequence[Effect] | Sequence[Sequence[Effect]] = (),
+        *,
+        num_threads: int | None = None,
+    ) -> None:
+        if num_worlds < 1:
+            raise ValueError(f"num_worlds is {num_worlds}; there must be at least one world")
+        super().__init__(device=torch.device("cpu"), batch_size=[num_worlds])
+        simulator = find_simulator(env)
+        if not isinstance(simulator, GymnasiumSimulator):
+            raise ValueError(f"{env} is no Gymnasium task; build one world of it with GymEnv")
+        self._task = simulator.owner
+        self._rules = rules_of(self._task)
+        self.num_worlds = num_worlds
+        self.max_episode_steps = _time_limit(simulator.env)
+        inside = [effect for of_gap in simulator.gaps.values() for effect in of_gap]
+        self._effects = [balanced((*inside, *own)) for own in _of_each_world(effects, num_worlds)]
+        self._control_step = simulator.control_step
+        self._frame_skip = round(simulator.control_step / simulator.model.opt.timestep)
+        self._models = self._compiled(simulator)
+        self._pool = Rollout(nthread=num_threads or cpu_count())
+        self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
+        self._states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], _FULL)))
+        self._steps = np.zeros(num_worlds, dtype=np.int64)
+        self._worlds = [_World(own, self._control_step) for own in self._effects]
+        self._alters_actions = any(world.on_actions for world in self._worlds)
+        self._alters_observations = any(world.on_observations for world in self._worlds)
+        self._forces = self._batched_forces()
+        self._differ = len({id(model) for model in self._models}) > 1
+        self._control_steps = np.array([self._frame_skip * model.opt.timestep for model in self._models])
+        self._everywhere = np.ones(num_worlds, dtype=bool)
+        self._make_specs(simulator.env)
+        self.set_seed(int(torch.randint(2**31, ())))
+
+    @property
+    def models(self) -> Sequence[mujoco.MjModel]:
+        """The model of each world, with its effects in it."""
+        return self._models
+
+    def _compiled(self, simulator: GymnasiumSimulator) -> list[mujoco.MjModel]:
+        """A model a world; worlds with the same effects share one."""
+        models: dict[tuple[Effect, ...], mujoco.MjModel] = {}
+        for effects in self._effects:
+            if tuple(effects) not in models:
+                model = compile_model(simulator.spec(), effects)
+                simulator._check_sizes(model)
+                models[tuple(effects)] = model
+        return [models[tuple(effects)] for effects in self._effects]
+
+    def _batched_forces(self) -> list[tuple[np.ndarray, BatchedForce]]:
+        """The forces that act, each with the worlds that it acts in."""
+        of_effects: dict[tuple[Effect, ...], list[int]] = {}
+        for index, effects in enumerate(self._effects):
+            of_effects.setdefault(tuple(effects), []).append(index)
+        return [
+            (np.array(worlds), effect.batched(self._models[worlds[0]]))
+            for effects, worlds in of_effects.items()
+            for effect in _of_kind(effects, ForceEffect)
+        ]
+
+    def _make_specs(self, env: EnvBase) -> None:
+        n = self.num_worlds
+        self.observation_spec = env.observation_spec.expand(n)
+        self.action_spec = env.action_spec_unbatched.expand(n, *env.action_spec_unbatched.shape)
+        self.reward_spec = env.reward_spec.expand(n, *env.reward_spec.shape)
+        self.done_spec = Composite({key: spec.expand(n, 1) for key, spec in env.full_done_spec.items()}, shape=(n,))
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._generators = []
+        for _ in range(self.num_worlds):
+            self._generators.append(seeding.np_random(seed)[0])
+            seed = None if seed is None else seed_generator(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
+        mask = np.ones(self.num_worlds, dtype=bool)
+        if tensordict is not None and (chosen := tensordict.get("_reset", None)) is not None:
+            mask = chosen.reshape(self.num_worlds, -1).any(1).numpy()
+        for index in np.flatnonzero(mask):
+            self._begin(int(index))
+        observation = self._observe(mask)
+        done = torch.zeros(self.num_worlds, 1, dtype=torch.bool)
+        return TensorDict(
+            {"observation": observation, "done": done, "terminated": done.clone(), "truncated": done.clone()},
+            batch_size=self.batch_size,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action").numpy()
+        executed = action
+        if self._alters_actions:
+            executed = np.stack([world.executed(own) for world, own in zip(self._worlds, action, strict=True)])
+            executed = executed.astype(action.dtype)
+        before = self._positions.copy()
+        self._simulate(executed)
+        self._steps += 1
+        paid = self._rules.reward(before, self._positions, self._velocities, executed, self._control_steps)
+        terminated = self._rules.is_terminated(self._positions, self._velocities)
+        truncated = self._steps >= self.max_episode_steps
+        return TensorDict(
+            {
+                "observation": self._observe(self._everywhere),
+                "reward": torch.as_tensor(paid, dtype=self.reward_spec.dtype).unsqueeze(-1),
+                "terminated": torch.from_numpy(terminated).unsqueeze(-1),
+                "truncated": torch.from_numpy(truncated).unsqueeze(-1),
+                "done": torch.from_numpy(terminated | truncated).unsqueeze(-1),
+            },
+            batch_size=self.batch_size,
+        )
+
+    @property
+    def _positions(self) -> np.ndarray:
+        return self._states[:, 1 : 1 + self._models[0].nq]
+
+    @property
+    def _velocities(self) -> np.ndarray:
+        nq, nv = self._models[0].nq, self._models[0].nv
+        return self._states[:, 1 + nq : 1 + nq + nv]
+
+    def _begin(self, index: int) -> None:
+        """Begins an episode in one world: the task draws where it starts, with the world's own generator."""
+        task = self._task
+        task.np_random = self._generators[index]
+        mujoco.mj_resetData(task.model, task.data)
+        task.reset_model()
+        state = self._states[index]
+        mujoco.mj_getState(task.model, task.data, state, _FULL)
+        # a task may start from a pose of its own; where it starts from the model's, follow that of the world's model
+        own, qpos0 = self._models[index].qpos0, task.model.qpos0
+        state[1 : 1 + len(own)] += np.where(task.init_qpos == qpos0, own - qpos0, 0.0)
+        self._steps[index] = 0
+        self._worlds[index].begin()
+
+    def _observe(self, mask: np.ndarray) -> torch.Tensor:
+        """What is observed of the worlds in a mask, (N); of the others what was observed last."""
+        observed = self._rules.observe(self._positions, self._velocities)
+        if self._alters_observations:
+            for index in np.flatnonzero(mask):
+                observed[index] = self._worlds[index].observed(observed[index])
+        if not mask.all():
+            observed[~mask] = self._observed[~mask]
+        self._observed = observed
+        return torch.as_tensor(observed, dtype=self.observation_spec["observation"].dtype)
+
+    def _simulate(self, actions: np.ndarray) -> None:
+        """One control step of all worlds."""
+        models = self._models if self._differ else self._models[0]
+        if not self._forces:
+            control = np.repeat(actions[:, None].astype(float), self._frame_skip, axis=1)
+            states, _ = self._pool.rollout(models, self._data, self._states, control)
+            self._states = states[:, -1].copy()
+            return
+        nq, nv = self._models[0].nq, self._models[0].nv
+        for _ in range(self._frame_skip):
+            total = np.zeros((self.num_worlds, nv))
+            time, qpos, qvel = self._states[:, 0], self._states[:, 1 : 1 + nq], self._states[:, 1 + nq : 1 + nq + nv]
+            for worlds, force in self._forces:
+                total[worlds] += force(qpos[worlds], qvel[worlds], actions[worlds].astype(float), time[worlds])
+            control = np.concatenate([actions, total], axis=-1)[:, None]
+            states, _ = self._pool.rollout(models, self._data, self._states, control, control_spec=_CTRL_AND_FORCE)
+            self._states = states[:, 0].copy()
+
+
+class _World:
+    """The effects of one world that are not in its model, with what they remember since its last reset."""
+
+    def __init__(self, effects: Sequence[Effect], control_step: float) -> None:
+        self.on_actions = _of_kind(effects, ActionEffect)
+        self.on_observations = _of_kind(effects, ObservationEffect)
+        self.control_step = control_step
+        self.begin()
+
+    def begin(self) -> None:
+        """Forgets, and draws a new generator for random effects, from torch's global one."""
+        rng = None
+        if any(effect.random for effect in (*self.on_actions, *self.on_observations)):
+            rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
+        self._actions = [effect.process(self.control_step, rng) for effect in self.on_actions]
+        self._observations = [effect.process(self.control_step, rng) for effect in self.on_observations]
+
+    def executed(self, action: np.ndarray) -> np.ndarray:
+        """What is executed of an action, (nu)."""
+        return _through(self._actions, action)
+
+    def observed(self, observation: np.ndarray) -> np.ndarray:
+        """What is reported of an observation, (n)."""
+        return _through(self._observations, observation)
+
+
+def _through(processes: Sequence[Process], values: np.ndarray) -> np.ndarray:
+    values = values.astype(float)  # a copy: what an effect remembers must not change
+    for process in processes:
+        values = process(values)
+    return values
+
+
+def _of_kind(effects: Sequence[Effect], kind: type[Effect]) -> list[Effect]:
+    return [effect for effect in effects if isinstance(effect, kind) and not effect.is_neutral]
+
+
+def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_worlds: int) -> list[tuple[Effect, ...]]:
+    effects = list(effects)
+    if all(isinstance(effect, Effect) for effect in effects):
+        return [tuple(effects)] * num_worlds
+    if len(effects) != num_worlds:
+        raise ValueError(
+            f"there are {len(effects)} lists of effects for {num_worlds} worlds: give one a world, or one list for all"
+        )
+    return [tuple(own) for own in effects]
+
+
+def _time_limit(env: EnvBase) -> float:
+    """The steps after which the task's TimeLimit wrapper truncates; infinite without one."""
+    wrapper = env._env
+    while wrapper is not wrapper.unwrapped:
+        if isinstance(wrapper, TimeLimit):
+            return wrapper._max_episode_steps
+        wrapper = wrapper.env
+    return np.inf
