@@ -64,7 +64,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
 
-    def evaluate(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
+    def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
         ratio_losses = ratio_loss(pairs)
         if cfg.ratio:
             estimator(batch)  # Eq. (9): writes the dynamics ratio
@@ -77,7 +77,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         SoftUpdate(loss, tau=cfg.tau),
         replay,
         [cfg.batch_size, cfg.discriminator_batch_size],
-        evaluate,
+        terms_of,
     )
 
 

@@ -21,7 +21,7 @@ class Learner:
         targets: moves the target networks.
         replay: where batches come from.
         batch_sizes: of the batches of one update, (real, simulated) rows each.
-        evaluate: takes these batches; returns terms named ``loss_*``, to be added up, and figures to be logged.
+        terms_of: takes these batches; returns terms named ``loss_*``, to be added up, and figures to be logged.
         batches: those of the last update.
     """
 
@@ -31,13 +31,13 @@ class Learner:
     targets: SoftUpdate
     replay: HybridReplayBuffer
     batch_sizes: Sequence[tuple[int, int]]
-    evaluate: Callable[..., dict[str, torch.Tensor]]
+    terms_of: Callable[..., dict[str, torch.Tensor]]
     batches: list[TensorDictBase] = field(default_factory=list)
 
     def update(self) -> dict[str, torch.Tensor]:
-        """One update of everything; returns what ``evaluate`` did."""
+        """One update of everything; returns what ``terms_of`` did."""
         self.batches = [self.replay.sample(size) for size in self.batch_sizes]
-        losses = self.evaluate(*self.batches)
+        losses = self.terms_of(*self.batches)
         self.optimiser.zero_grad()
         sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
         self.optimiser.step()

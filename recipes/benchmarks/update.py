@@ -98,7 +98,7 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
     chosen = {"textbook": textbook(cfg, run, replay), "ours": make().update}
     if cfg.compiled:
         learner = make()
-        learner.evaluate = torch.compile(learner.evaluate)
+        learner.terms_of = torch.compile(learner.terms_of)
         chosen["ours, compiled"] = learner.update
     torchrl_sac = sac.make_learner(run, cfg.observation_dim, action_spec(cfg), replay)
     torchrl_sac.batch_sizes = [run.batch_size]
