@@ -16,8 +16,7 @@ import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
 import json
 import os
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 
 import h2o_plus
@@ -32,13 +31,12 @@ from textbook import TextbookH2OPlus
 from torch.utils.flop_counter import FlopCounterMode
 from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate
-from tqdm import tqdm
+from turns import calls_per_second
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import H2OPlusLoss, make_actor, make_qvalue
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
-WARM_UP = 10  # updates
 
 
 def some_transitions(cfg: DictConfig) -> TensorDict:
@@ -119,27 +117,6 @@ def products_of(update: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def rates(functions: Mapping[str, Callable[[], object]], cfg: DictConfig) -> dict[str, float]:
-    """Calls a second of each, the best of several turns."""
-    best = dict.fromkeys(functions, 0.0)
-    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
-    bar = tqdm(desc="measuring", total=len(functions) * (1 + cfg.turns), unit=" turns")
-    for turn in range(1 + cfg.turns):
-        for name, function in functions.items():
-            bar.set_postfix_str(name)
-            synchronise()
-            start, calls = time.perf_counter(), 0
-            while calls < WARM_UP or (turn and time.perf_counter() - start < cfg.seconds):
-                function()
-                calls += 1
-            synchronise()
-            if turn:  # the first is to warm up
-                best[name] = max(best[name], calls / (time.perf_counter() - start))
-            bar.update()
-    bar.close()
-    return best
-
-
 def print_table(result: dict) -> None:
     print(f"\n{'an update of H2O+':<34}{'a second':>10}{'× textbook':>12}{'of the limit':>14}")
     for name, rate in result["updates_per_second"].items():
@@ -162,7 +139,9 @@ def main(cfg: DictConfig) -> None:
     run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")  # the recipe's own constants
     functions = contenders(cfg, run)
     flop = products_of(functions["textbook"])
-    measured = rates({**functions, "product": matrix_product(cfg.device)}, cfg)
+    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
+    functions |= {"product": matrix_product(cfg.device)}
+    measured = calls_per_second(functions, cfg.seconds, cfg.turns, synchronise)
     gflops = 2.0 * PRODUCT**3 * measured.pop("product") / 1e9
     result = {"updates_per_second": measured, "flop": flop, "gflop_per_second": gflops, "limit": gflops * 1e9 / flop}
     directory = Path(HydraConfig.get().runtime.output_dir)

@@ -32,7 +32,7 @@ def test_every_step_is_that_of_the_task_from_the_same_state(name):
         td = env.rand_action(td)
         if name in ("standing still", "moving forward"):
             td["action"] *= 0.1
-        before, td = env._states.copy(), env.step(td)
+        before, td = env.states.copy(), env.step(td)
         for world in range(WORLDS):
             mujoco.mj_setState(task.model, task.data, before[world], mujoco.mjtState.mjSTATE_FULLPHYSICS)
             observation, reward, terminated, _, _ = task.step(td["action"][world].numpy())
@@ -104,7 +104,7 @@ def test_effects_do_what_a_dynamics_gap_does(effects, inside):
     env.set_seed(3)
     task = single.base_env._env.unwrapped
     together, alone = env.reset(), single.reset()
-    mujoco.mj_setState(task.model, task.data, env._states[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    mujoco.mj_setState(task.model, task.data, env.states[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
     for _ in range(8):
         action = 2.0 * torch.rand(6) - 1.0
         together = env.step(together.set("action", action.expand(2, 6).clone()))["next"]
@@ -117,7 +117,7 @@ def test_every_world_can_have_effects_of_its_own():
     env = BatchedMujocoEnv(TASKS["HalfCheetah"](), WORLDS, [[Gravity(scale)] for scale in scales])
     assert [model.opt.gravity[2] for model in env.models] == pytest.approx(list(-9.81 * scales))
     env.reset()
-    env._states[:] = env._states[0]
+    env.states[:] = env.states[0]
     td = env.step(env.reset().set("action", torch.zeros(WORLDS, 6)))
     falls = td["next", "observation"][:, 9]  # vertical velocity
     assert falls[0] > falls[1] > falls[2]

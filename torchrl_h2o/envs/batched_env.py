@@ -43,6 +43,11 @@ class BatchedMujocoEnv(EnvBase):
     Keyword Args:
         num_threads: of ``mujoco.rollout``. As many as there are processors by default.
 
+    Attributes:
+        states: (N, size), MuJoCo's full physics state of each world: time, positions, velocities, activations. May be
+            written to.
+        physics_steps: of a control step.
+
     Raises:
         ValueError: if the env is no Gymnasium MuJoCo task whose rules are known, or there is not one list of effects
             a world.
@@ -78,18 +83,18 @@ class BatchedMujocoEnv(EnvBase):
         inside = [effect for of_gap in simulator.gaps.values() for effect in of_gap]
         self._effects = [balanced((*inside, *own)) for own in _of_each_world(effects, num_worlds)]
         self._control_step = simulator.control_step
-        self._frame_skip = round(simulator.control_step / simulator.model.opt.timestep)
+        self.physics_steps = round(simulator.control_step / simulator.model.opt.timestep)
         self._models = self._compiled(simulator)
         self._pool = Rollout(nthread=num_threads or cpu_count())
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
-        self._states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], _FULL)))
+        self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], _FULL)))
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._worlds = [_World(own, self._control_step) for own in self._effects]
         self._alters_actions = any(world.on_actions for world in self._worlds)
         self._alters_observations = any(world.on_observations for world in self._worlds)
         self._forces = self._batched_forces()
         self._differ = len({id(model) for model in self._models}) > 1
-        self._control_steps = np.array([self._frame_skip * model.opt.timestep for model in self._models])
+        self._control_steps = np.array([self.physics_steps * model.opt.timestep for model in self._models])
         self._everywhere = np.ones(num_worlds, dtype=bool)
         self._make_specs(simulator.env)
         self.set_seed(int(torch.randint(2**31, ())))
@@ -171,12 +176,12 @@ class BatchedMujocoEnv(EnvBase):
 
     @property
     def _positions(self) -> np.ndarray:
-        return self._states[:, 1 : 1 + self._models[0].nq]
+        return self.states[:, 1 : 1 + self._models[0].nq]
 
     @property
     def _velocities(self) -> np.ndarray:
         nq, nv = self._models[0].nq, self._models[0].nv
-        return self._states[:, 1 + nq : 1 + nq + nv]
+        return self.states[:, 1 + nq : 1 + nq + nv]
 
     def _begin(self, index: int) -> None:
         """Begins an episode in one world: the task draws where it starts, with the world's own generator."""
@@ -184,7 +189,7 @@ class BatchedMujocoEnv(EnvBase):
         task.np_random = self._generators[index]
         mujoco.mj_resetData(task.model, task.data)
         task.reset_model()
-        state = self._states[index]
+        state = self.states[index]
         mujoco.mj_getState(task.model, task.data, state, _FULL)
         # a task may start from a pose of its own; where it starts from the model's, follow that of the world's model
         own, qpos0 = self._models[index].qpos0, task.model.qpos0
@@ -207,19 +212,19 @@ class BatchedMujocoEnv(EnvBase):
         """One control step of all worlds."""
         models = self._models if self._differ else self._models[0]
         if not self._forces:
-            control = np.repeat(actions[:, None].astype(float), self._frame_skip, axis=1)
-            states, _ = self._pool.rollout(models, self._data, self._states, control)
-            self._states = states[:, -1].copy()
+            control = np.repeat(actions[:, None].astype(float), self.physics_steps, axis=1)
+            states, _ = self._pool.rollout(models, self._data, self.states, control)
+            self.states = states[:, -1].copy()
             return
         nq, nv = self._models[0].nq, self._models[0].nv
-        for _ in range(self._frame_skip):
+        for _ in range(self.physics_steps):
             total = np.zeros((self.num_worlds, nv))
-            time, qpos, qvel = self._states[:, 0], self._states[:, 1 : 1 + nq], self._states[:, 1 + nq : 1 + nq + nv]
+            time, qpos, qvel = self.states[:, 0], self.states[:, 1 : 1 + nq], self.states[:, 1 + nq : 1 + nq + nv]
             for worlds, force in self._forces:
                 total[worlds] += force(qpos[worlds], qvel[worlds], actions[worlds].astype(float), time[worlds])
             control = np.concatenate([actions, total], axis=-1)[:, None]
-            states, _ = self._pool.rollout(models, self._data, self._states, control, control_spec=_CTRL_AND_FORCE)
-            self._states = states[:, 0].copy()
+            states, _ = self._pool.rollout(models, self._data, self.states, control, control_spec=_CTRL_AND_FORCE)
+            self.states = states[:, 0].copy()
 
 
 class _World:

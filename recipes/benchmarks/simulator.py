@@ -1,0 +1,102 @@
+"""Measures simulated steps a second: one world at a time, many at once, and what ``mujoco.rollout`` alone makes.
+
+python recipes/benchmarks/simulator.py                     # a minute or two
+python recipes/benchmarks/simulator.py task=wheel_legged worlds=[64]
+
+Actions are fixed, no policy is in the loop. Leaves simulator.json in the run's folder. Compare ratios from one machine
+to another, not steps a second.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+import json
+import os
+from collections.abc import Callable
+
+import hydra
+import mujoco
+import numpy as np
+from hydra.core.hydra_config import HydraConfig
+from mujoco.rollout import Rollout
+from omegaconf import DictConfig
+from torchrl.envs import EnvBase, GymEnv
+from torchrl.envs.utils import step_mdp
+from turns import calls_per_second
+
+from torchrl_h2o.envs import BatchedMujocoEnv, WheelLeggedEnv
+
+AHEAD = 20  # control steps of one bare rollout
+
+
+def make(cfg: DictConfig) -> EnvBase:
+    return WheelLeggedEnv() if cfg.task == "wheel_legged" else GymEnv(cfg.task)
+
+
+def stepping(env: EnvBase) -> Callable[[], object]:
+    """One step of an env after another, worlds that end being reset."""
+    td = env.reset()
+    action = env.rand_action(td)["action"]
+
+    def step() -> None:
+        nonlocal td
+        td = env.maybe_reset(step_mdp(env.step(td.set("action", action))))
+
+    return step
+
+
+def gymnasium_stepping(env: EnvBase) -> Callable[[], object]:
+    """Gymnasium's own loop."""
+    task = env._env
+    task.reset(seed=0)
+    action = 0.1 * task.action_space.sample()
+
+    def step() -> None:
+        _, _, terminated, truncated, _ = task.step(action)
+        if terminated or truncated:
+            task.reset()
+
+    return step
+
+
+def bare_rollout(env: BatchedMujocoEnv, threads: int) -> Callable[[], object]:
+    """``mujoco.rollout`` from the states of an env, as far ahead as it likes."""
+    env.reset()
+    model = env.models[0]
+    states = env.states.copy()
+    control = np.random.default_rng(0).uniform(-1.0, 1.0, (len(states), AHEAD, model.nu))
+    control = np.repeat(control, env.physics_steps, axis=1)
+    data, pool = [mujoco.MjData(model) for _ in range(threads)], Rollout(nthread=threads)
+    return lambda: pool.rollout(model, data, states, control)
+
+
+@hydra.main(config_path="../config", config_name="simulator_benchmark", version_base=None)
+def main(cfg: DictConfig) -> None:
+    threads = cfg.threads or os.cpu_count()
+    functions = {"TorchRL's env": stepping(make(cfg)), "Gymnasium alone": gymnasium_stepping(make(cfg))}
+    steps = dict.fromkeys(functions, 1)
+    for worlds in cfg.worlds:
+        env = BatchedMujocoEnv(make(cfg), worlds, num_threads=threads)
+        functions[f"BatchedMujocoEnv, {worlds}"], steps[f"BatchedMujocoEnv, {worlds}"] = stepping(env), worlds
+        other = BatchedMujocoEnv(make(cfg), worlds, num_threads=threads)
+        name = f"mujoco.rollout, {worlds}"
+        functions[name], steps[name] = bare_rollout(other, threads), worlds * AHEAD
+    rates = calls_per_second(functions, cfg.seconds, cfg.turns)
+    per_second = {name: rate * steps[name] for name, rate in rates.items()}
+
+    print(f"\n{cfg.task:<34}{'steps a second':>16}{'of mujoco.rollout':>20}")
+    for name, rate in per_second.items():
+        bare = per_second.get(name.replace("BatchedMujocoEnv", "mujoco.rollout"), rate)
+        share = f"{rate / bare:.0%}" if name.startswith("BatchedMujocoEnv") else ""
+        print(f"{name:<34}{rate:>16,.0f}{share:>20}")
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    result = {"task": cfg.task, "threads": threads, "steps_per_second": per_second, "mujoco": mujoco.__version__}
+    (directory / "simulator.json").write_text(json.dumps(result, indent=2) + "\n")
+    print(f"\nresults    {os.path.relpath(directory)}/simulator.json")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""Timing by turns: contenders one after another, several times over, so that what else a machine does falls on all."""
+
+import time
+from collections.abc import Callable, Mapping
+
+from tqdm import tqdm
+
+WARM_UP = 10  # calls
+
+
+def calls_per_second(
+    functions: Mapping[str, Callable[[], object]],
+    seconds: float,
+    turns: int,
+    synchronise: Callable[[], object] = lambda: None,
+) -> dict[str, float]:
+    """Calls a second of each function, the best of several turns.
+
+    Args:
+        functions: by name.
+        seconds: of one turn.
+        turns: of each function, after one to warm up.
+        synchronise: waits until what was called is done.
+    """
+    best = dict.fromkeys(functions, 0.0)
+    with tqdm(desc="measuring", total=len(functions) * (1 + turns), unit=" turns") as bar:
+        for turn in range(1 + turns):
+            for name, function in functions.items():
+                bar.set_postfix_str(name)
+                synchronise()
+                start, calls = time.perf_counter(), 0
+                while calls < WARM_UP or (turn and time.perf_counter() - start < seconds):
+                    function()
+                    calls += 1
+                synchronise()
+                if turn:  # the first is to warm up
+                    best[name] = max(best[name], calls / (time.perf_counter() - start))
+                bar.update()
+    return best
