@@ -3,7 +3,7 @@
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import ActionDelay, ActionGain, JointDamping, JointFrictionLoss, ObservationDelay
+from torchrl_h2o.effects import ActionBias, ActionDelay, ActionGain, JointDamping, JointFrictionLoss, ObservationDelay
 from torchrl_h2o.residuals.separation import separated_by
 
 SIMULATION = pendulum()
@@ -33,6 +33,13 @@ def test_other_effects_stay_in_beside_each_alternative(measured):
     dead = separated_by(SIMULATION, measured, alternatives, [ActionGain(0.0)])
     assert "differ" in free
     assert dead.startswith("nothing that these sensors read")
+
+
+def test_other_effects_keep_their_places(measured):
+    """A bias before a motor that is dead is not seen, one behind it is."""
+    alternatives, dead = (ActionBias(0.1), ActionBias(0.2)), [ActionGain(0.0)]
+    assert separated_by(SIMULATION, measured, alternatives, behind=dead).startswith("nothing that these sensors read")
+    assert "differ" in separated_by(SIMULATION, measured, alternatives, before=dead)
 
 
 def test_effects_that_predict_the_same_are_told_apart_by_nothing_that_is_read(measured):

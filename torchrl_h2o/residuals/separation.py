@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.stats import rankdata
 
@@ -16,21 +18,28 @@ _MOST = 0.05  # of the transitions: where predictions differ most
 _TELLING = 1.5  # times the usual size of a coordinate, or one in as many: that says where
 
 
-def separated_by(simulation: Simulation, measured: Measured, effects: tuple[Effect, ...], others: list[Effect]) -> str:
+def separated_by(
+    simulation: Simulation,
+    measured: Measured,
+    effects: Sequence[Effect],
+    before: Sequence[Effect] = (),
+    behind: Sequence[Effect] = (),
+) -> str:
     """Which data would tell the first of some effects from the others.
 
     Args:
         simulation: without any of them.
         measured: the data.
         effects: alternatives, each at its best fit.
-        others: effects that are in beside each of them.
+        before: effects that are in beside each of them, and come before it.
+        behind: the same, and come behind it.
 
     Returns:
         In words: the dimension in which their predictions differ most, by how much, and at which states or actions.
     """
     rows = measured.windows(1)
     of_first, *of_others = (
-        residuals(simulation.with_effects(*others, effect), measured, rows)[:, 0] for effect in effects
+        residuals(simulation.with_effects(*before, effect, *behind), measured, rows)[:, 0] for effect in effects
     )
     spread = measured.observation.std(0) + 1e-12
     difference = np.nan_to_num(np.max([np.abs(of_first - other) for other in of_others], axis=0) / spread)

@@ -206,9 +206,11 @@ def _group(
     errors = [
         _error(simulation.with_effects(*effects[:index], other, *effects[index + 1 :]), measured) for other in alike
     ]
-    others = [effect for i, effect in enumerate(effects) if i != index and not _scatters(effect)]
-    words = tuple(map(in_words, alike))
-    return IndistinguishableGroup(alike, tuple(errors), separated_by(simulation, measured, alike, others), words)
+    before, behind = (
+        [effect for effect in some if not _scatters(effect)] for some in (effects[:index], effects[index + 1 :])
+    )
+    separation = separated_by(simulation, measured, alike, before, behind)
+    return IndistinguishableGroup(alike, tuple(errors), separation, tuple(map(in_words, alike)))
 
 
 def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:
