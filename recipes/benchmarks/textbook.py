@@ -1,6 +1,6 @@
-"""H2O+ and SAC as a textbook would write them: from the formulas, one optimiser a network, one forward a term.
+"""H2O+ as a textbook would write it: from the formulas, one optimiser a network, one forward a term.
 
-What the library's losses are compared to, in speed and in numbers. Nothing here is shared with the library.
+What the library's update is compared to in speed. Nothing here is shared with the library.
 """
 
 import copy

@@ -75,7 +75,7 @@ def textbook(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Ca
     return lambda: method.update(draw(real, n_real), draw(sim, n_sim), draw(real, pairs_real), draw(sim, pairs_sim))
 
 
-def ours_on_one_loss(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Learner:
+def sac_of_our_parts(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Learner:
     """SAC of this library's parts: Eq. (6) on both streams, no V and no ratio."""
     actor = make_actor(cfg.observation_dim, action_spec(cfg), run.num_cells)
     qvalues = [make_qvalue(cfg.observation_dim, cfg.action_dim, run.num_cells) for _ in range(2)]
@@ -101,7 +101,7 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
     torchrl_sac = sac.make_learner(run, cfg.observation_dim, action_spec(cfg), replay)
     torchrl_sac.batch_sizes = [run.batch_size]
     chosen["SAC, TorchRL's loss"] = torchrl_sac.update
-    chosen["SAC of our parts"] = ours_on_one_loss(cfg, run, replay).update
+    chosen["SAC of our parts"] = sac_of_our_parts(cfg, run, replay).update
     return chosen
 
 
