@@ -5,10 +5,18 @@ import numpy as np
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import DoubleToFloat, GymEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_h2o.effects import ActionDelay, ActionNoise, Gravity, LinearDrag, ObservationGain
+from torchrl_h2o.effects import (
+    ActionDelay,
+    ActionNoise,
+    Gravity,
+    LinearDrag,
+    ObservationDelay,
+    ObservationGain,
+    Timestep,
+)
 from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap, WheelLeggedEnv, dynamics_gap, mujoco_model
 
 TASKS = {
@@ -90,7 +98,13 @@ def test_an_episode_is_truncated_at_the_task_s_limit_and_worlds_are_reset_one_by
 
 @pytest.mark.parametrize(
     "effects",
-    [(Gravity(1.5),), (ActionDelay(0.13),), (LinearDrag(3.0, bodies="torso"),), (ObservationGain(1.2, (3,)),)],
+    [
+        (Gravity(1.5),),
+        (ActionDelay(0.13),),
+        (Timestep(0.5), ActionDelay(0.04)),
+        (LinearDrag(3.0, bodies="torso"),),
+        (ObservationGain(1.2, (3,)),),
+    ],
     ids=lambda effects: type(effects[0]).__name__,
 )
 @pytest.mark.parametrize("inside", [True, False], ids=["of the env", "beside it"])
@@ -109,7 +123,7 @@ def test_effects_do_what_a_dynamics_gap_does(effects, inside):
         action = 2.0 * torch.rand(6) - 1.0
         together = env.step(together.set("action", action.expand(2, 6).clone()))["next"]
         alone = single.step(alone.set("action", action))["next"]
-        torch.testing.assert_close(together["observation"][0], alone["observation"], rtol=0.0, atol=1e-8)
+        torch.testing.assert_close(together["observation"][0], alone["observation"], rtol=0.0, atol=1e-9)
 
 
 def test_every_world_can_have_effects_of_its_own():
@@ -145,6 +159,42 @@ def test_noise_that_the_simulator_should_not_have_is_taken_away():
     noisy = TransformedEnv(TASKS["HalfCheetah"](), dynamics_gap("joint_noise"))
     env = BatchedMujocoEnv(noisy, 2, [ActionNoise(-1.0)])
     assert not env._alters_actions
+
+
+def test_a_world_that_goes_on_is_not_read_again_while_another_is_reset():
+    """A sensor that is late by two steps shows after three what it saw in the first, whoever was reset meanwhile."""
+    env = BatchedMujocoEnv(WheelLeggedEnv(), 2, [ObservationDelay(0.01)])
+    td, seen = env.reset(), []
+    for step in range(4):
+        td = env.step(td.set("action", torch.full((2, 1), 0.1)))["next"]
+        seen.append(env.states[0, 3])  # the pitch of world 0
+        if step == 2:
+            td = env.reset(td.exclude("reward").set("_reset", torch.tensor([[False], [True]])))
+    assert td["observation"][0, 0].item() == pytest.approx(seen[1], abs=1e-6)
+
+
+def test_worlds_with_clocks_of_their_own_are_paid_by_them():
+    env = BatchedMujocoEnv(TASKS["HalfCheetah"](), 2, [[], [Timestep(0.5)]])
+    td = env.reset()
+    before = env.states[:, 1].copy()
+    reward = env.step(td.set("action", torch.zeros(2, 6)))["next", "reward"].squeeze(-1)
+    velocity = (env.states[:, 1] - before) / np.array([0.05, 0.025])
+    assert reward.tolist() == pytest.approx(velocity.tolist(), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: GymEnv("HalfCheetah-v5", frame_skip=2), "repeats actions"),
+        (
+            lambda: TransformedEnv(GymEnv("HalfCheetah-v5"), DoubleToFloat()),
+            r"without \(DoubleToFloat\): put them around",
+        ),
+    ],
+)
+def test_what_a_batch_would_leave_out_is_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        BatchedMujocoEnv(make(), 2)
 
 
 def test_it_feeds_a_collector():

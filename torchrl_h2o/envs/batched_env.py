@@ -18,12 +18,11 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect, balanced, compile_model
 from torchrl_h2o.effects.effect import BatchedForce, Process
+from torchrl_h2o.envs.dynamics_gap import DynamicsGap, transforms_of
 from torchrl_h2o.envs.gymnasium_simulator import GymnasiumSimulator
 from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, roll_out
 from torchrl_h2o.envs.task_rules import rules_of
-
-_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
-_CTRL_AND_FORCE = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
 
 class BatchedMujocoEnv(EnvBase):
@@ -36,7 +35,8 @@ class BatchedMujocoEnv(EnvBase):
     ones may be the same for all or differ from world to world, which makes domain randomisation one line.
 
     Args:
-        env: one env of the task, with or without dynamics gaps. It is kept, and not stepped.
+        env: one env of the task, with or without dynamics gaps. It is kept, to draw where episodes begin. Other
+            transforms go around the batched env.
         num_worlds: N.
         effects: more effects, for all worlds, or one list of them a world.
 
@@ -49,8 +49,8 @@ class BatchedMujocoEnv(EnvBase):
         physics_steps: of a control step.
 
     Raises:
-        ValueError: if the env is no Gymnasium MuJoCo task whose rules are known, or there is not one list of effects
-            a world.
+        ValueError: if the env is no Gymnasium MuJoCo task whose rules are known, repeats actions, or has transforms
+            other than dynamics gaps, or there is not one list of effects a world.
 
     Examples:
         >>> import numpy as np
@@ -73,29 +73,25 @@ class BatchedMujocoEnv(EnvBase):
         if num_worlds < 1:
             raise ValueError(f"num_worlds is {num_worlds}; there must be at least one world")
         super().__init__(device=torch.device("cpu"), batch_size=[num_worlds])
-        simulator = find_simulator(env)
-        if not isinstance(simulator, GymnasiumSimulator):
-            raise ValueError(f"{env} is no Gymnasium task; build one world of it with GymEnv")
+        simulator = _simulator_in(env)
         self._task = simulator.owner
         self._rules = rules_of(self._task)
         self.num_worlds = num_worlds
         self.max_episode_steps = _time_limit(simulator.env)
         inside = [effect for of_gap in simulator.gaps.values() for effect in of_gap]
-        self._effects = [balanced((*inside, *own)) for own in _of_each_world(effects, num_worlds)]
-        self._control_step = simulator.control_step
-        self.physics_steps = round(simulator.control_step / simulator.model.opt.timestep)
+        self._effects = [tuple(balanced((*inside, *own))) for own in _of_each_world(effects, num_worlds)]
+        self.physics_steps = self._task.frame_skip
         self._models = self._compiled(simulator)
+        self._differ = len(set(self._effects)) > 1
         self._pool = Rollout(nthread=num_threads or cpu_count())
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
-        self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], _FULL)))
+        self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], FULL_PHYSICS)))
         self._steps = np.zeros(num_worlds, dtype=np.int64)
-        self._worlds = [_World(own, self._control_step) for own in self._effects]
+        self._control_steps = np.array([self.physics_steps * model.opt.timestep for model in self._models])
+        self._worlds = [_World(own, step) for own, step in zip(self._effects, self._control_steps, strict=True)]
         self._alters_actions = any(world.on_actions for world in self._worlds)
         self._alters_observations = any(world.on_observations for world in self._worlds)
         self._forces = self._batched_forces()
-        self._differ = len({id(model) for model in self._models}) > 1
-        self._control_steps = np.array([self.physics_steps * model.opt.timestep for model in self._models])
-        self._everywhere = np.ones(num_worlds, dtype=bool)
         self._make_specs(simulator.env)
         self.set_seed(int(torch.randint(2**31, ())))
 
@@ -106,24 +102,19 @@ class BatchedMujocoEnv(EnvBase):
 
     def _compiled(self, simulator: GymnasiumSimulator) -> list[mujoco.MjModel]:
         """A model a world; worlds with the same effects share one."""
-        models: dict[tuple[Effect, ...], mujoco.MjModel] = {}
-        for effects in self._effects:
-            if tuple(effects) not in models:
-                model = compile_model(simulator.spec(), effects)
-                simulator._check_sizes(model)
-                models[tuple(effects)] = model
-        return [models[tuple(effects)] for effects in self._effects]
+        models = {effects: compile_model(simulator.spec(), effects) for effects in dict.fromkeys(self._effects)}
+        for model in models.values():
+            simulator.check_sizes(model)
+        return [models[effects] for effects in self._effects]
 
-    def _batched_forces(self) -> list[tuple[np.ndarray, BatchedForce]]:
-        """The forces that act, each with the worlds that it acts in."""
-        of_effects: dict[tuple[Effect, ...], list[int]] = {}
-        for index, effects in enumerate(self._effects):
-            of_effects.setdefault(tuple(effects), []).append(index)
-        return [
-            (np.array(worlds), effect.batched(self._models[worlds[0]]))
-            for effects, worlds in of_effects.items()
-            for effect in _of_kind(effects, ForceEffect)
-        ]
+    def _batched_forces(self) -> list[BatchedForce]:
+        """The forces that act, each in the worlds that it acts in."""
+        forces = []
+        for effects in dict.fromkeys(self._effects):
+            worlds = np.array([index for index, own in enumerate(self._effects) if own == effects])
+            model = self._models[worlds[0]]
+            forces += [_in_worlds(worlds, effect.batched(model)) for effect in _of_kind(effects, ForceEffect)]
+        return forces
 
     def _make_specs(self, env: EnvBase) -> None:
         n = self.num_worlds
@@ -144,10 +135,9 @@ class BatchedMujocoEnv(EnvBase):
             mask = chosen.reshape(self.num_worlds, -1).any(1).numpy()
         for index in np.flatnonzero(mask):
             self._begin(int(index))
-        observation = self._observe(mask)
         done = torch.zeros(self.num_worlds, 1, dtype=torch.bool)
         return TensorDict(
-            {"observation": observation, "done": done, "terminated": done.clone(), "truncated": done.clone()},
+            {"observation": self._observe(mask), "done": done, "terminated": done.clone(), "truncated": done.clone()},
             batch_size=self.batch_size,
         )
 
@@ -157,15 +147,25 @@ class BatchedMujocoEnv(EnvBase):
         if self._alters_actions:
             executed = np.stack([world.executed(own) for world, own in zip(self._worlds, action, strict=True)])
             executed = executed.astype(action.dtype)
-        before = self._positions.copy()
-        self._simulate(executed)
+        before, _ = positions_and_velocities(self._models[0], self.states)
+        reached = roll_out(
+            self._pool,
+            self._models if self._differ else self._models[0],
+            self._data,
+            self.states,
+            executed[:, None].astype(float),
+            self.physics_steps,
+            forces=self._forces,
+        )
+        self.states = reached[:, 0].copy()
         self._steps += 1
-        paid = self._rules.reward(before, self._positions, self._velocities, executed, self._control_steps)
-        terminated = self._rules.is_terminated(self._positions, self._velocities)
+        qpos, qvel = positions_and_velocities(self._models[0], self.states)
+        paid = self._rules.reward(before, qpos, qvel, executed, self._control_steps)
+        terminated = self._rules.is_terminated(qpos, qvel)
         truncated = self._steps >= self.max_episode_steps
         return TensorDict(
             {
-                "observation": self._observe(self._everywhere),
+                "observation": self._observe(),
                 "reward": torch.as_tensor(paid, dtype=self.reward_spec.dtype).unsqueeze(-1),
                 "terminated": torch.from_numpy(terminated).unsqueeze(-1),
                 "truncated": torch.from_numpy(truncated).unsqueeze(-1),
@@ -174,15 +174,6 @@ class BatchedMujocoEnv(EnvBase):
             batch_size=self.batch_size,
         )
 
-    @property
-    def _positions(self) -> np.ndarray:
-        return self.states[:, 1 : 1 + self._models[0].nq]
-
-    @property
-    def _velocities(self) -> np.ndarray:
-        nq, nv = self._models[0].nq, self._models[0].nv
-        return self.states[:, 1 + nq : 1 + nq + nv]
-
     def _begin(self, index: int) -> None:
         """Begins an episode in one world: the task draws where it starts, with the world's own generator."""
         task = self._task
@@ -190,41 +181,20 @@ class BatchedMujocoEnv(EnvBase):
         mujoco.mj_resetData(task.model, task.data)
         task.reset_model()
         state = self.states[index]
-        mujoco.mj_getState(task.model, task.data, state, _FULL)
+        mujoco.mj_getState(task.model, task.data, state, FULL_PHYSICS)
         # a task may start from a pose of its own; where it starts from the model's, follow that of the world's model
         own, qpos0 = self._models[index].qpos0, task.model.qpos0
         state[1 : 1 + len(own)] += np.where(task.init_qpos == qpos0, own - qpos0, 0.0)
         self._steps[index] = 0
         self._worlds[index].begin()
 
-    def _observe(self, mask: np.ndarray) -> torch.Tensor:
-        """What is observed of the worlds in a mask, (N); of the others what was observed last."""
-        observed = self._rules.observe(self._positions, self._velocities)
+    def _observe(self, mask: np.ndarray | slice = slice(None)) -> torch.Tensor:
+        """What is observed, (N, n), by the sensors of the worlds in a mask; TorchRL takes nothing of the others."""
+        observed = self._rules.observe(*positions_and_velocities(self._models[0], self.states))
         if self._alters_observations:
-            for index in np.flatnonzero(mask):
+            for index in np.arange(self.num_worlds)[mask]:
                 observed[index] = self._worlds[index].observed(observed[index])
-        if not mask.all():
-            observed[~mask] = self._observed[~mask]
-        self._observed = observed
         return torch.as_tensor(observed, dtype=self.observation_spec["observation"].dtype)
-
-    def _simulate(self, actions: np.ndarray) -> None:
-        """One control step of all worlds."""
-        models = self._models if self._differ else self._models[0]
-        if not self._forces:
-            control = np.repeat(actions[:, None].astype(float), self.physics_steps, axis=1)
-            states, _ = self._pool.rollout(models, self._data, self.states, control)
-            self.states = states[:, -1].copy()
-            return
-        nq, nv = self._models[0].nq, self._models[0].nv
-        for _ in range(self.physics_steps):
-            total = np.zeros((self.num_worlds, nv))
-            time, qpos, qvel = self.states[:, 0], self.states[:, 1 : 1 + nq], self.states[:, 1 + nq : 1 + nq + nv]
-            for worlds, force in self._forces:
-                total[worlds] += force(qpos[worlds], qvel[worlds], actions[worlds].astype(float), time[worlds])
-            control = np.concatenate([actions, total], axis=-1)[:, None]
-            states, _ = self._pool.rollout(models, self._data, self.states, control, control_spec=_CTRL_AND_FORCE)
-            self.states = states[:, 0].copy()
 
 
 class _World:
@@ -253,6 +223,17 @@ class _World:
         return _through(self._observations, observation)
 
 
+def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
+    """A force that acts in some worlds alone."""
+
+    def forces(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
+        everywhere = np.zeros(qvel.shape)
+        everywhere[worlds] = force(qpos[worlds], qvel[worlds], ctrl[worlds], time[worlds])
+        return everywhere
+
+    return forces
+
+
 def _through(processes: Sequence[Process], values: np.ndarray) -> np.ndarray:
     values = values.astype(float)  # a copy: what an effect remembers must not change
     for process in processes:
@@ -273,6 +254,22 @@ def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_w
             f"there are {len(effects)} lists of effects for {num_worlds} worlds: give one a world, or one list for all"
         )
     return [tuple(own) for own in effects]
+
+
+def _simulator_in(env: EnvBase) -> GymnasiumSimulator:
+    """The simulator of an env that can be stepped in a batch as it is."""
+    simulator = find_simulator(env)
+    if not isinstance(simulator, GymnasiumSimulator):
+        raise ValueError(f"{env} is no Gymnasium task; build one world of it with GymEnv")
+    others = [type(transform).__name__ for transform in transforms_of(env) if not isinstance(transform, DynamicsGap)]
+    if others:
+        raise ValueError(
+            f"the env that is given has transforms that a batch would be without ({', '.join(others)}): put them "
+            "around it, TransformedEnv(BatchedMujocoEnv(...), ...)"
+        )
+    if simulator.env.wrapper_frame_skip != 1:
+        raise ValueError("the env that is given repeats actions (frame_skip); leave that out")
+    return simulator
 
 
 def _time_limit(env: EnvBase) -> float:

@@ -236,12 +236,13 @@ def _transforms_of(transform: Transform, env: EnvBase) -> list[Transform]:
     root = transform
     while isinstance(container := root.__dict__["_container"](), Transform):
         root = container
-    return [*_leaves(env.base_env), *_leaves(root)]
+    return [*transforms_of(env.base_env), *transforms_of(root)]
 
 
-def _leaves(node: EnvBase | Transform) -> list[Transform]:
+def transforms_of(node: EnvBase | Transform) -> list[Transform]:
+    """All transforms in an env or a transform, the innermost first."""
     if isinstance(node, TransformedEnv):
-        return [*_leaves(node.base_env), *_leaves(node.transform)]
+        return [*transforms_of(node.base_env), *transforms_of(node.transform)]
     if isinstance(node, Compose):
-        return [leaf for child in node for leaf in _leaves(child)]
+        return [leaf for child in node for leaf in transforms_of(child)]
     return [node] if isinstance(node, Transform) else []

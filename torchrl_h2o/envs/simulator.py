@@ -107,7 +107,7 @@ class Simulator(ABC):
         applied = {**applied, gap: tuple(on_env[gap])}
         everything = [effect for effects in applied.values() for effect in effects]
         model = compile_model(self.spec(), everything)
-        self._check_sizes(model)
+        self.check_sizes(model)
         model.vis.global_.offwidth = self.model.vis.global_.offwidth
         model.vis.global_.offheight = self.model.vis.global_.offheight
         self.load(model)
@@ -116,7 +116,7 @@ class Simulator(ABC):
         self.owner._dynamics_gaps = applied
 
     def _check_source(self, effects: Sequence[Effect]) -> None:
-        self._check_sizes(compile_model(self.spec()))
+        self.check_sizes(compile_model(self.spec()))
         # dm_control copies a model with its gaps, but not what we remember of them
         if not self._came_from([]) and not self._came_from(effects):
             raise ValueError(
@@ -134,7 +134,12 @@ class Simulator(ABC):
             getattr(source, field)[:] = getattr(model, field)
         return np.array_equal(_bytes(source), _bytes(model))
 
-    def _check_sizes(self, model: mujoco.MjModel) -> None:
+    def check_sizes(self, model: mujoco.MjModel) -> None:
+        """Checks that a model has the joints, bodies and actuators of the one in use.
+
+        Raises:
+            ValueError: if it has not.
+        """
         for size in _SIZES:
             ours, theirs = getattr(self.model, size), getattr(model, size)
             if ours != theirs:

@@ -53,34 +53,49 @@ class TaskRules(ABC):
 
 
 class Running(TaskRules):
-    """HalfCheetah, Hopper and Walker2d: forward velocity, less the effort, and pay for being healthy."""
+    """HalfCheetah: forward velocity, less the effort; it never ends."""
 
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         skipped = int(self.task._exclude_current_positions_from_observation)
-        if not isinstance(self.task, HalfCheetahEnv):
-            qvel = np.clip(qvel, -10.0, 10.0)
         return np.concatenate([qpos[:, skipped:], qvel], axis=1)
 
     def reward(
         self, before: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray, control_step: np.ndarray
     ) -> np.ndarray:
-        task = self.task
-        paid = task._forward_reward_weight * ((qpos[:, 0] - before[:, 0]) / control_step)
-        if not isinstance(task, HalfCheetahEnv):
-            paid = paid + self._is_healthy(qpos, qvel) * task._healthy_reward
-        return paid - task._ctrl_cost_weight * np.sum(np.square(action), axis=1)
+        forward = self.task._forward_reward_weight * ((qpos[:, 0] - before[:, 0]) / control_step)
+        return forward + self._survival(qpos, qvel) - self.task._ctrl_cost_weight * np.sum(np.square(action), axis=1)
 
     def is_terminated(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        if isinstance(self.task, HalfCheetahEnv) or not self.task._terminate_when_unhealthy:
-            return np.zeros(len(qpos), dtype=bool)
+        return np.zeros(len(qpos), dtype=bool)
+
+    def _survival(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray | float:
+        return 0.0
+
+
+class Walking(Running):
+    """Walker2d: the same, velocities cut off, pay for being healthy, and an end when it is not."""
+
+    def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        return super().observe(qpos, np.clip(qvel, -10.0, 10.0))
+
+    def is_terminated(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        if not self.task._terminate_when_unhealthy:
+            return super().is_terminated(qpos, qvel)
         return ~self._is_healthy(qpos, qvel)
 
+    def _survival(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        return self._is_healthy(qpos, qvel) * self.task._healthy_reward
+
     def _is_healthy(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        healthy = _within(qpos[:, 1], self.task._healthy_z_range) & _within(qpos[:, 2], self.task._healthy_angle_range)
-        if isinstance(self.task, HopperEnv):
-            rest = np.concatenate([qpos[:, 2:], qvel], axis=1)
-            healthy &= _within(rest, self.task._healthy_state_range).all(1)
-        return healthy
+        return _within(qpos[:, 1], self.task._healthy_z_range) & _within(qpos[:, 2], self.task._healthy_angle_range)
+
+
+class Hopping(Walking):
+    """Hopper: the same, and healthy only while no other coordinate is far off."""
+
+    def _is_healthy(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        rest = np.concatenate([qpos[:, 2:], qvel], axis=1)
+        return super()._is_healthy(qpos, qvel) & _within(rest, self.task._healthy_state_range).all(1)
 
 
 class Balancing(TaskRules):
@@ -103,8 +118,8 @@ class Balancing(TaskRules):
 
 RULES: dict[type[MujocoEnv], type[TaskRules]] = {
     HalfCheetahEnv: Running,
-    HopperEnv: Running,
-    Walker2dEnv: Running,
+    HopperEnv: Hopping,
+    Walker2dEnv: Walking,
     WheelLeggedMujocoEnv: Balancing,
 }
 

@@ -30,10 +30,9 @@ from torchrl_h2o.effects import (
     catalogue,
     compile_model,
 )
+from torchrl_h2o.envs.physics import FULL_PHYSICS, roll_out
 from torchrl_h2o.residuals.state_map import StateMap
 
-_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
-_CTRL_AND_FORCE = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 _CHUNK = 2**24  # numbers that a rollout may return at once: 128 MB
 
 
@@ -183,17 +182,28 @@ class Simulation:
             The states after each control step, (B, H, nq + nv); NaN from where the simulation diverges on.
         """
         batch, horizon, _ = actions.shape
-        size = mujoco.mj_stateSize(self.model, _FULL)
+        size = mujoco.mj_stateSize(self.model, FULL_PHYSICS)
         full = np.zeros((batch, size))
         full[:, 0] = 0.0 if time is None else time
         full[:, 1 : 1 + states.shape[1]] = states
         forces = [e.batched(self.model) for e in self.effects if isinstance(e, ForceEffect) and not e.is_neutral]
-        step = self._forced if forces else self._free
         chunk = max(1, _CHUNK // (horizon * self.frame_skip * size))
         parts = []
         with _no_warnings():
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
-                parts.append(step(full[rows], actions[rows], None if applied is None else applied[rows], forces))
+                own = None if applied is None else applied[rows]
+                parts.append(
+                    roll_out(
+                        self._pool,
+                        self.model,
+                        self._data,
+                        full[rows],
+                        actions[rows],
+                        self.frame_skip,
+                        forces=forces,
+                        applied=own,
+                    )
+                )
         reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
         # MuJoCo starts anew, and its clock with it, where a state is not finite or far too large
         expected = full[:, :1] + self.control_step * np.arange(1, horizon + 1)
@@ -201,33 +211,6 @@ class Simulation:
         reached = reached[:, :, 1 : 1 + states.shape[1]].copy()
         reached[diverged] = np.nan
         return reached
-
-    def _free(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence) -> np.ndarray:
-        """Without forces that depend on the state: one rollout."""
-        control, spec = actions, int(mujoco.mjtState.mjSTATE_CTRL)
-        if applied is not None:
-            control, spec = np.concatenate([actions, applied], -1), _CTRL_AND_FORCE
-        control = np.repeat(control, self.frame_skip, axis=1)
-        states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=spec)
-        return states[:, self.frame_skip - 1 :: self.frame_skip]
-
-    def _forced(
-        self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None, forces: Sequence
-    ) -> np.ndarray:
-        """Under forces: physics step by physics step, each under the forces of the state that it starts from."""
-        nq, nv = self.model.nq, self.model.nv
-        reached = []
-        for step in range(actions.shape[1]):
-            ctrl = actions[:, step]
-            for _ in range(self.frame_skip):
-                total = np.zeros((len(full), nv)) if applied is None else applied[:, step].copy()
-                for force in forces:
-                    total += force(full[:, 1 : 1 + nq], full[:, 1 + nq : 1 + nq + nv], ctrl, full[:, 0])
-                control = np.concatenate([ctrl, total], -1)[:, None]
-                states, _ = self._pool.rollout(self.model, self._data, full, control, control_spec=_CTRL_AND_FORCE)
-                full = states[:, 0]
-            reached.append(full)
-        return np.stack(reached, axis=1)
 
 
 @contextmanager
