@@ -185,7 +185,7 @@ class H2OPlusLoss(MixedBellmanLoss):
         ratio_terms = {} if self.ratio_loss is None else self._ratio_terms(batch, rows)
         loss_qvalue = self.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
-        value_terms = {} if self.value_loss is None else self._value_terms(batch)
+        value_terms = {} if self.value_loss is None else self._value_terms(batch, rows)
         loss_actor, log_prob = self.actor_loss(batch, rows)
         terms = {
             "loss_actor": loss_actor,
@@ -205,10 +205,10 @@ class H2OPlusLoss(MixedBellmanLoss):
         shown = ratio if self.reduction == "none" else self._expectation(ratio, rows, rows.sim, reduction="mean")
         return {**self.ratio_loss(batch), "dynamics_ratio": shown}
 
-    def _value_terms(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _value_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
         """Eq. (4): writes the target Q at the data's own actions into the batch and returns V's loss."""
         batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
-        return {"loss_value": self.value_loss.value_loss(batch)}
+        return {"loss_value": self.value_loss.value_loss(batch, rows)}
 
     @torch.no_grad()
     def _data_qvalue(self, batch: TensorDictBase) -> Tensor:

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 
 from torchrl_h2o.objectives.functional import run
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 
 
 class InSampleValueLoss(HybridLoss):
@@ -88,14 +88,13 @@ class InSampleValueLoss(HybridLoss):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._output({"loss_value": self.value_loss(tensordict)}, tensordict)
+        return self._output({"loss_value": self.value_loss(tensordict, self._rows(tensordict))}, tensordict)
 
-    def value_loss(self, tensordict: TensorDictBase) -> Tensor:
+    def value_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Eq. (4), reduced."""
         out = run(self.value_network, tensordict, self.value_network_params)
         value = self._entry(out, self.tensor_keys.value).squeeze(-1)
         qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
-        rows = self._rows(tensordict)
         return self._expectation(self.penalty(qvalue - value), rows, rows.real)  # Eq. (4)
 
 

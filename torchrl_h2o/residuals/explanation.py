@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.chance import sensor_noise, stand_in
 from torchrl_h2o.residuals.fit import fit
 from torchrl_h2o.residuals.measured import Measured
 from torchrl_h2o.residuals.noise import estimate_noise
-from torchrl_h2o.residuals.problem import Problem, losses
+from torchrl_h2o.residuals.problem import Problem, losses, matters
 from torchrl_h2o.residuals.screening import free_parameters
 from torchrl_h2o.residuals.search import trace_effects
 from torchrl_h2o.residuals.significance import p_value_of_losses
@@ -120,8 +120,8 @@ def _with_undeclared(
             candidate = _found_anew(simulation, measured, _needed(problem, trace, candidate))
         after = loss(candidate)
         pays = after.mean() < (1.0 - _PAYS) * before.mean() and p_value_of_losses(before, after) < _LEVEL
-        matters = first.matters(*([part.effect for part in some] for some in (parts, candidate)), _WORTH_A_WORD)
-        if pays and matters and _beyond_noise(force, base, measured, rng):
+        losses_at_first = (first.held_out_loss([part.effect for part in some]) for some in ([], parts, candidate))
+        if pays and matters(*losses_at_first, _WORTH_A_WORD) and _beyond_noise(force, base, measured, rng):
             paying.append((candidate, after))
     if not paying:
         return parts

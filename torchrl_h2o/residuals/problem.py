@@ -96,11 +96,9 @@ class Problem:
         """The size of residual to be expected of windows, (W, H, n) or (1, 1, n), in units."""
         return self.scale[starts] if len(self.scale) > 1 else self.scale
 
-    def matters(self, before: Sequence[Effect], after: Sequence[Effect], share: float) -> bool:
-        """Whether, on held-out windows, effects explain more than others do, by a share of all that they explain."""
-        judged = self.measured.judged(self.horizon)
-        nothing, without, with_them = (losses(self.residual(effects, judged)).mean() for effects in ((), before, after))
-        return without - with_them > share * (nothing - with_them)
+    def held_out_loss(self, effects: Sequence[Effect]) -> float:
+        """The mean robust loss on held-out windows with effects put in."""
+        return float(losses(self.residual(effects, self.measured.judged(self.horizon))).mean())
 
     @property
     def within_rounding(self) -> bool:
@@ -151,6 +149,18 @@ class Problem:
 
 def _sensors(simulation: Simulation) -> list[Effect]:
     return [e for e in simulation.effects if isinstance(e, ObservationEffect) and not e.is_neutral]
+
+
+def matters(nothing: float, without: float, with_them: float, share: float) -> bool:
+    """Whether effects take more away from a loss than others do, by a share of all that they take away.
+
+    Args:
+        nothing: the loss without any effects.
+        without: with the others.
+        with_them: with the effects that are asked about.
+        share: of ``nothing - with_them``.
+    """
+    return without - with_them > share * (nothing - with_them)
 
 
 def losses(residual: np.ndarray) -> np.ndarray:

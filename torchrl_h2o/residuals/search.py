@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.chance import stand_in
 from torchrl_h2o.residuals.fit import Fit, Free, fit
 from torchrl_h2o.residuals.horizon import choose_horizon
 from torchrl_h2o.residuals.measured import Measured, thinned
-from torchrl_h2o.residuals.problem import Problem, losses
+from torchrl_h2o.residuals.problem import Problem, losses, matters
 from torchrl_h2o.residuals.screening import Lead, free_parameters, is_possible, promising_sets, screen
 from torchrl_h2o.residuals.significance import p_value_of_losses
 from torchrl_h2o.residuals.simulation import Simulation
@@ -85,7 +85,7 @@ class Search:
 
     def __post_init__(self):
         measured, horizon = self.problem.measured, self.problem.horizon
-        self.first = self.problem
+        self.first, self.nothing = self.problem, self.problem.held_out_loss(())
         self.all, self.judged = measured.fitted(horizon), measured.judged(horizon)
         self.fitted = thinned(self.all, max(_FEWEST_FITTED, _FITTED_STEPS // horizon))
         few = min(max(_FEWEST, _SCREENED // horizon), len(self.fitted))
@@ -154,10 +154,13 @@ class Search:
 
     def _weigh_by(self, effects: Sequence[Effect]) -> Problem:
         """Weighs residuals by the size that they, and what sensor noise makes of them, have with some effects in."""
-        mended = self.problem.simulation.with_effects(*effects)
-        posed = Problem.pose(mended, self.problem.measured, self.problem.horizon)
+        posed = self._posed(effects)
         self.problem = replace(posed, simulation=self.problem.simulation)
         return posed
+
+    def _posed(self, effects: Sequence[Effect]) -> Problem:
+        mended = self.problem.simulation.with_effects(*effects)
+        return Problem.pose(mended, self.problem.measured, self.problem.horizon)
 
     def _fitted(
         self, entries: Sequence[CatalogueEntry], start: Sequence[Effect] = (), starts: np.ndarray | None = None
@@ -184,7 +187,8 @@ class Search:
         """
         before = self._held_out(best.effects)
         least = _PAYS if self.problem.sensor_std is None else _PAYS_UNDER_NOISE
-        winner, added, lowest, base = None, 0, before, best.effects
+        winner, added, lowest = None, 0, before
+        at_first = base = self.first.held_out_loss(best.effects)
         for size, sketched in enumerate(self._sketches(best, leads), start=1):
             if len(entries) + size > _MOST:
                 break
@@ -193,13 +197,14 @@ class Search:
                 together = [*entries, *(lead.entry for lead in chosen)]
                 candidate = self._fitted(together, start.effects)
                 # a share worth a word each of all that has been explained since the start
-                if not self.first.matters(best.effects, candidate.effects, size * _WORTH_A_WORD):
+                loss = self.first.held_out_loss(candidate.effects)
+                if not matters(self.nothing, at_first, loss, size * _WORTH_A_WORD):
                     continue  # what does not matter takes nobody's place
                 after = self._held_out(candidate.effects)
                 p = p_value_of_losses(lowest, after)
                 pays = after.mean() < (1.0 - least) * lowest.mean() and p < _LEVEL / len(self.catalogue)
-                if pays and self.first.matters(base, candidate.effects, (size - added) * _WORTH_A_WORD):
-                    winner, added, lowest, base = (together, candidate), size, after, candidate.effects
+                if pays and matters(self.nothing, base, loss, (size - added) * _WORTH_A_WORD):
+                    winner, added, lowest, base = (together, candidate), size, after, loss
                 finalists += 1
                 if finalists == _FINALISTS:
                     break
@@ -331,8 +336,6 @@ class Search:
         a word.
         """
         kept = [effect for i, effect in enumerate(best.effects) if i != index]
-        self._weigh_by(best.effects)
-        by_what_is_left = self.problem
         self._weigh_by(kept)
         with_it = self._held_out(best.effects)
         explained = self._held_out(kept).mean() - with_it.mean()
@@ -354,13 +357,20 @@ class Search:
             candidate = self._fitted(instead, start.effects)
             after = self._held_out(candidate.effects)
             p = p_value_of_losses(after, with_it)
-            simpler = len(lead.free) < len(free_parameters(entries[index]))
-            if simpler and not self.first.matters(candidate.effects, best.effects, _WORTH_A_WORD):
-                p = max(p, self._p_value(by_what_is_left, candidate, best))
+            if p <= _LEVEL and len(lead.free) < len(free_parameters(entries[index])):
+                p = max(p, self._p_value_by_what_is_left(candidate, best))
             worse = (after.mean() - with_it.mean()) / explained
             if worse < _SAME or (worse < _ALIKE and p > _LEVEL):
                 as_good.append(Attempt(lead.entry, candidate, index, float(after.mean()), p))
         return tuple(sorted(as_good, key=lambda attempt: attempt.loss))
+
+    def _p_value_by_what_is_left(self, worse: Fit, better: Fit) -> float:
+        """Of a difference as large, by the size that residuals have with the better; 0 if it is worth a word."""
+        at_first = (self.first.held_out_loss(fitted.effects) for fitted in (worse, better))
+        if matters(self.nothing, *at_first, _WORTH_A_WORD):
+            return 0.0
+        left = replace(self._posed(better.effects), simulation=self.problem.simulation)
+        return self._p_value(left, worse, better)
 
     def _p_value(self, problem: Problem, worse: Fit, better: Fit) -> float:
         """Of a difference as large between two fits on held-out windows, as a problem weighs them."""
