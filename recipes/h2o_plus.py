@@ -17,7 +17,7 @@ from pathlib import Path
 
 import hydra
 import torch
-from environments import as_observed, learning_reward, make_reality, make_simulator, measure_observation_norm
+from environments import make_reality, make_simulator, measure_observation_norm
 from evaluation import evaluate
 from learner import Learner, adam
 from learning_curve import draw_learning_curve
@@ -25,13 +25,12 @@ from omegaconf import DictConfig
 from real_data import behaviour_in, read_real_data
 from rendering import try_to_film
 from results import print_table
-from run import Training, num_epochs, open_run, save_config, write_summary
+from run import Training, open_run, save_config, write_summary
 from sac import train_sac
 from tensordict import TensorDictBase
-from torch.optim.lr_scheduler import LinearLR
-from torchrl.collectors import Collector
 from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
+from training import train
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
@@ -70,6 +69,9 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
             estimator(batch)  # Eq. (9): writes the dynamics ratio
         return {**loss(batch), **ratio_losses}
 
+    def figures(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, float]:
+        return {"ratio_of_sim": float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean())}
+
     return Learner(
         actor,
         {"loss": loss, "ratio_loss": ratio_loss},
@@ -78,42 +80,13 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         replay,
         [cfg.batch_size, cfg.discriminator_batch_size],
         terms_of,
+        figures,
     )
 
 
 def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
-    """Simulate, update, look at it, again and again."""
-    simulator, reality = make_simulator(cfg), make_reality(cfg)
-    real = as_observed(cfg, real)  # both streams show observations and rewards in the same way
-    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
-    observation_dim = simulator.observation_spec["observation"].shape[-1]
-    learner = make_learner(cfg, observation_dim, simulator.action_spec_unbatched, replay)
-    estimator = learner.losses["ratio_loss"].estimator
-    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
-    collector = Collector(simulator, learner.actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
-    rollouts = iter(collector)
-
-    training = Training("H2O+", cfg, directory, **learner.components, schedule=schedule)
-    for epoch, evaluating in training.epochs(simulator):
-        simulated = next(rollouts)
-        simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
-        replay.extend(simulated)
-        for _ in training.epoch_updates():
-            losses = learner.update()
-        schedule.step()
-        if evaluating:
-            evaluation = evaluate(reality, learner.actor, cfg.eval_episodes)
-            batch = learner.batches[0]
-            training.log(
-                epoch,
-                return_real=evaluation.mean,
-                return_real_std=evaluation.std,
-                length_real=evaluation.mean_length,
-                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
-                **{name: value.item() for name, value in losses.items()},
-            )
-    collector.shutdown()
-    return learner.actor, training
+    """Real and simulated data, the simulator's weighed by how real they look."""
+    return train("H2O+", make_learner, cfg, real, directory)
 
 
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:

@@ -22,6 +22,7 @@ class Learner:
         replay: where batches come from.
         batch_sizes: of the batches of one update, (real, simulated) rows each.
         terms_of: takes these batches; returns terms named ``loss_*``, to be added up, and figures to be logged.
+        figures: takes the same batches; returns what is logged beside the losses, and costs too much at every update.
         batches: those of the last update.
     """
 
@@ -32,6 +33,7 @@ class Learner:
     replay: HybridReplayBuffer
     batch_sizes: Sequence[tuple[int, int]]
     terms_of: Callable[..., dict[str, torch.Tensor]]
+    figures: Callable[..., dict[str, float]] = lambda *batches: {}
     batches: list[TensorDictBase] = field(default_factory=list)
 
     def update(self) -> dict[str, torch.Tensor]:

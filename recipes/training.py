@@ -1,0 +1,65 @@
+"""The loop that every method goes through: simulate, update, look at it, again and again."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from environments import as_observed, learning_reward, make_reality, make_simulator
+from evaluation import evaluate
+from learner import Learner
+from omegaconf import DictConfig
+from run import Training, num_epochs
+from tensordict import TensorDictBase
+from torch.optim.lr_scheduler import LinearLR
+from torchrl.collectors import Collector
+from torchrl.data import TensorSpec
+
+from torchrl_h2o.data import HybridReplayBuffer
+
+MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
+
+
+def train(
+    name: str, make_learner: MakeLearner, cfg: DictConfig, real: TensorDictBase, directory: Path
+) -> tuple[torch.nn.Module, Training]:
+    """Trains one method.
+
+    Args:
+        name: what the bar and the tables call it.
+        make_learner: from the configuration, the size of the observation, the action's spec and the data.
+        cfg: the run's configuration.
+        real: the measured transitions.
+        directory: the run's folder.
+
+    Returns:
+        The policy, and the training with its metrics.
+    """
+    simulator, reality = make_simulator(cfg), make_reality(cfg)
+    real = as_observed(cfg, real)  # both streams show observations and rewards in the same way
+    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    observation_dim = simulator.observation_spec["observation"].shape[-1]
+    learner = make_learner(cfg, observation_dim, simulator.action_spec_unbatched, replay)
+    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
+    collector = Collector(simulator, learner.actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
+    rollouts = iter(collector)
+
+    training = Training(name, cfg, directory, **learner.components, schedule=schedule)
+    for epoch, evaluating in training.epochs(simulator):
+        simulated = next(rollouts)
+        simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
+        replay.extend(simulated)
+        for _ in training.epoch_updates():
+            losses = learner.update()
+        schedule.step()
+        if evaluating:
+            evaluation = evaluate(reality, learner.actor, cfg.eval_episodes)
+            training.log(
+                epoch,
+                return_real=evaluation.mean,
+                return_real_std=evaluation.std,
+                length_real=evaluation.mean_length,
+                **learner.figures(*learner.batches),
+                **{name: value.item() for name, value in losses.items()},
+            )
+    collector.shutdown()
+    return learner.actor, training
