@@ -7,23 +7,27 @@ from tensordict import TensorDictBase
 from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, ObservationNorm, TransformedEnv
 
 from torchrl_h2o.effects import Effect, paper_gap
-from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
 from torchrl_h2o.residuals import Report
 
 
-def make_reality(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
+def make_reality(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:
     """The target dynamics P: the task with the effects of ``env.reality``.
 
     Args:
         cfg: the run's configuration.
+        num_worlds: N, to be stepped at once, ``[N]``; one env, ``[]``, without it, or for a task that has no batch.
         raw: leave observations in their own units, whatever the run does.
         **kwargs: further arguments of the task, such as ``render_mode``.
     """
-    return _make(cfg, [instantiate(effect) for effect in cfg.env.reality], raw, kwargs)
+    return _make(cfg, [instantiate(effect) for effect in cfg.env.reality], num_worlds, raw, kwargs)
 
 
-def make_simulator(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
+def make_simulator(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:
     """The imperfect simulator: the effects of ``env.simulator``, the paper's gap and what mends it, if these are named.
+
+    Args:
+        cfg, num_worlds, raw, **kwargs: as for :func:`make_reality`.
 
     Raises:
         ValueError: for a report that mends nothing.
@@ -34,7 +38,7 @@ def make_simulator(cfg: DictConfig, *, raw: bool = False, **kwargs) -> EnvBase:
         effects.append(paper_gap(cfg.gap, cfg.gap_strength))
     if cfg.get("gap_fix") is not None:  # a run of an earlier version says nothing of it
         effects.extend(_missing_effects(cfg.gap_fix))
-    return _make(cfg, effects, raw, kwargs)
+    return _make(cfg, effects, num_worlds, raw, kwargs)
 
 
 def _missing_effects(report: str) -> tuple[Effect, ...]:
@@ -45,13 +49,16 @@ def _missing_effects(report: str) -> tuple[Effect, ...]:
     return effects
 
 
-def _make(cfg: DictConfig, effects: list, raw: bool, kwargs: dict) -> EnvBase:
-    transforms = [DynamicsGap(*effects), DoubleToFloat()]
+def _make(cfg: DictConfig, effects: list, num_worlds: int | None, raw: bool, kwargs: dict) -> EnvBase:
+    env = TransformedEnv(instantiate(cfg.env.make, **kwargs), DynamicsGap(*effects))
+    if num_worlds is not None and cfg.env.get("batched", False):
+        env = BatchedMujocoEnv(env, num_worlds)
+    transforms = [DoubleToFloat()]
     if cfg.observation_norm is not None and not raw:
         transforms.append(ObservationNorm(**_norm(cfg), in_keys=["observation"], standard_normal=True))
     if _frames(cfg) > 1 and not raw:
         transforms.append(CatFrames(N=_frames(cfg), dim=-1, in_keys=["observation"]))
-    return TransformedEnv(instantiate(cfg.env.make, **kwargs), Compose(*transforms))
+    return TransformedEnv(env, Compose(*transforms))
 
 
 def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:

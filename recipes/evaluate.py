@@ -16,14 +16,14 @@ from environments import make_reality, make_simulator
 from evaluation import evaluate
 from omegaconf import DictConfig
 from rendering import film
-from run import checkpoint_folder, load_config
+from run import checkpoint_folder, keeps_best, load_config
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from torchrl_h2o.objectives import make_actor
 
 
 def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") -> torch.nn.Module:
-    """The policy of a run's last checkpoint.
+    """The policy that a run's last checkpoint hands over.
 
     Raises:
         FileNotFoundError: if that method has no checkpoint there.
@@ -34,7 +34,7 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
         raise FileNotFoundError(f"{directory} has no checkpoint of {method!r}; it has {there or 'none'}")
     env = make_reality(cfg)
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
-    Checkpoint(actor=actor).load(latest)
+    Checkpoint(**{"policy" if keeps_best(cfg) else "actor": actor}).load(latest)
     return actor
 
 
@@ -47,7 +47,7 @@ def main(options: DictConfig) -> None:
         raise ValueError(f"in={options['in']}: choose reality or simulator")
     make_env = worlds[options["in"]]
     policy = load_policy(cfg, directory, options.method)
-    result = evaluate(make_env(cfg), policy, options.episodes, options.seed)
+    result = evaluate(make_env(cfg, options.episodes), policy, options.episodes, options.seed)
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]
     print(f"{options.method} in {options['in']}: return {result.mean:.1f} ± {result.std:.1f}, episodes of {seconds} s")
     summary = {"method": options.method, "in": options["in"], "seed": options.seed, **result.summary()}

@@ -128,7 +128,7 @@ def run(cfg: DictConfig, directory: Path) -> None:
 
     # What the policies do in reality, and in the simulator that they were trained in.
     start = time.perf_counter()
-    reality, simulator = make_reality(cfg), make_simulator(cfg)
+    reality, simulator = make_reality(cfg, cfg.final_episodes), make_simulator(cfg, 1)
     in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
     in_simulator = evaluate(simulator, policies["H2O+"], 1)
     behaviour = behaviour_in(cfg, real)

@@ -24,6 +24,8 @@ from tqdm import tqdm
 
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 
+KEEP = ("last", "best_in_simulator")
+
 
 def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
     """The configuration and folder of a new run, or of the one that ``resume`` names, whose own configuration counts.
@@ -43,6 +45,8 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
         raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
     if cfg.updates < 1:
         raise ValueError(f"updates={cfg.updates}: train for at least one")
+    if cfg.get("keep", "last") not in KEEP:
+        raise ValueError(f"keep={cfg.keep}: choose {' or '.join(KEEP)}")
     if cfg.gap is None and cfg.gap_strength is not None:
         raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
     for key in ("data", "columns", "gap_fix"):  # a resumed run may start elsewhere
@@ -141,6 +145,11 @@ class Training:
         self.rows.append(row)
         write_metrics(self.directory, self.name, self.rows)
         self._bar.set_postfix(return_real=f"{metrics['return_real']:.0f}")
+
+
+def keeps_best(cfg: DictConfig) -> bool:
+    """Whether the policy that did best in the simulator is handed over, and not the last."""
+    return cfg.get("keep", "last") == "best_in_simulator"  # a run of an earlier version says nothing of it
 
 
 def num_epochs(cfg: DictConfig) -> int:

@@ -1,6 +1,8 @@
 """The loop that every method goes through: simulate, update, look at it, again and again."""
 
 from collections.abc import Callable
+from copy import deepcopy
+from math import inf
 from pathlib import Path
 
 import torch
@@ -8,7 +10,7 @@ from environments import as_observed, learning_reward, make_reality, make_simula
 from evaluation import evaluate
 from learner import Learner
 from omegaconf import DictConfig
-from run import Training, num_epochs
+from run import Training, keeps_best, num_epochs
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import Collector
@@ -32,9 +34,10 @@ def train(
         directory: the run's folder.
 
     Returns:
-        The policy, and the training with its metrics.
+        The policy that ``keep`` asks for, and the training with its metrics.
     """
-    simulator, reality = make_simulator(cfg), make_reality(cfg)
+    simulator, reality = make_simulator(cfg, cfg.num_worlds), make_reality(cfg, cfg.eval_episodes)
+    trials = make_simulator(cfg, cfg.eval_episodes)
     real = as_observed(cfg, real)  # both streams show observations and rewards in the same way
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     observation_dim = simulator.observation_spec["observation"].shape[-1]
@@ -43,9 +46,12 @@ def train(
     collector = Collector(simulator, learner.actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
     rollouts = iter(collector)
 
-    training = Training(name, cfg, directory, **learner.components, schedule=schedule)
+    components = learner.components
+    if keeps_best(cfg):
+        components["policy"] = deepcopy(learner.actor)
+    training = Training(name, cfg, directory, **components, schedule=schedule)
     for epoch, evaluating in training.epochs(simulator):
-        simulated = next(rollouts)
+        simulated = next(rollouts).reshape(-1)
         simulated["next", "reward"] = learning_reward(cfg, simulated["next", "reward"])
         replay.extend(simulated)
         for _ in training.epoch_updates():
@@ -53,8 +59,14 @@ def train(
         schedule.step()
         if evaluating:
             evaluation = evaluate(reality, learner.actor, cfg.eval_episodes)
+            promised = {}
+            if keeps_best(cfg):
+                promised["return_sim"] = evaluate(trials, learner.actor, cfg.eval_episodes).mean
+                if promised["return_sim"] >= max((row["return_sim"] for row in training.rows), default=-inf):
+                    components["policy"].load_state_dict(learner.actor.state_dict())
             training.log(
                 epoch,
+                **promised,
                 return_real=evaluation.mean,
                 return_real_std=evaluation.std,
                 length_real=evaluation.mean_length,
@@ -62,4 +74,4 @@ def train(
                 **{name: value.item() for name, value in losses.items()},
             )
     collector.shutdown()
-    return learner.actor, training
+    return components["policy" if keeps_best(cfg) else "actor"], training

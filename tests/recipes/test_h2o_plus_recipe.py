@@ -12,7 +12,9 @@ from pathlib import Path
 import hydra
 import pytest
 import torch
-from environments import measure_observation_norm
+from environments import make_simulator, measure_observation_norm
+from evaluate import load_policy
+from evaluation import evaluate
 from h2o_plus import train_h2o_plus
 from real_data import read_real_data
 from run import Training
@@ -149,6 +151,7 @@ def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(co
         (["backbone=huber"], "choose expectile, sparse or exponential"),
         (["gap_strength=2"], "belongs to a gap"),
         (["env=halfcheetah", "data=recorded"], "name a data set"),
+        (["keep=best"], "choose last or best_in_simulator"),
         (["resume=nowhere"], "not the folder of a run"),
     ],
 )
@@ -200,6 +203,22 @@ def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, 
     train(cfg, real, tmp_path / "parts")
     (method,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
     assert trained(tmp_path / "parts", method) == trained(tmp_path / "whole", method)
+
+
+def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
+    cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=1")
+    policy, training = train_h2o_plus(cfg, real, tmp_path / "whole")
+    promised = [row["return_sim"] for row in training.rows]
+    assert max(promised) > promised[-1]
+    assert evaluate(make_simulator(cfg, 1), policy, 1).mean == max(promised)
+    assert evaluate(make_simulator(cfg, 1), load_policy(cfg, tmp_path / "whole"), 1).mean == max(promised)
+
+    monkeypatch.setattr("run.Training.log", interrupt_at(epoch=promised.index(max(promised)) + 1, log=Training.log))
+    with pytest.raises(KeyboardInterrupt):
+        train_h2o_plus(cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    train_h2o_plus(cfg, real, tmp_path / "parts")
+    assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
 
 
 def interrupt_at(epoch, log):
