@@ -28,6 +28,7 @@ from results import print_table
 from run import Training, open_run, save_config, write_summary
 from sac import train_sac
 from tensordict import TensorDictBase
+from torch.nn.functional import pad
 from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
 from training import train
@@ -59,14 +60,18 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
 
     # Losses. The discriminators have batches of their own, so their loss stands beside H2O+'s.
-    loss = H2OPlusLoss(actor, qvalues, value_loss, mixing=cfg.mixing, target_entropy=cfg.target_entropy)
+    num_real, _ = cfg.batch_size
+    loss = H2OPlusLoss(
+        actor, qvalues, value_loss, mixing=cfg.mixing, target_entropy=cfg.target_entropy, num_real=num_real
+    )
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
 
     def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
         ratio_losses = ratio_loss(pairs)
         if cfg.ratio:
-            estimator(batch)  # Eq. (9): writes the dynamics ratio
+            simulated = estimator(batch[num_real:])  # Eq. (9)
+            batch["dynamics_ratio"] = pad(simulated["dynamics_ratio"], (num_real, 0), value=1.0)
         return {**loss(batch), **ratio_losses}
 
     def figures(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, float]:

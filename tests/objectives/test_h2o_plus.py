@@ -183,3 +183,15 @@ def test_an_automatic_target_entropy_needs_the_action_s_spec(parts):
     actor = ProbabilisticActor(parts.actor[0], in_keys=["loc", "scale"], distribution_class=TanhNormal)
     with pytest.raises(ValueError, match="spec"):
         H2OPlusLoss(actor, parts.qvalues, ExpectileValueLoss(parts.value))
+
+
+def test_with_the_real_rows_first_the_numbers_stay_and_v_sees_them_alone(parts, batch):
+    loss, told = parts.h2o_plus(), parts.h2o_plus(num_real=4)
+    told.load_state_dict(loss.state_dict())
+    torch.manual_seed(0)
+    expected = loss(batch.copy())
+    seen = []
+    told.value_network.register_forward_hook(lambda module, inputs, output: seen.append(len(inputs[0])))
+    torch.manual_seed(0)
+    torch.testing.assert_close(told(batch.copy()), expected)
+    assert seen == [7, 4]  # V of all next states, and of the real states

@@ -279,7 +279,7 @@ def test_the_policy_starts_as_the_authors_and_stays_finite():
 def test_objectives_import_without_mujoco():
     code = (
         "import sys\n"
-        "for name in ('mujoco', 'gymnasium', 'dm_control', 'minari', 'h5py', 'hydra', 'yaml'):\n"
+        "for name in ('mujoco', 'gymnasium', 'dm_control', 'minari', 'h5py', 'hydra'):\n"
         "    sys.modules[name] = None\n"
         "import torchrl_h2o, torchrl_h2o.objectives\n"
     )

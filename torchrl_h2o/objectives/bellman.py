@@ -263,9 +263,9 @@ class MixedBellmanLoss(HybridLoss):
             policy = distribution(self.actor_network, states, self.actor_network_params)
         return rsample_and_log_prob(policy)
 
-    def _qvalues(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+    def _qvalues(self, tensordict: TensorDictBase, params: TensorDictBase, *, frozen: bool = False) -> Tensor:
         """Q(s, a) of every member of the ensemble, ``[num_qvalue_nets, *B]``."""
-        out = run(self.qvalue_network, tensordict, params, self.vmap_randomness)
+        out = run(self.qvalue_network, tensordict, params, self.vmap_randomness, frozen=frozen)
         return self._entry(out, self.tensor_keys.state_action_value).squeeze(-1)
 
     def _weight(self, terms: Tensor, tensordict: TensorDictBase, rows: Rows) -> Tensor:

@@ -18,6 +18,8 @@ from torch.nn import functional as F
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives.utils import _vmap_func
 
+from torchrl_h2o.objectives.relu_perceptron import relu_perceptron
+
 _ELEMENTWISE = (nn.ReLU, nn.Tanh, nn.ELU, nn.SiLU, nn.GELU, nn.Mish, nn.LeakyReLU, nn.Sigmoid, nn.Softplus, nn.Identity)
 _PLAIN = (TensorDictModule, ValueOperator)
 
@@ -29,7 +31,12 @@ class LastAxis(nn.Module):
 
 
 def run(
-    network: TensorDictModuleBase, tensordict: TensorDictBase, params: TensorDictBase, randomness: str = "error"
+    network: TensorDictModuleBase,
+    tensordict: TensorDictBase,
+    params: TensorDictBase,
+    randomness: str = "error",
+    *,
+    frozen: bool = False,
 ) -> TensorDictBase:
     """What a network writes.
 
@@ -38,21 +45,22 @@ def run(
         tensordict: what it reads, ``[*B]``, and maybe more.
         params: its parameters, ``[]``, or those of an ensemble, ``[N]``.
         randomness: of ``vmap``, for an ensemble that draws.
+        frozen: the parameters are constants; gradients reach the inputs alone.
 
     Returns:
         A tensordict with the network's ``out_keys``, ``[*B]`` or ``[N, *B]``.
     """
-    inputs = tensordict.select(*network.in_keys)
     layers = _layers(network)
     if layers is not None:
-        x = [inputs.get(key) for key in network.in_keys]
-        outputs = _perceptron(layers, x[0] if len(x) == 1 else torch.cat(x, -1), params)
+        x = [tensordict.get(key) for key in network.in_keys]
+        outputs = _perceptron(layers, x[0] if len(x) == 1 else torch.cat(x, -1), params, frozen)
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         if len(outputs) == len(network.out_keys):
             out = TensorDict({}, batch_size=(*params.batch_size, *tensordict.batch_size))
             for key, value in zip(network.out_keys, outputs, strict=True):
                 out.set(key, value)
             return out
+    inputs, params = tensordict.select(*network.in_keys), params.data if frozen else params
     if params.ndim:
         return _vmap_func(network, (None, 0), randomness=randomness)(inputs, params)
     with params.to_module(network, preserve_module_state=False):
@@ -78,7 +86,8 @@ def distribution(
 
 def _layers(network: nn.Module) -> list[tuple[Path, nn.Module]] | None:
     """The layers of a perceptron, each with where its parameters lie; None if the network is anything else."""
-    if type(network) not in _PLAIN or (len(network.in_keys) > 1 and type(network.module) is not MLP):
+    several = len(network.in_keys) > 1
+    if type(network) not in _PLAIN or _is_hooked(network) or (several and type(network.module) is not MLP):
         return None
     layers = list(_flat(network.module, ("module",)))
     plain = all(_is_plain(layer) for _, layer in layers) and any(type(layer) is nn.Linear for _, layer in layers)
@@ -86,7 +95,8 @@ def _layers(network: nn.Module) -> list[tuple[Path, nn.Module]] | None:
 
 
 def _flat(module: nn.Module, path: Path) -> Iterator[tuple[Path, nn.Module]]:
-    if type(module) is nn.Sequential or (type(module) is MLP and not module._reshape_out):
+    is_chain = type(module) is nn.Sequential or (type(module) is MLP and not module._reshape_out)
+    if is_chain and not _is_hooked(module):
         for name, child in module.named_children():
             yield from _flat(child, (*path, name))
     else:
@@ -94,33 +104,53 @@ def _flat(module: nn.Module, path: Path) -> Iterator[tuple[Path, nn.Module]]:
 
 
 def _is_plain(layer: nn.Module) -> bool:
-    hooked = layer._forward_hooks or layer._forward_pre_hooks
-    return (type(layer) in (nn.Linear, *_ELEMENTWISE) or isinstance(layer, LastAxis)) and not hooked
+    return (type(layer) in (nn.Linear, *_ELEMENTWISE) or isinstance(layer, LastAxis)) and not _is_hooked(layer)
 
 
-def _perceptron(layers: list[tuple[Path, nn.Module]], x: Tensor, params: TensorDictBase) -> Tensor | tuple[Tensor, ...]:
-    if not params.ndim:
-        for path, layer in layers:
-            x = F.linear(x, *_weight_and_bias(params, path)) if type(layer) is nn.Linear else layer(x)
-        return x
-    (members,), batch_size = params.batch_size, x.shape[:-1]
-    x, is_shared = x.reshape(-1, x.shape[-1]), True
+def _is_hooked(module: nn.Module) -> bool:
+    return bool(module._forward_hooks or module._forward_pre_hooks)
+
+
+def _perceptron(
+    layers: list[tuple[Path, nn.Module]], x: Tensor, params: TensorDictBase, frozen: bool
+) -> Tensor | tuple[Tensor, ...]:
+    batch_size = x.shape[:-1]
+    x = x.reshape(-1, x.shape[-1])
+    depth = 0 if torch.compiler.is_compiling() else _depth_with_relu(layers)
+    if depth:
+        linear = [_weight_and_bias(params, path, frozen) for path, _ in layers[: 2 * depth - 1 : 2]]
+        x = relu_perceptron(x, *zip(*linear, strict=True))
+        layers = layers[2 * depth - 1 :]
     for path, layer in layers:
         if type(layer) is not nn.Linear:
             x = layer(x)
             continue
-        weight, bias = _weight_and_bias(params, path)
-        if is_shared:  # one product for all members, as they read the same
-            bias = None if bias is None else bias.flatten(0, 1)
-            x = F.linear(x, weight.flatten(0, 1), bias).unflatten(-1, (members, -1)).movedim(-2, 0)
-            is_shared = False
+        weight, bias = _weight_and_bias(params, path, frozen)
+        if weight.ndim == 2:
+            x = F.linear(x, weight, bias)
         else:
-            x = torch.bmm(x, weight.mT) if bias is None else torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
+            x = x @ weight.mT if bias is None else x @ weight.mT + bias.unsqueeze(1)
     if isinstance(x, tuple):
-        return tuple(part.reshape(members, *batch_size, part.shape[-1]) for part in x)
-    return x.reshape(members, *batch_size, x.shape[-1])
+        return tuple(part.reshape(*params.batch_size, *batch_size, part.shape[-1]) for part in x)
+    return x.reshape(*params.batch_size, *batch_size, x.shape[-1])
 
 
-def _weight_and_bias(params: TensorDictBase, path: Path) -> tuple[Tensor, Tensor | None]:
+def _depth_with_relu(layers: list[tuple[Path, nn.Module]]) -> int:
+    """How many linear layers, each with a bias, follow each other with ReLU between them and nothing else."""
+    depth = 0
+    for index, (_, layer) in enumerate(layers):
+        if type(layer) is not (nn.ReLU if index % 2 else nn.Linear):
+            break
+        if not index % 2:
+            if layer.bias is None:
+                break
+            depth += 1
+    return depth
+
+
+def _weight_and_bias(params: TensorDictBase, path: Path, frozen: bool) -> tuple[Tensor, Tensor | None]:
     own = params.get(path)
-    return own.get("weight"), own.get("bias", None)
+    weight, bias = own.get("weight"), own.get("bias", None)
+    if frozen:
+        weight, bias = weight.detach(), None if bias is None else bias.detach()
+    return weight, bias

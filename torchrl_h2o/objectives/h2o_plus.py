@@ -41,6 +41,9 @@ class H2OPlusLoss(MixedBellmanLoss):
         fixed_alpha (bool, optional): whether β stays as it is. Defaults to ``False``.
         target_entropy (float or "auto", optional): in nats; ``"auto"`` is -dim(A), from the actor's spec.
         num_qvalue_nets (int, optional): see :class:`MixedBellmanLoss`.
+        num_real (int, optional): of a flat batch whose real rows come first, as
+            :class:`~torchrl_h2o.data.HybridReplayBuffer` draws it, how many there are. V, which real rows alone train,
+            is then not evaluated on the others.
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`; that of its parts too.
 
     Raises:
@@ -91,6 +94,7 @@ class H2OPlusLoss(MixedBellmanLoss):
         fixed_alpha: bool = False,
         target_entropy: float | str = "auto",
         num_qvalue_nets: int = 2,
+        num_real: int | None = None,
         reduction: str = "mean",
     ) -> None:
         super().__init__(
@@ -104,6 +108,7 @@ class H2OPlusLoss(MixedBellmanLoss):
             reduction=reduction,
         )
         self.ratio_loss = ratio_loss
+        self.num_real = num_real
         for part in self._parts:
             if part.reduction != reduction:
                 raise ValueError(
@@ -206,7 +211,11 @@ class H2OPlusLoss(MixedBellmanLoss):
         return {**self.ratio_loss(batch), "dynamics_ratio": shown}
 
     def _value_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
-        """Eq. (4): writes the target Q at the data's own actions into the batch and returns V's loss."""
+        """Eq. (4): V's loss, regressed on the target Q at the data's own actions."""
+        if self.num_real is not None and self.reduction != "none":  # no other row counts
+            batch, rows = batch[: self.num_real], rows.first(self.num_real)
+        else:
+            batch = batch.copy()
         batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
         return {"loss_value": self.value_loss.value_loss(batch, rows)}
 
@@ -220,7 +229,7 @@ class H2OPlusLoss(MixedBellmanLoss):
         states = tensordict.copy()
         action, log_prob = self._sample_action(states)
         states.set(self.tensor_keys.action, action)
-        qvalue = self._qvalues(states, self.qvalue_network_params.data).amin(0)
+        qvalue = self._qvalues(states, self.qvalue_network_params, frozen=True).amin(0)
         terms = self.alpha * log_prob - qvalue  # Eq. (10)
         return self._union_expectation(terms, rows), log_prob.detach()
 

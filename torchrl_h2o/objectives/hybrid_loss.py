@@ -22,18 +22,23 @@ class Rows:
 
     Args:
         real: the rows of measured data, a mask ``[*B]``.
-        sim: the simulated rows. One that ``loss_mask_key`` excludes is in neither.
+        sim: the simulated rows.
+        either: the rows of any stream; None for all, if ``loss_mask_key`` excludes none.
     """
 
-    def __init__(self, real: Tensor, sim: Tensor) -> None:
-        self.real, self.sim, self.either = real, sim, real | sim
+    def __init__(self, real: Tensor, sim: Tensor, either: Tensor | None) -> None:
+        self.real, self.sim, self.either = real, sim, either
         self._weights: dict[torch.dtype, Tensor] = {}
         self._streams: dict[torch.dtype, Tensor] = {}
+
+    def first(self, number: int) -> Rows:
+        """The first rows of a flat batch alone."""
+        return Rows(self.real[:number], self.sim[:number], None if self.either is None else self.either[:number])
 
     def weights(self, dtype: torch.dtype) -> Tensor:
         """One over the number of rows in each row's own stream, ``[*B]``."""
         if dtype not in self._weights:
-            n_real, n_sim = (rows.sum().clamp_min(1).to(dtype) for rows in (self.real, self.sim))
+            n_real, n_sim = (rows.sum(dtype=dtype).clamp_min(1.0) for rows in (self.real, self.sim))
             self._weights[dtype] = self.real / n_real + self.sim / n_sim
         return self._weights[dtype]
 
@@ -142,13 +147,14 @@ class HybridLoss(LossModule):
         real = real.bool()
         if real.ndim > tensordict.ndim:
             real = real.squeeze(-1)
-        sim = ~real
+        sim, either = ~real, None
         for key in self._loss_mask_keys():
             valid = tensordict.get(key, None)
             if valid is not None:
                 valid = self._expand_loss_mask(valid, real)
                 real, sim = real & valid, sim & valid
-        return Rows(real, sim)
+                either = real | sim
+        return Rows(real, sim, either)
 
     def _expectation(
         self, terms: Tensor, rows: Rows, among: Tensor | None = None, *, reduction: str | None = None
@@ -161,8 +167,9 @@ class HybridLoss(LossModule):
             among: ``rows.real`` or ``rows.sim``, for one expectation alone.
             reduction: instead of the loss's own.
         """
+        among = rows.either if among is None else among
         # Selected, not multiplied: 0 * inf is NaN.
-        selected = torch.where(rows.either if among is None else among, terms, 0.0)
+        selected = terms if among is None else terms.masked_fill(~among, 0.0)
         reduction = reduction or self.reduction
         if reduction == "none":
             return selected

@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchrl_h2o.objectives.functional import run
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 
 
@@ -80,38 +81,47 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         self.in_keys = list(dict.fromkeys((*sa_network.in_keys, *sas_network.in_keys)))
         self.out_keys = list(out_keys)
 
-    def log_odds(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def log_odds(self, tensordict: TensorDictBase, params: TensorDictBase | None = None) -> tuple[Tensor, Tensor]:
         """Log-odds of real over simulated.
 
         Args:
             tensordict (TensorDictBase): transitions, ``[*B]``.
+            params (TensorDictBase, optional): instead of this module's own parameters.
 
         Returns:
             The log-odds given (s, a) and given (s, a, s'), ``[*B]`` each. With ``residual`` the second holds the
             first as a constant, so that each is trained by its own loss alone.
         """
-        sa = self._network_log_odds(self.sa_network, tensordict)
-        sas = self._network_log_odds(self.sas_network, tensordict)
+        sa, sas = (self._network_log_odds(name, tensordict, params) for name in ("sa_network", "sas_network"))
         return sa, sas + sa.detach() if self.residual else sas
 
-    def _network_log_odds(self, network: TensorDictModule, tensordict: TensorDictBase) -> Tensor:
-        logits = network(tensordict.select(*network.in_keys)).get(network.out_keys[0])
+    def _network_log_odds(self, name: str, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
+        network = getattr(self, name)
+        if params is None:
+            out = network(tensordict.select(*network.in_keys))
+        else:
+            out = run(network, tensordict, params.get(name))
+        logits = out.get(network.out_keys[0])
         if logits.shape[-1] != 2:
             raise ValueError(f"a discriminator must write two logits (real, simulated), not {logits.shape[-1]}.")
         if self.logit_bound is not None:
             logits = self.logit_bound * torch.tanh(logits)
-        return logits[..., 0] - logits[..., 1]
+        real, sim = logits.unbind(-1)
+        return real - sim
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        with torch.no_grad():
-            sa, sas = self.log_odds(tensordict)
-            log_ratio = sas - sa  # Eq. (9)
-            ratio = log_ratio.exp()
-            if self.clamp is not None:
-                ratio = ratio.clamp(*self.clamp)
+        log_ratio, ratio = self.ratio(tensordict)
         log_key, key = self.out_keys
         return tensordict.set(log_key, log_ratio).set(key, ratio)
+
+    @torch.no_grad()
+    def ratio(self, tensordict: TensorDictBase, params: TensorDictBase | None = None) -> tuple[Tensor, Tensor]:
+        """Eq. (9): the log ratio, and the clamped ratio, constants, ``[*B]`` each; arguments as of :meth:`log_odds`."""
+        sa, sas = self.log_odds(tensordict, params)
+        log_ratio = sas - sa  # Eq. (9)
+        ratio = log_ratio.exp()
+        return log_ratio, ratio if self.clamp is None else ratio.clamp(*self.clamp)
 
 
 class DynamicsRatioLoss(HybridLoss):
@@ -173,17 +183,14 @@ class DynamicsRatioLoss(HybridLoss):
 
     def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
         """Eq. (9) of this loss's current parameters, a constant, ``[*B]``."""
-        with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
-            estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
-        return estimated.get(self.estimator.out_keys[-1])
+        return self.estimator.ratio(tensordict, self.estimator_params)[1]
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs, rows = tensordict.select(*self.estimator.in_keys), self._rows(tensordict)
         if self.training and self.input_noise:
             inputs = inputs.apply(lambda x: x + self.input_noise * torch.randn_like(x))
-        with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
-            sa, sas = self.estimator.log_odds(inputs)
+        sa, sas = self.estimator.log_odds(inputs, self.estimator_params)
         return self._output(
             {
                 "loss_ratio_sa": self._cross_entropy(sa, rows),
