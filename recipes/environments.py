@@ -1,5 +1,8 @@
 """The two environments of a run, from its configuration: reality, and the simulator with its dynamics gap."""
 
+from collections.abc import Callable
+from functools import partial
+
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -33,12 +36,21 @@ def make_simulator(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool 
         ValueError: for a report that mends nothing.
         torchrl_h2o.data.DataError: for a report that cannot be read.
     """
+    return _make(cfg, _simulator_effects(cfg), num_worlds, raw, kwargs)
+
+
+def simulator_maker(cfg: DictConfig) -> Callable[[], EnvBase]:
+    """What makes the run's simulator in another process or on another machine: what is in files here has been read."""
+    return partial(_make, cfg, _simulator_effects(cfg), cfg.num_worlds, raw=False, kwargs={})
+
+
+def _simulator_effects(cfg: DictConfig) -> list[Effect]:
     effects = [instantiate(effect) for effect in cfg.env.simulator]
     if cfg.gap is not None:
         effects.append(paper_gap(cfg.gap, cfg.gap_strength))
     if cfg.get("gap_fix") is not None:  # a run of an earlier version says nothing of it
         effects.extend(_missing_effects(cfg.gap_fix))
-    return _make(cfg, effects, num_worlds, raw, kwargs)
+    return effects
 
 
 def _missing_effects(report: str) -> tuple[Effect, ...]:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import hydra
 import torch
+from collection import check_collector
 from environments import make_reality, make_simulator, measure_observation_norm
 from evaluation import evaluate
 from learner import Learner, adam
@@ -120,6 +121,7 @@ def run(cfg: DictConfig, directory: Path) -> None:
     start = time.perf_counter()
     make_value_loss(cfg, observation_dim=1)  # what there is not, backbone, gap or report: said before the data are read
     make_simulator(cfg, raw=True)
+    check_collector(cfg)
     real = read_real_data(cfg)
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)

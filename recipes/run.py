@@ -19,7 +19,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
-from torchrl.envs import EnvBase
+from torchrl.collectors import BaseCollector
 from tqdm import tqdm
 
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
@@ -109,7 +109,7 @@ class Training:
         """The metrics so far, one row an evaluation."""
         return self.progress["rows"]
 
-    def epochs(self, env: EnvBase) -> Iterator[tuple[int, bool]]:
+    def epochs(self, collector: BaseCollector) -> Iterator[tuple[int, bool]]:
         """Yields each epoch's number and whether to evaluate at its end; seeds it before, and checkpoints after it."""
         done = self.progress["epoch"]
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * self.cfg.updates_per_epoch, unit=" updates")
@@ -117,7 +117,7 @@ class Training:
             start = time.perf_counter()
             seed = int(np.random.SeedSequence((self.cfg.seed, epoch)).generate_state(1)[0])
             torch.manual_seed(seed)
-            env.set_seed(seed % 2**31)
+            collector.set_seed(seed % 2**31)
             last = epoch + 1 == num_epochs(self.cfg)
             yield epoch, last or (epoch + 1) % self.cfg.eval_every == 0
             self.progress["epoch"] = epoch + 1

@@ -1,0 +1,152 @@
+"""Measures how the cost of an update grows: seconds and memory against buffer, batch and width.
+
+python recipes/benchmarks/scaling.py                       # three minutes; up to ten million transitions
+python recipes/benchmarks/scaling.py buffer_sizes=[100_000,100_000_000] scratch=/data
+python recipes/benchmarks/scaling.py device=cuda
+
+One thing grows at a time. Contenders take turns. Memory-mapped buffers are removed in the end; one that does not fit is
+left out, with a note. Leaves scaling.json and scaling.png in the run's folder.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from tempfile import TemporaryDirectory
+
+import h2o_plus
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from learner import Learner
+from memory import held, room_in_memory, room_on_disk, taken_by
+from omegaconf import DictConfig, OmegaConf
+from scaling_figure import draw_scaling
+from tensordict import TensorDict
+from tqdm import tqdm
+from turns import calls_per_second
+from update import action_spec, some_transitions
+
+from torchrl_h2o.data import HybridReplayBuffer
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What an update costs.
+
+    Args:
+        grows: buffer, batch (rows of a stream) or width (of a hidden layer).
+        size: of what grows.
+        storage: where simulated transitions are.
+        memory: bytes that a buffer holds, without mapped files; of what else grows, what a first update takes at its
+            height: gradients, the optimiser's state, activations.
+        seconds_per_update: sampling included.
+        seconds_per_sample: of all batches of an update.
+    """
+
+    grows: str
+    size: int
+    storage: str
+    memory: int
+    seconds_per_update: float = 0.0
+    seconds_per_sample: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.grows} {self.size:,}, {self.storage}"
+
+
+def fill(real: TensorDict, size: int, device: str, folder: str | None = None) -> HybridReplayBuffer:
+    """A buffer with so many simulated transitions, written piece by piece, in memory or in files of a folder."""
+    replay = HybridReplayBuffer(real, size, device=device, scratch_dir=folder)
+    for first in range(0, size, len(real)):
+        replay.extend(real[: size - first])
+    return replay
+
+
+def make_learner(cfg: DictConfig, replay: HybridReplayBuffer, **constants: object) -> Learner:
+    """H2O+ with the recipe's own constants, or these."""
+    run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")
+    run = OmegaConf.merge(run, constants)
+    return h2o_plus.make_learner(run, cfg.observation_dim, action_spec(cfg), replay)
+
+
+def larger_buffers(cfg: DictConfig, real: TensorDict, scratch: str) -> Iterator[tuple[Cost, Learner]]:
+    """Learners on buffers that grow, each in memory and in files."""
+    rows = real.select("observation", "action", "next")
+    each = sum(value.nbytes for value in rows.values(True, True)) // len(rows)
+    on_gpu = torch.device(cfg.device).type == "cuda"
+    for size in cfg.buffer_sizes:
+        rooms = {"in memory": room_in_memory()} | ({} if on_gpu else {"memory-mapped": room_on_disk(scratch)})
+        for storage, room in rooms.items():
+            if size * each > room:
+                tqdm.write(f"left out: {size:,} transitions {storage} take {size * each:,} bytes, there are {room:,}")
+                continue
+            before = held(cfg.device)
+            folder = f"{scratch}/{size}" if storage == "memory-mapped" else None
+            replay = fill(real, size, cfg.device, folder)
+            yield Cost("buffer", size, storage, held(cfg.device) - before), make_learner(cfg, replay)
+
+
+def larger_learners(cfg: DictConfig, real: TensorDict) -> Iterator[tuple[Cost, Learner]]:
+    """Learners with batches, or networks, that grow, on one buffer."""
+    replay = fill(real, cfg.transitions, cfg.device)
+    batches = {size: {"batch_size": [size] * 2, "discriminator_batch_size": [2 * size] * 2} for size in cfg.batch_sizes}
+    widths = {width: {"num_cells": [width] * 2} for width in cfg.widths}
+    for grows, choices in {"batch": batches, "width": widths}.items():
+        for size, constants in choices.items():
+            learner = make_learner(cfg, replay, **constants)
+            yield Cost(grows, size, "in memory", taken_by(learner.update, cfg.device)), learner
+
+
+def sample(learner: Learner) -> list[TensorDict]:
+    """The batches of one update."""
+    return [learner.replay.sample(size) for size in learner.batch_sizes]
+
+
+def measure(cfg: DictConfig, scratch: str) -> list[Cost]:
+    """Seconds and memory of each contender."""
+    real = some_transitions(cfg)
+    contenders = [*larger_buffers(cfg, real, scratch), *larger_learners(cfg, real)]
+    functions = {}
+    for cost, learner in contenders:
+        functions[f"update, {cost}"] = learner.update
+        functions[f"sample, {cost}"] = partial(sample, learner)
+    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
+    rates = calls_per_second(functions, cfg.seconds, cfg.turns, synchronise)
+    return [
+        replace(cost, seconds_per_update=1 / rates[f"update, {cost}"], seconds_per_sample=1 / rates[f"sample, {cost}"])
+        for cost, _ in contenders
+    ]
+
+
+def print_table(costs: list[Cost]) -> None:
+    print(f"\n{'what grows':<40}{'ms an update':>14}{'ms a sample':>14}{'MB':>10}")
+    for cost in costs:
+        times = f"{1e3 * cost.seconds_per_update:>14.2f}{1e3 * cost.seconds_per_sample:>14.3f}"
+        print(f"{cost!s:<40}{times}{cost.memory / 1e6:>10.1f}")
+
+
+@hydra.main(config_path="../config", config_name="scaling_benchmark", version_base=None)
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    torch.set_default_device(cfg.device)
+    with TemporaryDirectory(dir=cfg.scratch) as scratch:
+        costs = measure(cfg, scratch)
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    result = {"costs": [asdict(cost) for cost in costs], "torch": torch.__version__}
+    result |= {"threads": cfg.threads, "device": cfg.device}
+    (directory / "scaling.json").write_text(json.dumps(result, indent=2) + "\n")
+    draw_scaling(directory / "scaling.png", result["costs"])
+    print_table(costs)
+    print(f"\nresults    {os.path.relpath(directory)}/scaling.json, scaling.png")
+
+
+if __name__ == "__main__":
+    main()

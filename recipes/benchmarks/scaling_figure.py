@@ -1,0 +1,53 @@
+"""The picture of how the cost of an update grows: a column for each thing that does, seconds above and memory below."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+LABELS = {
+    "buffer": "simulated transitions in the buffer",
+    "batch": "rows of a stream in a batch",
+    "width": "width of the hidden layers",
+    "population": "runs in one process",
+}
+COLOURS = {"in memory": "#0b6e4f", "memory-mapped": "#c8553d"}
+
+
+def draw_scaling(path: Path, costs: list[dict]) -> None:
+    """Draws scaling.png; both axes are logarithmic.
+
+    Args:
+        path: of the picture.
+        costs: what scaling.json has: what grows, its size, seconds and bytes.
+    """
+    columns = list(dict.fromkeys(cost["grows"] for cost in costs))
+    figure, axes = plt.subplots(
+        2, len(columns), figsize=(4 * len(columns), 6), sharex="col", sharey="row", squeeze=False, layout="constrained"
+    )
+    for column, grows in enumerate(columns):
+        seconds, memory = axes[:, column]
+        for storage, colour in COLOURS.items():
+            rows = [cost for cost in costs if cost["grows"] == grows and cost["storage"] == storage]
+            if not rows:
+                continue
+            sizes = [cost["size"] for cost in rows]
+            for key, style in (("seconds_per_update", "o-"), ("seconds_per_sample", "s--")):
+                label = f"{key.replace('seconds_per_', 'one ')}, {storage}"
+                seconds.plot(sizes, [1e3 * cost[key] for cost in rows], style, ms=4, color=colour, label=label)
+            megabytes = [max(cost["memory"], 1e5) / 1e6 for cost in rows]  # pages are too coarse for less
+            memory.plot(sizes, megabytes, "o-", ms=4, color=colour)
+        memory.set(xlabel=LABELS.get(grows, grows), xscale="log")
+        sizes = sorted({cost["size"] for cost in costs if cost["grows"] == grows})
+        memory.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        memory.minorticks_off()
+    axes[0, 0].set(ylabel="ms", yscale="log")
+    axes[1, 0].set(ylabel="MB", yscale="log")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
