@@ -5,6 +5,7 @@ python recipes/h2o_plus.py data=standing_still.txt                     # the sam
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the simulator, mended
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # anything in config/ can be overridden
+python recipes/h2o_plus.py seeds=[0,1,2,3,4] gaps=[gravity,friction]   # ten runs at once, stacked
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # go on after an interruption
 """
 
@@ -18,15 +19,15 @@ from pathlib import Path
 import hydra
 import torch
 from collection import check_collector
-from environments import make_reality, make_simulator, measure_observation_norm
-from evaluation import evaluate
+from environments import make_simulator, measure_observation_norm
+from judging import judge, judge_failed
 from learner import Learner, adam
-from learning_curve import draw_learning_curve
 from omegaconf import DictConfig
+from population_training import members_of, train_population
 from real_data import behaviour_in, read_real_data
 from rendering import try_to_film
-from results import print_table
-from run import Training, open_run, save_config, write_summary
+from results import print_population, print_table
+from run import Training, open_run, save_config
 from sac import train_sac
 from tensordict import TensorDictBase
 from torch.nn.functional import pad
@@ -49,6 +50,28 @@ from torchrl_h2o.objectives import (
 )
 
 
+class H2OPlusTerms(torch.nn.Module):
+    """What an update adds up: H2O+'s loss on a batch, and the discriminators' on pairs of their own."""
+
+    def __init__(self, loss: H2OPlusLoss, ratio_loss: DynamicsRatioLoss, ratio: bool, num_real: int) -> None:
+        super().__init__()
+        self.loss, self.ratio_loss, self.ratio, self.num_real = loss, ratio_loss, ratio, num_real
+
+    def forward(self, batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
+        ratio_losses = self.ratio_loss(pairs)
+        if self.ratio:
+            of_simulated = self.ratio_loss.dynamics_ratio(batch[self.num_real :])  # Eq. (9)
+            batch["dynamics_ratio"] = pad(of_simulated, (self.num_real, 0), value=1.0)
+        return {**self.loss(batch), **ratio_losses}
+
+    def draw_noise(
+        self, batch: TensorDictBase, pairs: TensorDictBase, generator: torch.Generator | None = None
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """The noise of a forward, for the batch and for the pairs, drawn in the forward's order."""
+        of_pairs = self.ratio_loss.draw_noise(pairs, generator)
+        return self.loss.draw_noise(batch, generator), of_pairs
+
+
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """The method: real and simulated batches, one loss, one optimiser."""
     torch.manual_seed(cfg.seed)
@@ -68,13 +91,6 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
 
-    def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
-        ratio_losses = ratio_loss(pairs)
-        if cfg.ratio:
-            simulated = estimator(batch[num_real:])  # Eq. (9)
-            batch["dynamics_ratio"] = pad(simulated["dynamics_ratio"], (num_real, 0), value=1.0)
-        return {**loss(batch), **ratio_losses}
-
     def figures(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, float]:
         return {"ratio_of_sim": float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean())}
 
@@ -85,7 +101,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         SoftUpdate(loss, tau=cfg.tau),
         replay,
         [cfg.batch_size, cfg.discriminator_batch_size],
-        terms_of,
+        H2OPlusTerms(loss, ratio_loss, cfg.ratio, num_real),
         figures,
     )
 
@@ -111,7 +127,8 @@ def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
 def main(cfg: DictConfig) -> None:
     cfg, directory = open_run(cfg)
     try:
-        run(cfg, directory)
+        members = members_of(cfg)
+        run_population(cfg, members, directory) if members else run(cfg, directory)
     except KeyboardInterrupt:
         sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}")
 
@@ -119,12 +136,7 @@ def main(cfg: DictConfig) -> None:
 def run(cfg: DictConfig, directory: Path) -> None:
     """Trains, evaluates in reality, and leaves summary.json, metrics.csv, learning_curve.png and a film."""
     start = time.perf_counter()
-    make_value_loss(cfg, observation_dim=1)  # what there is not, backbone, gap or report: said before the data are read
-    make_simulator(cfg, raw=True)
-    check_collector(cfg)
-    real = read_real_data(cfg)
-    measure_observation_norm(cfg, real)
-    save_config(cfg, directory)
+    real = prepare(cfg, directory)
     wall_s = time.perf_counter() - start
 
     policies, trainings = {}, {}
@@ -133,36 +145,41 @@ def run(cfg: DictConfig, directory: Path) -> None:
         policies["SAC in the simulator"], trainings["SAC in the simulator"] = train_sac(cfg, real, directory)
     wall_s += sum(training.progress["seconds"] for training in trainings.values())
 
-    # What the policies do in reality, and in the simulator that they were trained in.
-    start = time.perf_counter()
-    reality, simulator = make_reality(cfg, cfg.final_episodes), make_simulator(cfg, 1)
-    in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
-    in_simulator = evaluate(simulator, policies["H2O+"], 1)
-    behaviour = behaviour_in(cfg, real)
-    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour.mean, cfg)
-    write_summary(
-        directory,
-        {
-            "env": cfg.env.name,
-            "gap": cfg.gap,
-            "gap_fix": cfg.get("gap_fix"),
-            "data": cfg.data,
-            "transitions": len(real),
-            "backbone": cfg.backbone,
-            "mixing": cfg.mixing,
-            "ratio": cfg.ratio,
-            "seed": cfg.seed,
-            "updates": trainings["H2O+"].updates,
-            "return_real": in_reality["H2O+"].summary(),
-            "return_sim": in_simulator.summary(),
-            "return_data": behaviour.summary(),
-            "baselines": {name: in_reality[name].summary() for name in policies if name != "H2O+"},
-            "updates_per_second": trainings["H2O+"].updates_per_second,
-            "wall_s": wall_s + time.perf_counter() - start,
-        },
-    )
+    in_reality = judge(cfg, real, policies, trainings, directory, wall_s)
     film = try_to_film(cfg, policies["H2O+"], directory) if cfg.render else None
-    print_table(cfg, in_reality | {"the data's behaviour": behaviour}, directory, film)
+    print_table(cfg, in_reality, directory, film)
+
+
+def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: Path) -> None:
+    """The same for many runs at once, each with its files in a folder of its own; no baseline and no films."""
+    start = time.perf_counter()
+    for own in members.values():
+        make_simulator(own, raw=True)  # a gap that there is not
+    real = prepare(cfg, directory)
+    members = members_of(cfg)  # with what was measured from the data
+    wall_s = time.perf_counter() - start
+    outcomes = train_population(make_learner, cfg, members, real, directory)
+    in_reality = {}
+    for name, outcome in outcomes.items():
+        own, folder = members[name], directory / name
+        if outcome.failure is None:
+            so_far_s = wall_s + outcome.seconds
+            in_reality[name] = judge(own, real, {"H2O+": outcome.policy}, {"H2O+": outcome}, folder, so_far_s)["H2O+"]
+        else:
+            judge_failed(own, real, outcome.failure, folder)
+            in_reality[name] = None
+    print_population(cfg, in_reality | {"the data's behaviour": behaviour_in(cfg, real)}, directory)
+
+
+def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
+    """The real data. What there is not, backbone, gap or report, is said before they are read."""
+    make_value_loss(cfg, observation_dim=1)
+    make_simulator(cfg, raw=True)
+    check_collector(cfg)
+    real = read_real_data(cfg)
+    measure_observation_norm(cfg, real)
+    save_config(cfg, directory)
+    return real
 
 
 if __name__ == "__main__":

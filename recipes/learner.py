@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import total_loss
 
 
 @dataclass
@@ -41,7 +42,7 @@ class Learner:
         self.batches = [self.replay.sample(size) for size in self.batch_sizes]
         losses = self.terms_of(*self.batches)
         self.optimiser.zero_grad()
-        sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
+        total_loss(losses).backward()
         self.optimiser.step()
         self.targets.step()
         return losses

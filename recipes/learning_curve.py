@@ -1,18 +1,26 @@
 """The picture of a run: returns in reality over the updates, and what the discriminators see."""
 
 from pathlib import Path
+from typing import Protocol
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from omegaconf import DictConfig
-from run import Training
 
 COLOURS = {"H2O+": "#0b6e4f", "SAC in the simulator": "#c8553d"}
 
 
-def draw_learning_curve(path: Path, trainings: dict[str, Training], behaviour: float, cfg: DictConfig) -> None:
+class Trained(Protocol):
+    """What is told of a training when it is over."""
+
+    rows: list[dict]
+    updates: int
+    updates_per_second: float
+
+
+def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: float, cfg: DictConfig) -> None:
     """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(3, 2))
     for name, training in trainings.items():

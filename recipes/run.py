@@ -47,7 +47,7 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
         raise ValueError(f"updates={cfg.updates}: train for at least one")
     if cfg.get("keep", "last") not in KEEP:
         raise ValueError(f"keep={cfg.keep}: choose {' or '.join(KEEP)}")
-    if cfg.gap is None and cfg.gap_strength is not None:
+    if cfg.gap is None and cfg.get("gaps") is None and cfg.gap_strength is not None:
         raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
     for key in ("data", "columns", "gap_fix"):  # a resumed run may start elsewhere
         if cfg[key] is not None and Path(cfg[key]).exists():
@@ -109,15 +109,18 @@ class Training:
         """The metrics so far, one row an evaluation."""
         return self.progress["rows"]
 
-    def epochs(self, collector: BaseCollector) -> Iterator[tuple[int, bool]]:
-        """Yields each epoch's number and whether to evaluate at its end; seeds it before, and checkpoints after it."""
+    def epochs(self, collector: BaseCollector | None = None) -> Iterator[tuple[int, bool]]:
+        """Yields each epoch's number and whether to evaluate at its end; checkpoints after it.
+
+        Args:
+            collector: is seeded before each epoch, with torch; without it the caller does that.
+        """
         done = self.progress["epoch"]
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * self.cfg.updates_per_epoch, unit=" updates")
         for epoch in range(done, num_epochs(self.cfg)):
             start = time.perf_counter()
-            seed = int(np.random.SeedSequence((self.cfg.seed, epoch)).generate_state(1)[0])
-            torch.manual_seed(seed)
-            collector.set_seed(seed % 2**31)
+            if collector is not None:
+                seed_epoch(self.cfg.seed, epoch, collector)
             last = epoch + 1 == num_epochs(self.cfg)
             yield epoch, last or (epoch + 1) % self.cfg.eval_every == 0
             self.progress["epoch"] = epoch + 1
@@ -141,10 +144,19 @@ class Training:
 
     def log(self, epoch: int, **metrics: float) -> None:
         """Adds a row of metrics, writes metrics.csv, and shows the return in reality beside the bar."""
-        row = {"method": self.name, "updates": (epoch + 1) * self.cfg.updates_per_epoch, **metrics}
-        self.rows.append(row)
+        self.rows.append(self._row(epoch, metrics))
         write_metrics(self.directory, self.name, self.rows)
         self._bar.set_postfix(return_real=f"{metrics['return_real']:.0f}")
+
+    def _row(self, epoch: int, metrics: dict[str, float]) -> dict:
+        return {"method": self.name, "updates": (epoch + 1) * self.cfg.updates_per_epoch, **metrics}
+
+
+def seed_epoch(run_seed: int, epoch: int, collector: BaseCollector) -> None:
+    """Starts the random streams of an epoch: torch's global one, and the collector's."""
+    seed = int(np.random.SeedSequence((run_seed, epoch)).generate_state(1)[0])
+    torch.manual_seed(seed)
+    collector.set_seed(seed % 2**31)
 
 
 def keeps_best(cfg: DictConfig) -> bool:

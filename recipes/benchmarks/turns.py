@@ -13,6 +13,7 @@ def calls_per_second(
     seconds: float,
     turns: int,
     synchronise: Callable[[], object] = lambda: None,
+    least: int = WARM_UP,
 ) -> dict[str, float]:
     """Calls a second of each function, the best of several turns.
 
@@ -21,6 +22,7 @@ def calls_per_second(
         seconds: of one turn.
         turns: of each function, after one to warm up.
         synchronise: waits until what was called is done.
+        least: how many calls a turn has at least.
     """
     best = dict.fromkeys(functions, 0.0)
     with tqdm(desc="measuring", total=len(functions) * (1 + turns), unit=" turns") as bar:
@@ -29,7 +31,7 @@ def calls_per_second(
                 bar.set_postfix_str(name)
                 synchronise()
                 start, calls = time.perf_counter(), 0
-                while calls < WARM_UP or (turn and time.perf_counter() - start < seconds):
+                while calls < least or (turn and time.perf_counter() - start < seconds):
                     function()
                     calls += 1
                 synchronise()

@@ -35,6 +35,23 @@ def test_steps_are_set_beside_bare_rollouts(tmp_path):
     assert "of mujoco.rollout" in out
 
 
+def test_a_population_s_updates_are_set_beside_a_single_run_s(tmp_path):
+    small = ("members=[1,3]", "compiled=[]", "seconds=0.1", "turns=1", "calls=1", "transitions=600", "threads=1")
+    out = run("population.py", tmp_path, *small)
+    result = json.loads((tmp_path / "population.json").read_text())
+    assert [(line["members"], line["way"]) for line in result["lines"]] == [
+        (1, "a single run"),
+        (1, "stacked"),
+        (3, "stacked"),
+    ]
+    for line in result["lines"]:
+        assert line["run_updates_per_second"] == pytest.approx(line["members"] * line["updates_per_second"])
+    best = max(line["run_updates_per_second"] for line in result["lines"])
+    assert result["table"]["hours"] == pytest.approx(125e6 / best / 3600)
+    assert "CPU" in result["device"]
+    assert "25 tasks x 5 seeds x 1,000,000 updates" in out
+
+
 def test_costs_are_told_for_all_that_grows_and_mapped_buffers_leave_nothing(tmp_path):
     (tmp_path / "scratch").mkdir()
     small = ["transitions=1000", "buffer_sizes=[500,20000,1000000000000]", "batch_sizes=[8,16]", "widths=[8,512]"]

@@ -10,6 +10,7 @@ from torchrl_h2o.data.load import load
 from torchrl_h2o.data.log_columns import Column, LogColumns
 from torchrl_h2o.data.memory_map import read_ted, write_ted
 from torchrl_h2o.data.minari_dataset import read_minari, write_minari
+from torchrl_h2o.data.population_replay import PopulationReplay
 from torchrl_h2o.data.robot_log import read_robot_log
 from torchrl_h2o.data.specs import check_specs
 from torchrl_h2o.data.ted import episodes
@@ -19,6 +20,7 @@ __all__ = [
     "DataError",
     "HybridReplayBuffer",
     "LogColumns",
+    "PopulationReplay",
     "check_specs",
     "episodes",
     "load",

@@ -54,6 +54,8 @@ class HybridReplayBuffer:
         device: where the data are kept and the batches are made.
         scratch_dir: keep the simulated data in memory-mapped files there, for more than fits in
             memory.
+        sim_memory: keep the simulated data in these tensors, of batch size [sim_capacity]; what
+            they hold does not count.
 
     Raises:
         ValueError: an entry that the real data lack, with what to do.
@@ -80,6 +82,7 @@ class HybridReplayBuffer:
         keys: Sequence[NestedKey] = TRANSITION_KEYS,
         device: torch.device | str = "cpu",
         scratch_dir: str | Path | None = None,
+        sim_memory: TensorDictBase | None = None,
     ):
         if sim_capacity < 1:
             raise ValueError(f"sim_capacity is {sim_capacity}, it must be at least 1")
@@ -90,12 +93,14 @@ class HybridReplayBuffer:
         self.device = torch.device(device)
         real = _select(real, self.keys, "real").to(self.device)
         self.real = ReplayBuffer(storage=TensorStorage(real, device=self.device), writer=ImmutableDatasetWriter())
-        storage = (
-            LazyTensorStorage(sim_capacity, device=self.device)
-            if scratch_dir is None
-            else LazyMemmapStorage(sim_capacity, scratch_dir=scratch_dir, device=self.device)
-        )
+        if sim_memory is not None:
+            storage = TensorStorage(sim_memory, device=self.device)
+        elif scratch_dir is not None:
+            storage = LazyMemmapStorage(sim_capacity, scratch_dir=scratch_dir, device=self.device)
+        else:
+            storage = LazyTensorStorage(sim_capacity, device=self.device)
         self.sim = ReplayBuffer(storage=storage)
+        self.sim.empty()
         self._real_rows = [real.get(key) for key in self.keys]
         self._sim_rows: list[torch.Tensor] = []
 
@@ -132,12 +137,13 @@ class HybridReplayBuffer:
         self.sim.extend(rows)
         self._find_sim_rows()
 
-    def sample(self, batch_size: tuple[int, int] | None = None) -> TensorDict:
+    def sample(self, batch_size: tuple[int, int] | None = None, generator: torch.Generator | None = None) -> TensorDict:
         """Draw real and simulated rows, each uniformly with replacement.
 
         Args:
             batch_size: (real, simulated) rows, instead of the buffer's own. (n, 0) draws real rows
                 alone, which works before there are simulated ones.
+            generator: where the draws come from, instead of torch's global one.
 
         Returns:
             TensorDict of batch size [real + simulated]: the buffer's entries, and ``real``, bool
@@ -154,9 +160,9 @@ class HybridReplayBuffer:
             )
         streams = []
         if n_real:
-            streams.append((self._real_rows, self._draw(self._real_rows, n_real)))
+            streams.append((self._real_rows, self._draw(self._real_rows, n_real, generator)))
         if n_sim:
-            streams.append((self._sim_rows, self._draw(self._sim_rows, n_sim)))
+            streams.append((self._sim_rows, self._draw(self._sim_rows, n_sim, generator)))
         batch = {
             key: torch.cat([rows[i].index_select(0, index) for rows, index in streams])
             for i, key in enumerate(self.keys)
@@ -226,8 +232,8 @@ class HybridReplayBuffer:
             state["rows"] = [rows.get(key) for key in self.keys]
         self.load_state_dict(state)
 
-    def _draw(self, rows: list[torch.Tensor], count: int) -> torch.Tensor:
-        return torch.randint(len(rows[0]), (count,), device=self.device)
+    def _draw(self, rows: list[torch.Tensor], count: int, generator: torch.Generator | None) -> torch.Tensor:
+        return torch.randint(len(rows[0]), (count,), device=self.device, generator=generator)
 
     def _find_sim_rows(self) -> None:
         """Keep the filled part of each tensor at hand: looking it up costs more than gathering."""

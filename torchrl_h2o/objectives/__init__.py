@@ -10,6 +10,7 @@ from torchrl_h2o.objectives.networks import (
     make_qvalue,
     make_value,
 )
+from torchrl_h2o.objectives.population import Population, total_loss
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss
 from torchrl_h2o.objectives.value import (
     ExpectileValueLoss,
@@ -29,9 +30,11 @@ __all__ = [
     "ImportanceWeightedLoss",
     "InSampleValueLoss",
     "MixedBellmanLoss",
+    "Population",
     "SparseValueLoss",
     "make_actor",
     "make_dynamics_ratio_estimator",
     "make_qvalue",
     "make_value",
+    "total_loss",
 ]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -19,8 +19,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 
-from torchrl_h2o.objectives.functional import distribution, run
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, like_rows
+from torchrl_h2o.objectives.functional import distribution, run, sample_from_noise
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, like_rows, normal_like
 
 
 class EntropyBonus(TensorDictModuleBase):
@@ -235,7 +235,7 @@ class MixedBellmanLoss(HybridLoss):
         """Eq. (7): the target of Q(s, a), a constant, ``[*B]``."""
         keys = self.tensor_keys
         next_states = tensordict.get("next")
-        next_value = self._next_policy_value(next_states)
+        next_value = self._next_policy_value(next_states, self._given_noise(tensordict, "next_action"))
         if self.value_network is not None:
             next_value = self.mixing * self._next_value(next_states) + (1 - self.mixing) * next_value
         reward = like_rows(self._entry(next_states, keys.reward), next_value)
@@ -247,21 +247,25 @@ class MixedBellmanLoss(HybridLoss):
         out = run(self.value_network, next_states, self.value_network_params)
         return self._entry(out, self.tensor_keys.value).squeeze(-1)
 
-    def _next_policy_value(self, next_states: TensorDictBase) -> Tensor:
+    def _next_policy_value(self, next_states: TensorDictBase, noise: Tensor | None) -> Tensor:
         """Q̂(s', a') of the target networks' minimum plus the exploration term, a' from the policy."""
         states = next_states.copy()
-        action, log_prob = self._sample_action(states)
+        action, log_prob = self._sample_action(states, noise)
         states.set(self.tensor_keys.action, action)
         qvalue = self._qvalues(states, self.target_qvalue_network_params).amin(0)
         states.set("_log_prob", log_prob).set("alpha", self.alpha.expand(log_prob.shape))
         bonus = self.exploration(states).get("exploration_bonus")
         return qvalue + like_rows(bonus, qvalue)
 
-    def _sample_action(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def draw_noise(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDict:
+        action = self._entry(tensordict, self.tensor_keys.action)
+        return super().draw_noise(tensordict, generator).set("next_action", normal_like(action, generator))
+
+    def _sample_action(self, states: TensorDictBase, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Reparameterised a ~ π(.|s) and log π(a|s), ``[*B]``."""
         with set_exploration_type(ExplorationType.RANDOM):
             policy = distribution(self.actor_network, states, self.actor_network_params)
-        return rsample_and_log_prob(policy)
+        return rsample_and_log_prob(policy) if noise is None else sample_from_noise(policy, noise)
 
     def _qvalues(self, tensordict: TensorDictBase, params: TensorDictBase, *, frozen: bool = False) -> Tensor:
         """Q(s, a) of every member of the ensemble, ``[num_qvalue_nets, *B]``."""

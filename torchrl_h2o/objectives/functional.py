@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.distributions import Distribution
+from torch.distributions import Distribution, Independent, Normal
 from torch.nn import functional as F
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives.utils import _vmap_func
@@ -82,6 +82,28 @@ def distribution(
         return modules[1].get_dist(run(modules[0], tensordict, params.get(("module", "0"))))
     with params.to_module(network, preserve_module_state=False):
         return network.get_dist(tensordict.select(*network.in_keys))
+
+
+def sample_from_noise(policy: Distribution, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """A reparameterised sample and its log-probability, from given standard normal numbers.
+
+    Args:
+        policy: a Gaussian over ``[*B, n]``, maybe behind transforms, such as TorchRL's ``TanhNormal``.
+        noise: ``[*B, n]``.
+
+    Raises:
+        TypeError: for a distribution of another kind.
+    """
+    transforms = getattr(policy, "transforms", ())
+    base = policy.base_dist if transforms else policy
+    if not isinstance(base, Independent) or not isinstance(base.base_dist, Normal):
+        raise TypeError(f"noise is given for Gaussian policies alone, and {type(policy).__name__} is not made of one.")
+    sample = base.mean + noise * base.stddev
+    log_prob = base.log_prob(sample)
+    for transform in transforms:
+        before, sample = sample, transform(sample)
+        log_prob = log_prob - transform.log_abs_det_jacobian(before, sample).sum(-1)
+    return sample, log_prob
 
 
 def _layers(network: nn.Module) -> list[tuple[Path, nn.Module]] | None:

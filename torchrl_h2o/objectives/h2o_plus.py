@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from torch import Tensor, nn
 from torchrl.data import Composite
 
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, normal_like
 from torchrl_h2o.objectives.ratio import DynamicsRatioLoss
 from torchrl_h2o.objectives.value import InSampleValueLoss
 
@@ -203,6 +203,12 @@ class H2OPlusLoss(MixedBellmanLoss):
             terms |= {"alpha": self.alpha, "entropy": self._metric(-log_prob, rows)}
         return self._output(terms, tensordict)
 
+    def draw_noise(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDict:
+        action = self._entry(tensordict, self.tensor_keys.action)
+        ratio_noise = {} if self.ratio_loss is None else self.ratio_loss.draw_noise(tensordict, generator)  # the first
+        noise = super().draw_noise(tensordict, generator).set("action", normal_like(action, generator))
+        return noise.update(ratio_noise)
+
     def _ratio_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
         """Eq. (9): writes the ratio into the batch and returns the discriminators' losses."""
         ratio = self.ratio_loss.dynamics_ratio(batch)
@@ -227,7 +233,7 @@ class H2OPlusLoss(MixedBellmanLoss):
     def actor_loss(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, Tensor]:
         """Eq. (10), reduced, and log π(a|s) of the sampled actions, ``[*B]``, a constant."""
         states = tensordict.copy()
-        action, log_prob = self._sample_action(states)
+        action, log_prob = self._sample_action(states, self._given_noise(tensordict, "action"))
         states.set(self.tensor_keys.action, action)
         qvalue = self._qvalues(states, self.qvalue_network_params, frozen=True).amin(0)
         terms = self.alpha * log_prob - qvalue  # Eq. (10)

@@ -68,9 +68,12 @@ class HybridLoss(LossModule):
 
         Attributes:
             real: boolean of the batch's shape, True on rows of measured data. Defaults to ``"real"``.
+            noise: standard normal numbers that the loss then does not draw itself, see :meth:`draw_noise`. Defaults
+                to ``"noise"``.
         """
 
         real: NestedKey = "real"
+        noise: NestedKey = "noise"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -156,6 +159,22 @@ class HybridLoss(LossModule):
                 either = real | sim
         return Rows(real, sim, either)
 
+    def draw_noise(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDict:
+        """The standard normal numbers that a forward on this batch draws, in its order.
+
+        A forward on a batch that has them under ``noise`` draws nothing, and returns what the generator would have
+        made it return. So random numbers can come from elsewhere: from the stream of each member of a population.
+
+        Args:
+            tensordict: the batch, ``[*B]``.
+            generator: torch's global one if it is None.
+        """
+        return TensorDict({}, batch_size=tensordict.batch_size)
+
+    def _given_noise(self, tensordict: TensorDictBase, name: str) -> Tensor | TensorDictBase | None:
+        noise = tensordict.get(self.tensor_keys.noise, None)
+        return None if noise is None else noise.get(name, None)
+
     def _expectation(
         self, terms: Tensor, rows: Rows, among: Tensor | None = None, *, reduction: str | None = None
     ) -> Tensor:
@@ -190,6 +209,11 @@ class HybridLoss(LossModule):
         out = TensorDict(losses, batch_size=batch_size)
         self._clear_weakrefs(tensordict, out, *(name for name, _ in self.named_children()))
         return out
+
+
+def normal_like(tensor: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """What ``torch.randn_like`` draws, from a generator."""
+    return torch.empty_like(tensor).normal_(generator=generator)
 
 
 def like_rows(tensor: Tensor, rows: Tensor) -> Tensor:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_h2o.objectives.functional import run
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, normal_like
 
 
 class DynamicsRatioEstimator(TensorDictModuleBase):
@@ -181,6 +181,13 @@ class DynamicsRatioLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return "loss_ratio_sa", "loss_ratio_sas", "accuracy_sa", "accuracy"
 
+    def draw_noise(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDict:
+        noise = super().draw_noise(tensordict, generator)
+        if self.training and self.input_noise:
+            inputs = tensordict.select(*self.estimator.in_keys)
+            noise.set("inputs", inputs.apply(lambda x: normal_like(x, generator)))
+        return noise
+
     def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
         """Eq. (9) of this loss's current parameters, a constant, ``[*B]``."""
         return self.estimator.ratio(tensordict, self.estimator_params)[1]
@@ -189,7 +196,9 @@ class DynamicsRatioLoss(HybridLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs, rows = tensordict.select(*self.estimator.in_keys), self._rows(tensordict)
         if self.training and self.input_noise:
-            inputs = inputs.apply(lambda x: x + self.input_noise * torch.randn_like(x))
+            noise = self._given_noise(tensordict, "inputs")
+            noise = inputs.apply(torch.randn_like) if noise is None else noise
+            inputs = inputs.apply(lambda x, z: x + self.input_noise * z, noise)
         sa, sas = self.estimator.log_odds(inputs, self.estimator_params)
         return self._output(
             {

@@ -1,0 +1,146 @@
+"""Measures a population's updates a second, times its members, and what the paper's main table would take.
+
+python recipes/benchmarks/population.py                                # on a CPU
+python recipes/benchmarks/population.py device=cuda compiled=[1,8,32,128]   # and with CUDA graphs, as there is CUDA
+
+Beside it, in the same run, a single run as `recipes/h2o_plus.py` makes it. Sampling is in all figures, the simulator in
+none. Leaves population.json in the run's folder.
+"""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+import json
+import os
+import platform
+from collections.abc import Callable
+
+import h2o_plus
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from learner import Learner
+from omegaconf import DictConfig, OmegaConf
+from population_learner import PopulationLearner
+from turns import calls_per_second
+from update import action_spec, some_transitions
+
+from torchrl_h2o.data import HybridReplayBuffer, PopulationReplay
+
+SINGLE = "a single run"
+
+
+def make_population(cfg: DictConfig, run: DictConfig, num_members: int) -> PopulationLearner:
+    """Runs of other seeds on the same data, with buffers of their own."""
+    replay = PopulationReplay(some_transitions(cfg), cfg.transitions, run.batch_size, num_members, device=cfg.device)
+    learners = []
+    for seed, buffer in enumerate(replay.buffers):
+        buffer.extend(some_transitions(cfg))
+        learners.append(make_single(cfg, run, buffer, seed))
+    on_gpu = torch.device(cfg.device).type == "cuda"
+    return PopulationLearner(learners, replay, run.lr, run.tau, capturable=on_gpu)
+
+
+def make_single(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, seed: int = 0) -> Learner:
+    own = OmegaConf.merge(run, {"seed": seed})
+    return h2o_plus.make_learner(own, cfg.observation_dim, action_spec(cfg), replay)
+
+
+def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, Callable[[], object]]:
+    """The ways to make one update of every member."""
+    chosen = {"stacked": make_population(cfg, run, num_members).update}
+    if num_members == 1:
+        replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
+        replay.extend(some_transitions(cfg))
+        chosen = {SINGLE: make_single(cfg, run, replay).update} | chosen
+    on_gpu = torch.device(cfg.device).type == "cuda"
+    if on_gpu:
+        chosen["CUDA graph"] = captured(make_population(cfg, run, num_members))
+    if num_members in cfg.compiled:
+        learner = make_population(cfg, run, num_members)
+        learner.losses_of = torch.compile(learner.losses_of)
+        chosen["compiled"] = learner.update
+        if on_gpu:
+            chosen["compiled, CUDA graph"] = captured(learner)
+    return chosen
+
+
+def captured(learner: PopulationLearner) -> Callable[[], object]:
+    """An update as one CUDA graph; nobody looks at the losses in between."""
+
+    def update() -> None:
+        learner.differentiate()
+        learner.step()
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):  # what is allocated or compiled at the first calls must not be captured
+            update()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        update()
+    return graph.replay
+
+
+def measure(cfg: DictConfig, run: DictConfig) -> list[dict]:
+    """A line for each size and way: updates of the population a second, and of its members together."""
+    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
+    lines = []
+    for num_members in cfg.members:
+        functions = contenders(cfg, run, num_members)
+        rates = calls_per_second(functions, cfg.seconds, cfg.turns, synchronise, least=cfg.calls)
+        lines += [
+            {
+                "members": num_members,
+                "way": way,
+                "updates_per_second": rate,
+                "run_updates_per_second": num_members * rate,
+            }
+            for way, rate in rates.items()
+        ]
+    return lines
+
+
+def device_name(device: str) -> str:
+    if torch.device(device).type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
+
+
+def print_table(result: dict) -> None:
+    single = next((line["updates_per_second"] for line in result["lines"] if line["way"] == SINGLE), None)
+    print(f"\n{'on ' + result['device']:<34}{'members':>8}{'updates/s':>12}{'run-updates/s':>15}{'× single':>10}")
+    for line in result["lines"]:
+        rate, together = line["updates_per_second"], line["run_updates_per_second"]
+        times_single = f"{together / single:>10.2f}" if single else ""
+        print(f"{line['way']:<34}{line['members']:>8}{rate:>12.1f}{together:>15.1f}{times_single}")
+    tasks, seeds, updates = result["table"]["tasks"], result["table"]["seeds"], result["table"]["updates"]
+    print(
+        f"\nThe paper's main table, {tasks} tasks x {seeds} seeds x {updates:,} updates, would take "
+        f"{result['table']['hours']:,.1f} h of updates at the best of these rates, without simulation and evaluation."
+    )
+
+
+@hydra.main(config_path="../config", config_name="population_benchmark", version_base=None)
+def main(cfg: DictConfig) -> None:
+    torch.set_num_threads(cfg.threads)
+    torch.set_default_device(cfg.device)
+    run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")  # the recipe's own constants
+    lines = measure(cfg, run)
+    best = max(line["run_updates_per_second"] for line in lines)
+    tasks, seeds, updates = cfg.table
+    table = {"tasks": tasks, "seeds": seeds, "updates": updates, "hours": tasks * seeds * updates / best / 3600}
+    result = {"lines": lines, "device": device_name(cfg.device), "table": table, "torch": torch.__version__}
+    directory = Path(HydraConfig.get().runtime.output_dir)
+    (directory / "population.json").write_text(json.dumps(result, indent=2) + "\n")
+    print_table(result)
+    print(f"\nresults    {os.path.relpath(directory)}/population.json")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""What a run's policies do in reality and in the simulator they learnt in: summary.json and learning_curve.png."""
+
+import time
+from pathlib import Path
+
+import torch
+from environments import make_reality, make_simulator
+from evaluation import Evaluation, evaluate
+from learning_curve import Trained, draw_learning_curve
+from omegaconf import DictConfig
+from real_data import behaviour_in
+from run import write_summary
+from tensordict import TensorDictBase
+
+
+def judge(
+    cfg: DictConfig,
+    real: TensorDictBase,
+    policies: dict[str, torch.nn.Module],
+    trainings: dict[str, Trained],
+    directory: Path,
+    wall_s: float,
+) -> dict[str, Evaluation]:
+    """Evaluates the policies and leaves summary.json and learning_curve.png.
+
+    Args:
+        cfg: the run's configuration.
+        real: the measured transitions.
+        policies: by method; H2O+ and maybe others beside it.
+        trainings: theirs.
+        directory: where the files go.
+        wall_s: seconds that the run took so far.
+
+    Returns:
+        The episodes in reality, by method, and the data's own.
+    """
+    start = time.perf_counter()
+    reality, simulator = make_reality(cfg, cfg.final_episodes), make_simulator(cfg, 1)
+    in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
+    in_simulator = evaluate(simulator, policies["H2O+"], 1)
+    behaviour = behaviour_in(cfg, real)
+    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour.mean, cfg)
+    write_summary(
+        directory,
+        {
+            **settings(cfg, real),
+            "updates": trainings["H2O+"].updates,
+            "return_real": in_reality["H2O+"].summary(),
+            "return_sim": in_simulator.summary(),
+            "return_data": behaviour.summary(),
+            "baselines": {name: in_reality[name].summary() for name in policies if name != "H2O+"},
+            "updates_per_second": trainings["H2O+"].updates_per_second,
+            "wall_s": wall_s + time.perf_counter() - start,
+        },
+    )
+    return in_reality | {"the data's behaviour": behaviour}
+
+
+def judge_failed(cfg: DictConfig, real: TensorDictBase, failure: dict, directory: Path) -> None:
+    """Leaves the summary.json of a run that has no policy to show, and says there why."""
+    failed = {"updates": failure["updates"], "return_real": None, "failure": failure["why"]}
+    write_summary(directory, settings(cfg, real) | failed)
+
+
+def settings(cfg: DictConfig, real: TensorDictBase) -> dict:
+    """What a summary says of the run itself."""
+    return {
+        "env": cfg.env.name,
+        "gap": cfg.gap,
+        "gap_fix": cfg.get("gap_fix"),
+        "data": cfg.data,
+        "transitions": len(real),
+        "backbone": cfg.backbone,
+        "mixing": cfg.mixing,
+        "ratio": cfg.ratio,
+        "seed": cfg.seed,
+    }

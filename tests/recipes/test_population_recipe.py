@@ -1,0 +1,213 @@
+"""A population as its user runs it: one command line, a folder a member, and each member what a single run is."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from environments import measure_observation_norm
+from h2o_plus import make_learner, run_population, train_h2o_plus
+from population_learner import PopulationLearner
+from population_training import PopulationTraining, members_of, train_population
+from real_data import read_real_data
+from run import seed_epoch
+from torchrl.checkpoint import CheckpointRotation
+from training import Trainee
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "updates=30",
+    "updates_per_epoch=10",
+    "steps_per_epoch=20",
+    "eval_every=1",
+    "checkpoint_every=1",
+    "eval_episodes=1",
+    "final_episodes=1",
+    "num_cells=[8,8]",
+    "batch_size=[8,8]",
+    "discriminator_batch_size=[8,8]",
+    "render=false",
+    "threads=1",
+    "env.make.max_episode_steps=40",
+    "env.recording.num_transitions=200",
+    "lr_end_factor=0.1",
+]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def compose(cache, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+
+    def build(*overrides):
+        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+            cfg = hydra.compose("h2o_plus", [*SMALL, *overrides])
+        real = read_real_data(cfg)
+        measure_observation_norm(cfg, real)
+        return cfg, real
+
+    return build
+
+
+def train(cfg, real, directory):
+    return train_population(make_learner, cfg, members_of(cfg), real, directory)
+
+
+def rows(directory):
+    with open(directory / "metrics.csv") as file:
+        return list(csv.DictReader(file))
+
+
+def trained(directory):
+    """Every number of the last checkpoint, by the file that it stands in."""
+    latest = CheckpointRotation(directory / "checkpoints" / "h2o+", keep_last=1).latest()
+    with zipfile.ZipFile(latest) as archive:
+        return {name: archive.read(name) for name in archive.namelist() if name.startswith("components")}
+
+
+def assert_same_figures(some, others, tolerance):
+    assert len(some) == len(others) > 0
+    for row, other in zip(some, others, strict=True):
+        assert row.keys() == other.keys()
+        for name in row.keys() - {"method"}:
+            assert float(row[name]) == pytest.approx(float(other[name]), rel=tolerance, abs=tolerance), name
+
+
+def test_every_combination_is_a_member_with_a_name(compose):
+    cfg, _ = compose("seeds=[0,3]", "gaps=[gravity,null]")
+    members = members_of(cfg)
+    assert list(members) == ["seed_0_gravity", "seed_0_no_gap", "seed_3_gravity", "seed_3_no_gap"]
+    assert [(own.seed, own.gap) for own in members.values()] == [(0, "gravity"), (0, None), (3, "gravity"), (3, None)]
+    assert all(members_of(own) == {} for own in members.values())
+    assert members_of(compose()[0]) == {}
+    with pytest.raises(ValueError, match="seed_1 is in the population twice"):
+        members_of(compose("seeds=[1,1]")[0])
+    for wrong in ("seeds=4", "seeds=[]"):
+        with pytest.raises(ValueError, match="give a list of at least one, such as seeds=\\[0\\]"):
+            members_of(compose(wrong)[0])
+
+
+def test_each_member_learns_what_a_single_run_learns(compose, tmp_path):
+    cfg, real = compose("seeds=[0,1]", "gaps=[null,gravity]", "mixings=[0.2]")
+    outcomes = train(cfg, real, tmp_path / "population")
+    figures = set()
+    for name in ("seed_0_gravity_mixing_0.2", "seed_1_no_gap_mixing_0.2"):
+        own = members_of(cfg)[name]
+        policy, training = train_h2o_plus(own, real, tmp_path / name)
+        assert_same_figures(outcomes[name].rows, training.rows, 1e-5)
+        assert_same_figures(rows(tmp_path / "population" / name), rows(tmp_path / name), 1e-5)
+        for mine, its in zip(outcomes[name].policy.parameters(), policy.parameters(), strict=True):
+            torch.testing.assert_close(mine, its, rtol=1e-5, atol=1e-5)
+        figures.add(training.rows[-1]["loss_qvalue"])
+    assert len(figures) == 2
+
+
+def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path, monkeypatch):
+    cfg, real = compose("seeds=[0,1]", "keep=best_in_simulator")
+    train(cfg, real, tmp_path / "whole")
+    log = PopulationTraining.log_member
+
+    def interrupt(self, epoch, member, **metrics):
+        if (epoch, member) == (1, "seed_1"):
+            raise KeyboardInterrupt
+        log(self, epoch, member, **metrics)
+
+    monkeypatch.setattr("population_training.PopulationTraining.log_member", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train(cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    assert trained(tmp_path / "parts") != trained(tmp_path / "whole")
+    train(cfg, real, tmp_path / "parts")
+    assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
+    for member in ("seed_0", "seed_1"):
+        assert rows(tmp_path / "parts" / member) == rows(tmp_path / "whole" / member)
+
+
+def break_seed_1(monkeypatch, at_epoch):
+    """From some epoch on, what seed 1 simulates is no finite number."""
+    simulate = Trainee.simulate
+    started, simulated = {}, []
+
+    def seed(run_seed, epoch, env):
+        started["epoch"] = epoch
+        seed_epoch(run_seed, epoch, env)
+
+    def broken(self):
+        simulate(self)
+        simulated.append((self.cfg.seed, started["epoch"]))
+        if self.cfg.seed == 1 and started["epoch"] >= at_epoch:
+            self.learner.replay.sim.storage[:]["next", "reward"].fill_(float("nan"))
+
+    monkeypatch.setattr("population_training.seed_epoch", seed)
+    monkeypatch.setattr("training.Trainee.simulate", broken)
+    return simulated
+
+
+def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(compose, tmp_path, monkeypatch):
+    cfg, real = compose("seeds=[0,1,2]")
+    healthy = train(cfg, real, tmp_path / "healthy")
+    simulated = break_seed_1(monkeypatch, at_epoch=1)
+    outcomes = train(cfg, real, tmp_path / "broken")
+    failed = outcomes["seed_1"]
+    assert [epoch for seed, epoch in simulated if seed == 1] == [0, 1]
+    assert failed.failure == {"updates": 10, "why": "loss_qvalue not finite"}
+    assert failed.updates == 10
+    assert len(failed.rows) == 1
+    assert all(parameter.isfinite().all() for parameter in failed.policy.parameters())
+    for name in ("seed_0", "seed_2"):
+        assert outcomes[name].failure is None
+        assert outcomes[name].rows == healthy[name].rows
+    again = train(cfg, real, tmp_path / "broken")  # from the last checkpoint, which remembers
+    assert again["seed_1"].failure == failed.failure
+    assert again["seed_0"].rows == healthy["seed_0"].rows
+
+
+def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(compose, tmp_path, monkeypatch, capsys):
+    cfg, _ = compose("seeds=[0,1]", "updates=10")
+    update = PopulationLearner.update
+
+    def spoiling(self):
+        terms = update(self)
+        if self.updates == 10:  # its losses were fine up to here
+            next(self.population.parameters()).data[1] = float("inf")
+        return terms
+
+    monkeypatch.setattr("population_learner.PopulationLearner.update", spoiling)
+    run_population(cfg, members_of(cfg), tmp_path)
+    failed = json.loads((tmp_path / "seed_1" / "summary.json").read_text())
+    assert (failed["failure"], failed["updates"], failed["return_real"]) == ("its parameters not finite", 10, None)
+    assert not (tmp_path / "seed_1" / "metrics.csv").exists()
+    healthy = json.loads((tmp_path / "seed_0" / "summary.json").read_text())
+    assert healthy["return_real"]["episodes"] == 1
+    table = {line.split()[0]: line.split()[1] for line in capsys.readouterr().out.splitlines() if "seed_" in line}
+    assert table["seed_1"] == "failed"
+    assert float(table["seed_0"])
+
+
+def test_one_command_leaves_a_folder_a_member_and_one_table(cache, tmp_path):
+    command = [sys.executable, str(ROOT / "recipes" / "h2o_plus.py"), *SMALL, "updates=10", "hydra.run.dir=out"]
+    env = os.environ | {"XDG_CACHE_HOME": str(cache), "OMP_NUM_THREADS": "1"}
+    options = {"env": env, "cwd": tmp_path, "capture_output": True, "text": True, "check": False}
+    done = subprocess.run([*command, "seeds=[0,1]", "gaps=[gravity]"], **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for name, seed in (("seed_0_gravity", 0), ("seed_1_gravity", 1)):
+        summary = json.loads((tmp_path / "out" / name / "summary.json").read_text())
+        assert (summary["seed"], summary["gap"], summary["updates"]) == (seed, "gravity", 10)
+        assert summary["return_real"].keys() >= {"mean", "std", "episodes"}
+        assert (tmp_path / "out" / name / "learning_curve.png").stat().st_size > 10_000
+        assert name in done.stdout
+    assert "the data's behaviour" in done.stdout
+
+    evaluate = [sys.executable, str(ROOT / "recipes" / "evaluate.py"), "checkpoint=out/seed_1_gravity"]
+    replayed = subprocess.run([*evaluate, "episodes=1", "film=null"], **options)
+    assert "H2O+ in reality" in replayed.stdout, replayed.stderr
