@@ -102,7 +102,11 @@ def _with_undeclared(
     beside = find_undeclared(mended, measured)
     if beside is None:
         return parts
-    problem = replace(Problem.pose(mended, measured), simulation=simulation)
+    candidates = [(_beside(simulation, measured, trace, parts, beside), beside, mended)]
+    alone = find_undeclared(simulation, measured) if parts else None
+    if alone is not None:
+        candidates.append(([Part(alone.effect, False, alone.ci95)], alone, simulation))
+    problem = _with_least_noise(simulation, measured, [parts, *(candidate for candidate, _, _ in candidates)])
     judged = measured.judged()
 
     def loss(candidate: Sequence[Part]) -> np.ndarray:
@@ -110,14 +114,8 @@ def _with_undeclared(
 
     first = Problem.pose(simulation, measured)
     before = loss(parts)
-    alone = find_undeclared(simulation, measured) if parts else None
     paying = []
-    for force, base, known in ((beside, mended, parts), (alone, simulation, [])):
-        if force is None:
-            continue
-        candidate = [*known, Part(force.effect, False, force.ci95)]
-        if known:
-            candidate = _found_anew(simulation, measured, _needed(problem, trace, candidate))
+    for candidate, force, base in candidates:
         after = loss(candidate)
         pays = after.mean() < (1.0 - _PAYS) * before.mean() and p_value_of_losses(before, after) < _LEVEL
         losses_at_first = (first.held_out_loss([part.effect for part in some]) for some in ([], parts, candidate))
@@ -128,6 +126,34 @@ def _with_undeclared(
     least = min(after.mean() for _, after in paying)
     as_good = [candidate for candidate, after in paying if after.mean() <= least / (1.0 - _PAYS)]
     return min(as_good, key=_size)  # of two that are as short, the one with names in it
+
+
+def _beside(
+    simulation: Simulation, measured: Measured, trace: Trace, parts: Sequence[Part], force: Undeclared
+) -> list[Part]:
+    """The parts that are needed beside a force, and the force as it is then."""
+    candidate = [*parts, Part(force.effect, False, force.ci95)]
+    if not parts:
+        return candidate
+    mended = simulation.with_effects(*(part.effect for part in parts))
+    problem = replace(Problem.pose(mended, measured), simulation=simulation)
+    return _found_anew(simulation, measured, _needed(problem, trace, candidate))
+
+
+def _with_least_noise(simulation: Simulation, measured: Measured, explanations: Sequence[Sequence[Part]]) -> Problem:
+    """The problem that explanations are compared in: where the one that leaves sensors the least noise says they are.
+
+    What an explanation takes for noise of the sensors and another explains is no noise, and states that were smoothed
+    by the first would tell against the second.
+    """
+    mended = [simulation.with_effects(*(part.effect for part in parts)) for parts in explanations]
+    spread = np.maximum(measured.observation.std(0), 1e-12)
+
+    def noise(candidate: Simulation) -> float:
+        std = sensor_noise(candidate, measured)
+        return 0.0 if std is None else float(((std / spread) ** 2).mean())
+
+    return replace(Problem.pose(min(mended, key=noise), measured), simulation=simulation)
 
 
 def _size(parts: Sequence[Part]) -> int:
