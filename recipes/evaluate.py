@@ -14,6 +14,7 @@ import hydra
 import torch
 from environments import make_reality, make_simulator
 from evaluation import evaluate
+from methods import method_named
 from omegaconf import DictConfig
 from rendering import film
 from run import checkpoint_folder, keeps_best, load_config
@@ -46,11 +47,12 @@ def main(options: DictConfig) -> None:
     if options["in"] not in worlds:
         raise ValueError(f"in={options['in']}: choose reality or simulator")
     make_env = worlds[options["in"]]
-    policy = load_policy(cfg, directory, options.method)
+    method = options.method or method_named(cfg.get("method", "h2o_plus")).title
+    policy = load_policy(cfg, directory, method)
     result = evaluate(make_env(cfg, options.episodes), policy, options.episodes, options.seed)
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]
-    print(f"{options.method} in {options['in']}: return {result.mean:.1f} ± {result.std:.1f}, episodes of {seconds} s")
-    summary = {"method": options.method, "in": options["in"], "seed": options.seed, **result.summary()}
+    print(f"{method} in {options['in']}: return {result.mean:.1f} ± {result.std:.1f}, episodes of {seconds} s")
+    summary = {"method": method, "in": options["in"], "seed": options.seed, **result.summary()}
     (directory / "evaluation.json").write_text(json.dumps(summary | {"returns": result.returns}, indent=2) + "\n")
     if options.film is not None:
         path = directory / options.film

@@ -11,29 +11,26 @@ python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # go on a
 
 import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
-import os
-import sys
 import time
 from pathlib import Path
 
 import hydra
 import torch
-from collection import check_collector
-from environments import make_simulator, measure_observation_norm
+from environments import make_simulator
+from job import prepare, resumable, run_job
 from judging import judge, judge_failed
 from learner import Learner, adam
 from omegaconf import DictConfig
 from population_training import members_of, train_population
-from real_data import behaviour_in, read_real_data
-from rendering import try_to_film
-from results import print_population, print_table
-from run import Training, open_run, save_config
-from sac import train_sac
+from real_data import behaviour_in
+from results import print_population
+from run import Training, open_run
+from sac import SAC
 from tensordict import TensorDictBase
 from torch.nn.functional import pad
 from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
-from training import train
+from training import Method, train
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
@@ -106,9 +103,12 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     )
 
 
+H2O_PLUS = Method("H2O+", make_learner)
+
+
 def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
     """Real and simulated data, the simulator's weighed by how real they look."""
-    return train("H2O+", make_learner, cfg, real, directory)
+    return train(H2O_PLUS.title, make_learner, cfg, real, directory)
 
 
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
@@ -126,28 +126,12 @@ def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
 @hydra.main(config_path="config", config_name="h2o_plus", version_base=None)
 def main(cfg: DictConfig) -> None:
     cfg, directory = open_run(cfg)
-    try:
-        members = members_of(cfg)
-        run_population(cfg, members, directory) if members else run(cfg, directory)
-    except KeyboardInterrupt:
-        sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}")
-
-
-def run(cfg: DictConfig, directory: Path) -> None:
-    """Trains, evaluates in reality, and leaves summary.json, metrics.csv, learning_curve.png and a film."""
-    start = time.perf_counter()
-    real = prepare(cfg, directory)
-    wall_s = time.perf_counter() - start
-
-    policies, trainings = {}, {}
-    policies["H2O+"], trainings["H2O+"] = train_h2o_plus(cfg, real, directory)
-    if cfg.baseline:
-        policies["SAC in the simulator"], trainings["SAC in the simulator"] = train_sac(cfg, real, directory)
-    wall_s += sum(training.progress["seconds"] for training in trainings.values())
-
-    in_reality = judge(cfg, real, policies, trainings, directory, wall_s)
-    film = try_to_film(cfg, policies["H2O+"], directory) if cfg.render else None
-    print_table(cfg, in_reality, directory, film)
+    make_value_loss(cfg, observation_dim=1)  # a backbone that there is not: said before the data are read
+    with resumable(directory):
+        if members := members_of(cfg):
+            run_population(cfg, members, directory)
+        else:
+            run_job(cfg, directory, [H2O_PLUS, SAC] if cfg.baseline else [H2O_PLUS])
 
 
 def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: Path) -> None:
@@ -169,17 +153,6 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
             judge_failed(own, real, outcome.failure, folder)
             in_reality[name] = None
     print_population(cfg, in_reality | {"the data's behaviour": behaviour_in(cfg, real)}, directory)
-
-
-def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
-    """The real data. What there is not, backbone, gap or report, is said before they are read."""
-    make_value_loss(cfg, observation_dim=1)
-    make_simulator(cfg, raw=True)
-    check_collector(cfg)
-    real = read_real_data(cfg)
-    measure_observation_norm(cfg, real)
-    save_config(cfg, directory)
-    return real
 
 
 if __name__ == "__main__":

@@ -12,6 +12,8 @@ from real_data import behaviour_in
 from run import write_summary
 from tensordict import TensorDictBase
 
+H2O_PLUS_S = ("backbone", "mixing", "ratio")  # which no other method reads
+
 
 def judge(
     cfg: DictConfig,
@@ -26,7 +28,7 @@ def judge(
     Args:
         cfg: the run's configuration.
         real: the measured transitions.
-        policies: by method; H2O+ and maybe others beside it.
+        policies: by method; the one that the run is about, and maybe others beside it.
         trainings: theirs.
         directory: where the files go.
         wall_s: seconds that the run took so far.
@@ -35,21 +37,23 @@ def judge(
         The episodes in reality, by method, and the data's own.
     """
     start = time.perf_counter()
+    main = next(iter(policies))
     reality, simulator = make_reality(cfg, cfg.final_episodes), make_simulator(cfg, 1)
     in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
-    in_simulator = evaluate(simulator, policies["H2O+"], 1)
+    in_simulator = evaluate(simulator, policies[main], 1)
     behaviour = behaviour_in(cfg, real)
     draw_learning_curve(directory / "learning_curve.png", trainings, behaviour.mean, cfg)
     write_summary(
         directory,
         {
+            "method": main,
             **settings(cfg, real),
-            "updates": trainings["H2O+"].updates,
-            "return_real": in_reality["H2O+"].summary(),
+            "updates": trainings[main].updates,
+            "return_real": in_reality[main].summary(),
             "return_sim": in_simulator.summary(),
             "return_data": behaviour.summary(),
-            "baselines": {name: in_reality[name].summary() for name in policies if name != "H2O+"},
-            "updates_per_second": trainings["H2O+"].updates_per_second,
+            "baselines": {name: in_reality[name].summary() for name in policies if name != main},
+            "updates_per_second": trainings[main].updates_per_second,
             "wall_s": wall_s + time.perf_counter() - start,
         },
     )
@@ -70,8 +74,6 @@ def settings(cfg: DictConfig, real: TensorDictBase) -> dict:
         "gap_fix": cfg.get("gap_fix"),
         "data": cfg.data,
         "transitions": len(real),
-        "backbone": cfg.backbone,
-        "mixing": cfg.mixing,
-        "ratio": cfg.ratio,
+        **({key: cfg[key] for key in H2O_PLUS_S} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
         "seed": cfg.seed,
     }

@@ -4,11 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torchrl.data import TensorSpec
+from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import total_loss
+from torchrl_h2o.objectives import make_actor, make_qvalue, total_loss
 
 
 @dataclass
@@ -48,9 +51,23 @@ class Learner:
         return losses
 
     @property
+    def simulates(self) -> bool:
+        """Whether it needs a simulator: one that learns from real rows alone has no use for it."""
+        return any(sim for _, sim in self.batch_sizes)
+
+    @property
     def components(self) -> dict:
         """What a checkpoint holds."""
         return {"actor": self.actor, **self.losses, "optimiser": self.optimiser, "replay": self.replay}
+
+
+def make_networks(
+    cfg: DictConfig, observation_dim: int, action_spec: TensorSpec
+) -> tuple[ProbabilisticActor, list[ValueOperator]]:
+    """The policy and the two Q of the run's seed, the same for every method."""
+    torch.manual_seed(cfg.seed)
+    actor = make_actor(observation_dim, action_spec, cfg.num_cells)
+    return actor, [make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells) for _ in range(2)]
 
 
 def adam(*losses: LossModule, lr: float) -> torch.optim.Adam:

@@ -9,7 +9,16 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from omegaconf import DictConfig
 
-COLOURS = {"H2O+": "#0b6e4f", "SAC in the simulator": "#c8553d"}
+COLOURS = {
+    "H2O+": "#0b6e4f",
+    "H2O": "#5aa9a3",
+    "SAC in the simulator": "#c8553d",
+    "DARC": "#e0a458",
+    "IQL": "#3d5a98",
+    "CQL": "#8a6fae",
+    "RLPD": "#7a7a7a",
+    "weighted TD3": "#a3a3a3",
+}
 
 
 class Trained(Protocol):
@@ -45,17 +54,27 @@ def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: fl
     left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
     left.legend(frameon=False)
 
-    rows = trainings["H2O+"].rows
-    updates = [row["updates"] for row in rows]
-    for key, label in (("accuracy_sa", "accuracy on (s, a)"), ("accuracy", "accuracy on (s, a, s')")):
-        right.plot(updates, [row[key] for row in rows], "o-", ms=3, label=label)
-    right.plot(
-        updates, [row["ratio_of_sim"] for row in rows], "s--", ms=3, color="0.4", label="mean ratio of simulated rows"
-    )
-    right.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (0.5: cannot be told)")
-    right.legend(frameon=False, loc="lower right")
+    _draw_discriminators(right, next(iter(trainings.values())).rows)
     for axis in (left, right):
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=150)
     plt.close(figure)
+
+
+def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
+    """How well the discriminators tell the streams apart; nothing for a method that has none."""
+    updates = [row["updates"] for row in rows]
+    lines = [
+        ("accuracy_sa", "o-", None, "accuracy on (s, a)"),
+        ("accuracy", "o-", None, "accuracy on (s, a, s')"),
+        ("ratio_of_sim", "s--", "0.4", "mean ratio of simulated rows"),
+    ]
+    lines = [line for line in lines if line[0] in rows[0]]
+    if not lines:
+        axis.set_visible(False)
+        return
+    for key, style, colour, label in lines:
+        axis.plot(updates, [row[key] for row in rows], style, ms=3, color=colour, label=label)
+    axis.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (0.5: cannot be told)")
+    axis.legend(frameon=False, loc="lower right")

@@ -27,8 +27,12 @@ PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoc
 KEEP = ("last", "best_in_simulator")
 
 
-def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
+def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
     """The configuration and folder of a new run, or of the one that ``resume`` names, whose own configuration counts.
+
+    Args:
+        cfg: what the command line asks for.
+        go_on: with the run that is in the folder already, if there is one, as if ``resume`` named it.
 
     Raises:
         ValueError: for other overrides beside ``resume``, or settings that contradict each other.
@@ -42,6 +46,8 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
             raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
         cfg = load_config(directory)
     elif (directory / "config.yaml").exists():
+        if go_on:
+            return _opened(load_config(directory), directory)
         raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
     if cfg.updates < 1:
         raise ValueError(f"updates={cfg.updates}: train for at least one")
@@ -53,6 +59,10 @@ def open_run(cfg: DictConfig) -> tuple[DictConfig, Path]:
         if cfg[key] is not None and Path(cfg[key]).exists():
             cfg[key] = str(Path(cfg[key]).resolve())
     save_config(cfg, directory)
+    return _opened(cfg, directory)
+
+
+def _opened(cfg: DictConfig, directory: Path) -> tuple[DictConfig, Path]:
     torch.set_num_threads(cfg.threads)
     tqdm.write(f"run folder: {os.path.relpath(directory)}")
     return cfg, directory

@@ -3,29 +3,29 @@
 from pathlib import Path
 
 import torch
-from learner import Learner, adam
+from learner import Learner, adam, make_networks
 from omegaconf import DictConfig
 from run import Training
 from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.objectives import SACLoss, SoftUpdate
-from training import train
+from training import Method, train
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import make_actor, make_qvalue
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """TorchRL's loss, on simulated rows alone."""
-    torch.manual_seed(cfg.seed)
-    actor = make_actor(observation_dim, action_spec, cfg.num_cells)
-    qvalues = [make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells) for _ in range(2)]
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     targets = SoftUpdate(loss, tau=cfg.tau)
     return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [(0, sum(cfg.batch_size))], loss)
 
 
+SAC = Method("SAC in the simulator", make_learner)
+
+
 def train_sac(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
     """SAC on simulated batches; of the real data it sees nothing but the scale of the observations."""
-    return train("SAC in the simulator", make_learner, cfg, real, directory)
+    return train(SAC.title, make_learner, cfg, real, directory)

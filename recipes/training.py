@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from copy import deepcopy
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
@@ -20,6 +21,19 @@ from torchrl.data import TensorSpec
 from torchrl_h2o.data import HybridReplayBuffer
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
+
+
+@dataclass(frozen=True)
+class Method:
+    """What tells one method from another.
+
+    Args:
+        title: what bars, tables and checkpoints call it.
+        make_learner: from the configuration, the size of the observation, the action's spec and the data.
+    """
+
+    title: str
+    make_learner: MakeLearner
 
 
 class Trainee:
@@ -119,7 +133,8 @@ def train(
     training = Training(name, cfg, directory, **trainee.components, schedule=schedule)
     with closing(trainee):
         for epoch, evaluating in training.epochs(trainee.collector):
-            trainee.simulate()
+            if learner.simulates:
+                trainee.simulate()
             for _ in training.epoch_updates():
                 losses = learner.update()
             schedule.step()

@@ -165,9 +165,9 @@ def test_what_cannot_be_is_said_with_what_to_do(command, overrides, said):
 def compose(cache, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
 
-    def build(*overrides):
+    def build(*overrides, config="h2o_plus"):
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            cfg = hydra.compose("h2o_plus", [*SMALL, *ROBOT, *overrides])
+            cfg = hydra.compose(config, [*SMALL, *ROBOT, *overrides])
         real = read_real_data(cfg)
         measure_observation_norm(cfg, real)
         return cfg, real

@@ -1,6 +1,7 @@
-"""The losses of H2O+ as TorchRL loss modules. Needs torch, tensordict and torchrl alone."""
+"""The losses of H2O+, and what DARC and H2O add to others. Needs torch, tensordict and torchrl alone."""
 
 from torchrl_h2o.objectives.bellman import EntropyBonus, MixedBellmanLoss
+from torchrl_h2o.objectives.conservative import ConservativeLoss, DynamicsDivergence
 from torchrl_h2o.objectives.h2o_plus import H2OPlusLoss
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 from torchrl_h2o.objectives.importance import ImportanceWeightedLoss
@@ -12,6 +13,7 @@ from torchrl_h2o.objectives.networks import (
 )
 from torchrl_h2o.objectives.population import Population, total_loss
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss
+from torchrl_h2o.objectives.reward_correction import DynamicsRewardCorrection
 from torchrl_h2o.objectives.value import (
     ExpectileValueLoss,
     ExponentialValueLoss,
@@ -20,8 +22,11 @@ from torchrl_h2o.objectives.value import (
 )
 
 __all__ = [
+    "ConservativeLoss",
+    "DynamicsDivergence",
     "DynamicsRatioEstimator",
     "DynamicsRatioLoss",
+    "DynamicsRewardCorrection",
     "EntropyBonus",
     "ExpectileValueLoss",
     "ExponentialValueLoss",

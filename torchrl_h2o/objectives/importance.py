@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss
+from torchrl_h2o.objectives.loss_wrapper import LossWrapper
 
 
-class ImportanceWeightedLoss(HybridLoss):
+class ImportanceWeightedLoss(LossWrapper):
     """A TorchRL loss with every row's terms multiplied by a weight found in the batch.
 
     If the batch has ``real``, rows marked True keep weight 1, as in Eq. (8): measured rows need no correction. Only
@@ -53,13 +53,12 @@ class ImportanceWeightedLoss(HybridLoss):
     """
 
     def __init__(self, loss: LossModule, key: NestedKey = "dynamics_ratio", *, reduction: str = "mean") -> None:
-        super().__init__(reduction=reduction)
+        super().__init__(loss, reduction=reduction)
         if getattr(loss, "reduction", None) != "none":
             raise ValueError(
                 f"{type(loss).__name__} reduces its terms ({getattr(loss, 'reduction', None)!r}) before they could be "
                 "weighted: build it with reduction='none'."
             )
-        self.loss = loss
         self.key = key
 
     def _read_keys(self) -> Iterable[NestedKey]:
@@ -67,17 +66,6 @@ class ImportanceWeightedLoss(HybridLoss):
 
     def _optional_keys(self) -> Iterable[NestedKey]:
         return (self.tensor_keys.real,)
-
-    def set_keys(self, **kwargs) -> None:
-        """Renames ``real`` here, and every other key in the loss inside."""
-        if "real" in kwargs:
-            super().set_keys(real=kwargs.pop("real"))
-        if kwargs:
-            self.loss.set_keys(**kwargs)
-
-    def make_value_estimator(self, *args, **kwargs) -> None:
-        """That of the loss inside."""
-        self.loss.make_value_estimator(*args, **kwargs)
 
     def _written_keys(self) -> Iterable[NestedKey]:
         return tuple(key for key in self.loss.out_keys if str(key).startswith("loss_"))
@@ -102,24 +90,6 @@ class ImportanceWeightedLoss(HybridLoss):
         if real is not None:
             weights = torch.where(self._expand_loss_mask(real.bool(), weights), 1.0, weights)
         return weights.detach()
-
-    # What follows lets SoftUpdate find the targets of the loss inside.
-    @property
-    def _has_update_associated(self) -> dict[str, bool]:
-        return self.loss._has_update_associated if "loss" in self._modules else {}
-
-    @_has_update_associated.setter
-    def _has_update_associated(self, value: dict[str, bool]) -> None:
-        """The loss inside keeps its own."""
-
-    def named_children(self) -> Iterator[tuple[str, nn.Module]]:
-        yield from super().named_children()
-        yield from ((n, m) for n, m in self.loss.named_children() if n.startswith("target_"))
-
-    def __getattr__(self, name: str):
-        if name.endswith("_params"):
-            return getattr(self.loss, name)
-        return super().__getattr__(name)
 
 
 def _scale(terms: Tensor, weights: Tensor) -> Tensor:

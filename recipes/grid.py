@@ -1,0 +1,100 @@
+"""The paper's tables and figures as grids of runs: each run is a list of overrides of train.py."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import product
+
+from omegaconf import DictConfig
+
+from torchrl_h2o.effects import PAPER_GAPS
+
+SIX = ("sac", "cql", "iql", "darc", "h2o", "h2o_plus")
+OFFLINE = ("cql", "iql")  # no simulator, so no gap: one run serves the whole row
+MEDIUM, REPLAY = "halfcheetah/medium-v0", "halfcheetah/medium-replay-v0"
+ENVS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d"}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What a table or figure of the paper is made of.
+
+    Args:
+        methods: by the names of methods.py.
+        datasets: by their Minari names, whose first part is the environment; none for the robot's own.
+        gaps: by the names of the paper; those that an environment has not are left out.
+        strengths: of the gap; None is the paper's.
+        tasks: environments with data of their own, instead of data sets and gaps.
+        variants: further overrides, one run each.
+    """
+
+    methods: tuple[str, ...] = ("h2o_plus",)
+    datasets: tuple[str, ...] = ()
+    gaps: tuple[str, ...] = ("gravity",)
+    strengths: tuple[float | None, ...] = (None,)
+    tasks: tuple[str, ...] = ()
+    variants: tuple[tuple[str, ...], ...] = field(default=((),))
+
+    def runs(self, seeds: tuple[int, ...]) -> Iterator[list[str]]:
+        """The overrides of each run, seed by seed, so that a grid that is broken off has every cell once."""
+        for seed in seeds:
+            worlds = [*product(self.datasets, self.gaps, self.strengths), *((task, None, None) for task in self.tasks)]
+            done = set()
+            for (world, gap, strength), method, variant in product(worlds, self.methods, self.variants):
+                overrides = _run(world, None if method in OFFLINE else gap, strength, method, variant, seed)
+                if overrides is not None and tuple(overrides) not in done:
+                    done.add(tuple(overrides))
+                    yield overrides
+
+
+def _run(
+    world: str, gap: str | None, strength: float | None, method: str, variant: tuple, seed: int
+) -> list[str] | None:
+    env, _, dataset = world.partition("/")
+    chosen = [f"method={method}", f"env={env}"]
+    if dataset:
+        if gap is not None and ENVS[env] not in PAPER_GAPS[gap].tasks:
+            return None
+        chosen += [f"data={world}", f"gap={'null' if gap is None else gap}"]
+        if gap is not None and strength is not None:
+            chosen.append(f"gap_strength={strength}")
+    return [*chosen, *variant, f"seed={seed}"]
+
+
+WITHOUT_RATIO = ("mixing=0.1", "ratio=false")
+TABLES = {
+    "returns": Grid(SIX, (REPLAY, MEDIUM, "walker2d/medium-replay-v0"), tuple(PAPER_GAPS)),
+    "mixing": Grid(
+        datasets=(REPLAY,),
+        variants=(*((f"mixing={value}",) for value in (0.0, 0.1, 0.2, 0.5, 1.0)), WITHOUT_RATIO),
+    ),
+    "gaps": Grid(("h2o", "h2o_plus"), (REPLAY,), strengths=(1.25, 1.5, 2.0, 3.0)),
+}
+FIGURES = {
+    "backbones": Grid(
+        datasets=(MEDIUM, REPLAY),
+        gaps=("small_thigh", "big_thigh"),
+        variants=(("backbone=expectile",), ("backbone=sparse",)),
+    ),
+    "wheel_legged": Grid(SIX, tasks=("wheel_legged", "wheel_legged_forward")),
+}
+
+
+def group_name(cfg: DictConfig) -> str:
+    """The table or figure that was asked for.
+
+    Raises:
+        ValueError: if there is none of that name, or not exactly one was asked for.
+    """
+    if (cfg.table is None) == (cfg.figure is None):
+        raise ValueError(f"name one: table={' | '.join(TABLES)}, or figure={' | '.join(FIGURES)}")
+    kind, name, there = ("table", cfg.table, TABLES) if cfg.figure is None else ("figure", cfg.figure, FIGURES)
+    if name not in there:
+        raise ValueError(f"{kind}={name}: choose {', '.join(there)}")
+    return name
+
+
+def chosen_grid(cfg: DictConfig) -> Grid:
+    """The grid that was asked for, with the choices of the command line in the place of the paper's."""
+    grid = (TABLES | FIGURES)[group_name(cfg)]
+    chosen = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
+    return Grid(**{**vars(grid), **{key: tuple(value) for key, value in chosen.items()}})

@@ -1,0 +1,100 @@
+"""Tables and pictures of the results in recipes/results/, ours beside the paper's.
+
+python recipes/report.py                              # all that is there
+python recipes/report.py groups=[returns] updates=50000
+python recipes/report.py groups=[wheel_legged] runs=outputs/paper    # with the robot's trajectories
+"""
+
+import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+
+from pathlib import Path
+
+import hydra
+from aggregates import BASE, common_scores, improvements, interquartile_means
+from methods import METHODS
+from omegaconf import DictConfig
+from report_figures import draw_aggregates, draw_curves
+from results_file import curves_of, read_rows
+from robot_figures import draw_robot
+from score_table import REFERENCES, VARIANTS, Row, Task, cells, markdown, placed
+
+TITLES = {name: method.title for name, method in METHODS.items()}
+ABLATIONS = ("mixing", "backbones")  # one method, whose variants are compared
+
+
+@hydra.main(config_path="config", config_name="report", version_base=None)
+def main(cfg: DictConfig) -> None:
+    results = Path(cfg.results or Path(__file__).parent / "results")
+    to = Path(cfg.to or results)
+    for group in cfg.groups:
+        rows = of_one_budget(read_rows(results / f"{group}.csv"), cfg.updates, group)
+        if rows:
+            report(group, rows, results, to, cfg.reps)
+            if group == "wheel_legged":
+                draw_robot(Path(cfg.runs) / group, results, to)
+
+
+def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:
+    """The runs of one number of updates, so that none is set beside one that learnt for longer.
+
+    Raises:
+        ValueError: if there are several numbers and none is asked for.
+    """
+    budgets = sorted({int(row["updates"]) for row in rows})
+    if updates is None and len(budgets) > 1:
+        raise ValueError(f"{group}.csv holds runs of {budgets} updates: choose one with updates=...")
+    return [row for row in rows if updates is None or int(row["updates"]) == updates]
+
+
+def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> None:
+    """Writes a group's table, learning curves and aggregates, and prints the table."""
+    variants = group in ABLATIONS
+    table = cells(placed(rows, variants))
+    lines = [markdown(table, TITLES, paper_cells(read_rows(results / "paper.csv"), group, table)), ""]
+    lines.append(
+        "Returns in reality: mean ± standard deviation over the seeds (how many); of one seed, over its episodes."
+    )
+    lines.append(f"After {int(rows[0]['updates']):,} updates. The paper's: five seeds, 1,000,000 updates.")
+    scores = common_scores(table)
+    if len(scores.by_method) > 1 and scores.seeds and all(task[0] in REFERENCES for task in scores.tasks):
+        means = interquartile_means(scores, reps)
+        better = improvements(scores, reps) if BASE in scores.by_method else {}
+        note = f"{len(scores.tasks)} tasks, seeds {', '.join(map(str, scores.seeds))}; 95 % bootstrap intervals"
+        draw_aggregates(to / f"{group}_aggregates.png", means, better, TITLES, note)
+        lines += ["", aggregate_table(means, better), "", note[0].upper() + note[1:] + "."]
+    text = "\n".join(lines) + "\n"
+    to.mkdir(parents=True, exist_ok=True)
+    (to / f"{group}.md").write_text(text)
+    print(f"\n{group}\n\n{text}")
+    budget = {row["updates"] for row in rows}
+    curves = [row for row in read_rows(curves_of(results / f"{group}.csv")) if row["updates"] in budget]
+    if curves:
+        draw_curves(to / f"{group}_curves.png", placed(curves, variants), TITLES)
+
+
+def aggregate_table(means: dict, better: dict) -> str:
+    """Interquartile means and probabilities of improvement, a line a method."""
+    lines = ["| method | interquartile mean of the normalised score | P(H2O+ does better) |", "| --- | --- | --- |"]
+    for name in (name for name in TITLES if name in means):
+        chance = better[name].text() if name in better else ""
+        lines.append(f"| {TITLES[name]} | {means[name].text()} | {chance} |")
+    return "\n".join(lines)
+
+
+def paper_cells(rows: list[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
+    """The paper's figures for the tasks of a table."""
+    cells: dict[Task, dict[str, str]] = {}
+    for row in rows:
+        if row["group"] != group:
+            continue
+        asked = (row["env"], row["data"], f"{row['gap']} {float(row['strength']):g}")
+        variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
+        for task in table:
+            if task[:3] == asked and all(part in task[3:] for part in variant):
+                text = f"{float(row['return_mean']):,.0f} ± {float(row['return_std']):,.0f}"
+                cells.setdefault(task, {})[row["method"]] = text
+    return cells
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""The paper's grids: which runs they hold, and that a grid loses nothing when it is killed or when a run dies."""
+
+import subprocess
+from collections import Counter
+
+import hydra
+import pytest
+from grid import FIGURES, TABLES, chosen_grid
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from methods import METHODS
+from results_file import identity, read_rows
+from torchrl.checkpoint import CheckpointRotation
+from training import train
+
+from tests.recipes.test_h2o_plus_recipe import (  # noqa: F401  (fixtures)
+    ROBOT,
+    ROOT,
+    SMALL,
+    cache,
+    command,
+    compose,
+    trained,
+)
+
+
+def chosen(runs, key):
+    values = [override.partition("=")[2] for run in runs for override in run if override.startswith(f"{key}=")]
+    return Counter(values)
+
+
+def paper(*overrides):
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        return hydra.compose("paper", list(overrides))
+
+
+def test_the_main_table_has_every_cell_once_and_methods_without_simulator_once_a_data_set():
+    runs = list(TABLES["returns"].runs((0, 1)))
+    assert len(runs) == 2 * (25 * 4 + 3 * 2)
+    assert chosen(runs, "method") == {"sac": 50, "darc": 50, "h2o": 50, "h2o_plus": 50, "cql": 6, "iql": 6}
+    assert len({tuple(run) for run in runs}) == len(runs)
+    walker = [run for run in runs if "env=walker2d" in run]
+    assert {"gap=long_torso", "gap=soft_feet"}.isdisjoint(override for run in walker for override in run)
+
+
+def test_the_ablations_are_the_paper_s():
+    mixing = list(TABLES["mixing"].runs((0,)))
+    assert chosen(mixing, "mixing") == {"0.0": 1, "0.1": 2, "0.2": 1, "0.5": 1, "1.0": 1}
+    assert chosen(mixing, "ratio") == {"false": 1}
+    assert chosen(TABLES["gaps"].runs((0,)), "gap_strength") == {"1.25": 2, "1.5": 2, "2.0": 2, "3.0": 2}
+    assert len(list(FIGURES["backbones"].runs((0,)))) == 8
+    assert len(list(FIGURES["wheel_legged"].runs((0,)))) == 12
+
+
+def test_any_subset_is_an_override():
+    cfg = paper("table=returns", "methods=[h2o_plus,iql]", "gaps=[gravity,friction]", "seeds=[0,1]")
+    runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))
+    assert chosen(runs, "method") == {"h2o_plus": 2 * 3 * 2, "iql": 2 * 3}
+    assert chosen(runs, "gap") == {"gravity": 6, "friction": 6, "null": 6}
+
+
+@pytest.mark.parametrize("overrides", [["table=main"], [], ["table=returns", "figure=backbones"]])
+def test_a_grid_that_there_is_not_is_said(overrides):
+    with pytest.raises(ValueError, match=r"choose returns, mixing, gaps|name one"):
+        chosen_grid(paper(*overrides))
+
+
+@pytest.mark.parametrize("grid", [TABLES["mixing"], TABLES["gaps"]])
+def test_runs_that_differ_have_different_identities(grid):
+    found = []
+    for run in grid.runs((0,)):
+        cfg = paper(*run)
+        cfg.overrides = run
+        found.append(tuple(identity(cfg).values()))
+    assert len(set(found)) == len(found)
+    assert not any("=" in value for who in found for value in who)
+
+
+def test_every_run_is_an_override_that_hydra_reads():
+    parser = OverridesParser.create()
+    for grid in (TABLES | FIGURES).values():
+        for run in grid.runs((0,)):
+            parser.parse_overrides(run)
+
+
+GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
+
+
+def test_a_grid_that_is_killed_goes_on_where_it_was(command, compose, tmp_path):  # noqa: F811
+    asked = command(*GRID, "methods=[iql,cql]", "updates=200", script="paper.py")
+    process = subprocess.Popen(**asked, text=True)
+    while not (second := checkpoint_of(tmp_path, "cql")):
+        assert process.poll() is None, process.communicate()[0]
+    process.kill()
+    process.communicate()
+    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
+
+    done = subprocess.run(**asked, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "2 runs, 1 of them done" in done.stdout
+    assert done.stdout.count("run folder:") == 1
+    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql", "cql"]
+
+    cfg, real = compose("updates=200", "method=cql", config="train")
+    train(METHODS["cql"].title, METHODS["cql"].make_learner, cfg, real, tmp_path / "unbroken")
+    assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
+
+
+def checkpoint_of(folder, method):
+    """The folder of that method's run, once it has a checkpoint."""
+    found = list(folder.glob(f"outputs/paper/results/{method}__*"))
+    return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
+
+
+def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):  # noqa: F811
+    grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "backbone=huber", script="paper.py")
+    done = subprocess.run(**grid, text=True, check=False)
+    assert done.returncode != 0
+    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
+    assert "these runs died:\n  method=h2o_plus" in done.stdout
+    assert "ValueError: backbone=huber: choose expectile" in done.stdout
+    assert done.stdout.count("run folder:") == 3  # it was tried again, once

@@ -1,0 +1,135 @@
+"""The report, from a fixture of results: what stands in its tables, and its statistics against plain arithmetic."""
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from aggregates import common_scores, improvements, interquartile_means
+from results_file import IDENTITY, RESULT, append_rows, read_rows
+from score_table import cells, markdown, normalised, placed
+
+ROOT = Path(__file__).parents[2]
+CHEETAH = {"env": "HalfCheetah-v5", "data": "halfcheetah/medium-replay-v0"}
+
+
+def row(method, seed, value, gap="gravity", **others):
+    who = dict.fromkeys((*IDENTITY, *RESULT), "") | CHEETAH | {"updates": "1000", "episodes": "5"}
+    strength = {"gravity": "2.0", "friction": "0.3", "": ""}[gap]
+    told = {"method": method, "seed": str(seed), "gap": gap, "strength": strength}
+    return who | told | {"return_mean": str(value), "return_std": "10.0"} | others
+
+
+def fixture():
+    """Three methods, two gaps, three seeds; IQL saw no simulator."""
+    rows = []
+    for seed in range(3):
+        rows.append(row("iql", seed, 1000 + 100 * seed, gap=""))
+        for gap, harder in (("gravity", 0), ("friction", 500)):
+            rows.append(row("sac", seed, 500 + 100 * seed - harder, gap))
+            plus = {"backbone": "expectile", "mixing": "0.1", "ratio": "True"}
+            rows.append(row("h2o_plus", seed, 2000 + 100 * seed - harder, gap, **plus))
+    return rows
+
+
+def write(path, rows):
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def test_a_cell_is_the_mean_over_seeds_and_a_method_without_simulator_stands_in_every_gap():
+    table = cells(placed(fixture(), variants=False))
+    assert {task[2] for task in table} == {"gravity 2", "friction 0.3"}
+    friction = table["HalfCheetah-v5", "halfcheetah/medium-replay-v0", "friction 0.3"]
+    assert friction["h2o_plus"].text() == "1,600 ± 100 (3)"
+    assert friction["iql"].text() == "1,100 ± 100 (3)"
+    assert cells([row("sac", 0, 7)]).popitem()[1]["sac"].text() == "7 ± 10 (1)"
+
+
+def test_variants_are_rows_of_their_own_in_an_ablation():
+    rows = [row("h2o_plus", 0, 1, mixing="0.1", ratio=ratio) for ratio in ("True", "False")]
+    assert len(cells(placed(rows, variants=True))) == 2
+
+
+def test_runs_with_other_settings_are_not_averaged():
+    table = cells(placed([row("sac", 0, 1), row("sac", 0, 9, others="lr=0.01")], variants=False))
+    assert sorted(c["sac"].returns[0] for c in table.values()) == [1.0, 9.0]
+
+
+def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
+    table = cells(placed(fixture(), variants=False))
+    task = sorted(table)[1]
+    text = markdown(table, {"h2o_plus": "H2O+", "sac": "SAC", "cql": "CQL"}, {task: {"sac": "4,513 ± 513"}})
+    head, _, *lines = text.splitlines()
+    assert head.endswith("| H2O+ | SAC |")
+    assert lines[-1].endswith("| paper |  | 4,513 ± 513 |")
+    assert lines[-2].endswith("| ours | 2,100 ± 100 (3) | 600 ± 100 (3) |")
+
+
+def test_the_interquartile_mean_is_that_of_the_middle_half():
+    scores = common_scores(cells(placed(fixture(), variants=False)))
+    means = interquartile_means(scores, reps=100)
+    assert scores.seeds == [0, 1, 2]
+    values = sorted(normalised("HalfCheetah-v5", 2000 + 100 * s - h) for s in range(3) for h in (0, 500))
+    assert means["h2o_plus"].value == pytest.approx(np.mean(values[1:-1]))  # a quarter of six is one and a half: one
+    assert means["h2o_plus"].low <= means["h2o_plus"].value <= means["h2o_plus"].high
+    np.random.seed(7)
+    assert interquartile_means(scores, reps=100) == means  # whatever state the global generator is in
+
+
+def test_the_probability_of_improvement_counts_pairs_of_runs():
+    rows = [row("h2o_plus", s, v) for s, v in enumerate((1, 4, 5))] + [
+        row("sac", s, v) for s, v in enumerate((2, 3, 6))
+    ]
+    better = improvements(common_scores(cells(rows)), reps=50)
+    assert better["sac"].value == pytest.approx(4 / 9)
+    assert 0 <= better["sac"].low <= 4 / 9 <= better["sac"].high <= 1
+
+
+def test_aggregates_are_of_tasks_and_seeds_that_every_method_has():
+    rows = [r for r in fixture() if (r["method"], r["gap"]) != ("sac", "friction")]
+    rows = [r for r in rows if (r["method"], r["seed"]) != ("iql", "2")]
+    scores = common_scores(cells(placed(rows, variants=False)))
+    assert [task[2] for task in scores.tasks] == ["gravity 2"]
+    assert scores.seeds == [0, 1]
+    assert {x.shape for x in scores.by_method.values()} == {(2, 1)}
+
+
+def test_one_command_makes_tables_and_pictures(tmp_path):
+    write(tmp_path / "returns.csv", fixture())
+    curve = [
+        {**{k: r[k] for k in IDENTITY}, "at": at, "return_mean": at, "return_std": 1}
+        for r in fixture()
+        for at in (500, 1000)
+    ]
+    write(tmp_path / "returns_curves.csv", curve)
+    write(tmp_path / "paper.csv", read_rows(ROOT / "recipes" / "results" / "paper.csv"))
+    command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}", "reps=50"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    table = (tmp_path / "returns.md").read_text()
+    assert "| ours | 600 ± 100 (3) | 1,100 ± 100 (3) | 2,100 ± 100 (3) |" in table
+    assert "| paper | 4,513 ± 513 | 5,207 ± 149 | 6,861 ± 268 |" in table
+    assert "P(H2O+ does better)" in table
+    assert table in done.stdout
+    for name in ("returns_curves.png", "returns_aggregates.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+
+
+def test_runs_of_several_budgets_are_not_set_beside_each_other(tmp_path):
+    write(tmp_path / "returns.csv", [row("sac", 0, 1), row("sac", 1, 1, updates="2000")])
+    command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "holds runs of [1000, 2000] updates: choose one" in done.stderr
+
+
+def test_a_run_is_recorded_once(tmp_path):
+    who = dict.fromkeys(IDENTITY, "x")
+    for value in (1, 2):
+        append_rows(tmp_path / "a.csv", (*IDENTITY, "return_mean"), [who | {"return_mean": value}], who)
+    assert [r["return_mean"] for r in read_rows(tmp_path / "a.csv")] == ["1"]

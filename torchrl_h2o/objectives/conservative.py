@@ -1,0 +1,186 @@
+"""H2O's conservative term, Eq. (1): Q is pushed down where the simulator is off, and up on the real data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from torchrl_h2o.objectives.functional import run
+from torchrl_h2o.objectives.hybrid_loss import Rows, like_rows
+from torchrl_h2o.objectives.loss_wrapper import LossWrapper
+from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
+
+
+class DynamicsDivergence(TensorDictModuleBase):
+    r"""How far the simulator is off at (s, a): :math:`D_{KL}(\hat P\|P)` from noisy next states.
+
+    .. math::
+        u(s,a)=\tfrac 1N\sum_i\log\frac{\hat P(s'_i|s,a)}{P(s'_i|s,a)},\qquad s'_i\sim\mathcal N(s',\sigma^2)
+
+    Normalised over a batch's simulated rows it is ω of Eq. (1), as :class:`ConservativeLoss` takes it.
+
+    Args:
+        estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`.
+        noise (Tensor or float): σ, in the observation's units, ``[observation_dim]`` or one for all. The authors take
+            the standard deviation of the real data's observations.
+        num_samples (int, optional): N. Defaults to 10, the authors'.
+
+    Keyword Args:
+        clamp (tuple of float, optional): bounds of the estimate. Defaults to ``(1e-45, 10.0)``, the authors'.
+        out_keys (sequence of NestedKey, optional): Defaults to ``["dynamics_divergence"]``, ``[*B]``, a constant.
+
+    Raises:
+        ValueError: if there is no sample, or the lower bound is not positive: its logarithm is taken.
+
+    Source:
+        H2O+, below Eq. (1), after H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464); constants of their code.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_h2o.objectives import make_dynamics_ratio_estimator
+        >>> divergence = DynamicsDivergence(make_dynamics_ratio_estimator(observation_dim=3, action_dim=1), noise=1.0)
+        >>> batch = TensorDict(observation=torch.randn(5, 3), action=torch.randn(5, 1),
+        ...                    next=TensorDict(observation=torch.randn(5, 3)), batch_size=5)
+        >>> divergence(batch)["dynamics_divergence"].shape
+        torch.Size([5])
+    """
+
+    def __init__(
+        self,
+        estimator: DynamicsRatioEstimator,
+        noise: Tensor | float,
+        num_samples: int = 10,
+        *,
+        clamp: tuple[float, float] = (1e-45, 10.0),
+        out_keys: Iterable[NestedKey] = ("dynamics_divergence",),
+    ) -> None:
+        if num_samples < 1:
+            raise ValueError(f"num_samples is {num_samples}: a mean needs at least one next state.")
+        if not 0 < clamp[0] < clamp[1]:
+            raise ValueError(f"clamp must be (low, high) with 0 < low < high, not {clamp}.")
+        super().__init__()
+        self.estimator = estimator
+        self.register_buffer("noise", torch.as_tensor(noise))
+        self.num_samples = num_samples
+        self.clamp = clamp
+        self.in_keys = list(estimator.in_keys)
+        self.out_keys = list(out_keys)
+
+    @dispatch
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        inputs = tensordict.select(*self.in_keys)
+        samples = inputs.expand(self.num_samples, *inputs.batch_size).copy()
+        for key in self.in_keys:
+            if key[0] == "next":
+                value = samples.get(key)
+                samples.set(key, value + self.noise.to(value) * torch.randn_like(value))
+        log_ratio = self.estimator(samples).get(self.estimator.out_keys[0])
+        return tensordict.set(self.out_keys[0], (-log_ratio.mean(0)).clamp(*self.clamp))
+
+
+class ConservativeLoss(LossWrapper):
+    r"""Any loss with a Q network, and H2O's conservative term beside it.
+
+    .. math::
+        \alpha_c\Big(\log\sum_{s,a\sim B}\omega(s,a)e^{Q(s,a)}-E_{𝒟}[Q(s,a)]\Big)
+
+    ω is the batch's ``dynamics_divergence``, which :class:`DynamicsDivergence` writes, normalised over the simulated
+    rows. The term, ``loss_conservative``, is summed over the ensemble and moves Q alone. Around SAC on both streams
+    whose Bellman error the dynamics ratio weighs, as in the example, it is H2O.
+
+    Args:
+        loss (LossModule): with a ``qvalue_network``, as TorchRL's SAC, TD3 and IQL losses have and this package's.
+        alpha_c (float, optional): its weight, not negative. Defaults to 0.01, the authors'.
+
+    Raises:
+        ValueError: if the loss inside has no ``qvalue_network`` or does not return means, or α_c is negative.
+
+    Reads what the loss inside reads, ``real`` ``[*B]``, and ``dynamics_divergence`` ``[*B]`` if it is there (else all
+    simulated rows weigh the same). Without rows of one stream that stream's part is zero.
+
+    Source:
+        H2O+, Eq. (1), after H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_h2o.objectives import (DynamicsDivergence, H2OPlusLoss, make_actor,
+        ...     make_dynamics_ratio_estimator, make_qvalue)
+        >>> actor, estimator = make_actor(3, Bounded(-1, 1, (1,))), make_dynamics_ratio_estimator(3, 1)
+        >>> divergence = DynamicsDivergence(estimator, noise=1.0)
+        >>> loss = ConservativeLoss(H2OPlusLoss(actor, [make_qvalue(3, 1), make_qvalue(3, 1)], None, mixing=0.0))
+        >>> targets = SoftUpdate(loss, tau=0.005)
+        >>> batch = TensorDict(observation=torch.randn(8, 3), action=torch.rand(8, 1), real=torch.arange(8) < 4,
+        ...                    next=TensorDict(observation=torch.randn(8, 3), reward=torch.randn(8, 1),
+        ...                                    terminated=torch.zeros(8, 1, dtype=torch.bool)), batch_size=8)
+        >>> losses = loss(divergence(estimator(batch)))  # with the ratio, and with ω
+        >>> sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys(LossWrapper._AcceptedKeys):
+        """Keys that ``set_keys`` renames, beside those of the loss inside.
+
+        Attributes:
+            dynamics_divergence: ω before it is normalised. Defaults to ``"dynamics_divergence"``.
+        """
+
+        dynamics_divergence: NestedKey = "dynamics_divergence"
+
+    tensor_keys: _AcceptedKeys
+
+    def __init__(self, loss: LossModule, alpha_c: float = 0.01) -> None:
+        if not hasattr(loss, "qvalue_network"):
+            raise ValueError(f"{type(loss).__name__} has no qvalue_network that a conservative term could push down.")
+        if getattr(loss, "reduction", "mean") != "mean":
+            raise ValueError(
+                f"{type(loss).__name__} has reduction={loss.reduction!r}; the conservative term is a number a batch: "
+                "build it with reduction='mean'."
+            )
+        if alpha_c < 0:
+            raise ValueError(f"alpha_c is {alpha_c}: below zero it would reward the simulator for being off.")
+        super().__init__(loss)
+        self.alpha_c = alpha_c
+
+    def _read_keys(self) -> Iterable[NestedKey]:
+        return *self.loss.in_keys, self.tensor_keys.real
+
+    def _optional_keys(self) -> Iterable[NestedKey]:
+        inside = self.loss._optional_keys() if hasattr(self.loss, "_optional_keys") else ()
+        return *inside, self.tensor_keys.dynamics_divergence
+
+    def _written_keys(self) -> Iterable[NestedKey]:
+        return *self.loss.out_keys, "loss_conservative"
+
+    @dispatch(source="_dispatch_keys")
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        term = self.conservative_loss(tensordict, self._rows(tensordict))
+        return self._output({**self.loss(tensordict), "loss_conservative": term}, tensordict)
+
+    def conservative_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
+        """The first bracket of Eq. (1), times α_c, ``[]``."""
+        inputs = tensordict.select(*self.loss.qvalue_network.in_keys)
+        out = run(self.loss.qvalue_network, inputs, self.loss.qvalue_network_params)
+        qvalues = out.get(self.loss.tensor_keys.state_action_value).squeeze(-1)
+        of_sim = self._soft_maximum(qvalues, tensordict, rows.sim).sum()
+        return self.alpha_c * (of_sim - self._expectation(qvalues, rows, rows.real))  # Eq. (1)
+
+    def _soft_maximum(self, qvalues: Tensor, tensordict: TensorDictBase, sim: Tensor) -> Tensor:
+        """log Σ ω e^Q over the simulated rows, of each member of the ensemble; zero without such rows."""
+        lowest = torch.finfo(qvalues.dtype).min  # not -inf, which taken from itself is NaN: there may be no row
+        divergence = tensordict.get(self.tensor_keys.dynamics_divergence, None)
+        logits = torch.zeros_like(qvalues[0]) if divergence is None else like_rows(divergence.detach(), sim).log()
+        logits = torch.where(sim, logits, lowest).flatten()
+        log_omega = logits - logits.logsumexp(0)
+        terms = torch.where(sim.flatten(), qvalues.flatten(1) + log_omega, lowest)
+        return torch.where(sim.any(), terms.logsumexp(-1), 0.0)

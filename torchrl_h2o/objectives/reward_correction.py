@@ -1,0 +1,74 @@
+"""DARC's reward correction: a simulated step is paid less the less likely it is in reality."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+
+from torchrl_h2o.objectives.hybrid_loss import like_rows
+from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
+
+
+class DynamicsRewardCorrection(TensorDictModuleBase):
+    r"""Adds the log dynamics ratio to the reward of simulated transitions: :math:`r+\log\frac{P}{\hat P}(s'|s,a)`.
+
+    Any loss that learns from the corrected reward in the simulator learns what pays off in reality too. With
+    TorchRL's ``SACLoss`` it is DARC. Call it on a batch, or hand it to a replay buffer as its transform, which
+    corrects what is sampled with the discriminators of that moment: ``ReplayBuffer(..., transform=correction)``.
+
+    Args:
+        estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`. Its log-ratio is not clamped;
+            its ``logit_bound`` bounds it.
+        scale (float, optional): of the log-ratio, which is in nats. A script that hands ``c * reward`` to its loss
+            corrects the task's own reward with ``scale=c``. Defaults to 1.0.
+
+    Keyword Args:
+        reward (NestedKey, optional): read and replaced, ``[*B, 1]`` or ``[*B]``. Defaults to ``("next", "reward")``.
+        real (NestedKey, optional): marks measured rows, which keep their reward; if it is not there, every row is
+            simulated. Defaults to ``"real"``.
+
+    Raises:
+        KeyError: if a transition lacks what the estimator reads, or its reward.
+
+    Source:
+        DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916), the correction Δr; H2O+, Eq. (9), the ratio.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+        >>> from torchrl_h2o.objectives import make_dynamics_ratio_estimator
+        >>> correction = DynamicsRewardCorrection(make_dynamics_ratio_estimator(observation_dim=3, action_dim=1))
+        >>> steps = TensorDict(observation=torch.randn(8, 3), action=torch.rand(8, 1), batch_size=8,
+        ...                    next=TensorDict(observation=torch.randn(8, 3), reward=torch.zeros(8, 1), batch_size=8))
+        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(8), transform=correction, batch_size=4)
+        >>> _ = buffer.extend(steps)
+        >>> buffer.sample()["next", "reward"].abs().max() > 0
+        tensor(True)
+    """
+
+    def __init__(
+        self,
+        estimator: DynamicsRatioEstimator,
+        scale: float = 1.0,
+        *,
+        reward: NestedKey = ("next", "reward"),
+        real: NestedKey = "real",
+    ) -> None:
+        super().__init__()
+        self.estimator = estimator
+        self.scale = scale
+        self.reward, self.real = reward, real
+        self.in_keys = [*estimator.in_keys, reward]
+        self.out_keys = [reward]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
+        correction = self.scale * estimated.get(self.estimator.out_keys[0])
+        real = tensordict.get(self.real, None)
+        if real is not None:
+            correction = torch.where(like_rows(real.bool(), correction), 0.0, correction)
+        reward = tensordict.get(self.reward)
+        return tensordict.set(self.reward, reward + correction.reshape(reward.shape))
