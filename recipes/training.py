@@ -129,6 +129,8 @@ def train(
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     trainee = Trainee(make_learner, cfg, replay)
     learner = trainee.learner
+    if cfg.get("compiled", False):  # a run of an earlier version says nothing of it
+        learner.terms_of = torch.compile(learner.terms_of)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     training = Training(name, cfg, directory, **trainee.components, schedule=schedule)
     with closing(trainee):

@@ -40,6 +40,7 @@ WORKERS = ["multi_sync", pytest.param("ray", marks=needs_ray)]
 @pytest.fixture
 def compose(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.setenv("RAY_ADDRESS", "local")  # whatever cluster this machine is in, or was
 
     def build(*overrides):
         with hydra.initialize_config_dir(str(CONFIG), version_base=None):
