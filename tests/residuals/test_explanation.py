@@ -5,12 +5,13 @@ import pytest
 from tqdm import tqdm
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointFrictionLoss
+from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
 from torchrl_h2o.residuals.explanation import explain
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
 FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
+CONSTANT = CatalogueEntry(JointForce(0.0, ("elbow",)), ({"torque": -0.1}, {"torque": 0.1}))
 RIPPLE = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
 
 
@@ -34,6 +35,16 @@ def test_a_force_stands_in_the_place_of_effects_that_it_explains_better():
     (part,) = explained(RIPPLE).parts
     assert not part.declared
     assert part.effect.parameters["frequency_1"].value == pytest.approx(7.0, rel=0.01)
+
+
+def test_a_force_that_starts_late_is_not_called_one_that_was_always_there():
+    """What a constant force leaves of it looks like nothing that could be put beside that force."""
+    late = UnknownForce(0.2, lambda q, v, t: (t >= 8.0) + 0.0 * q)
+    (part,) = explained(late, catalogue=[CONSTANT], rows=2500).parts
+    assert not part.declared
+    (term,) = part.effect.parsed
+    assert term.factors[0].function == "step"
+    assert term.factors[0].numbers[0] == pytest.approx(8.0, abs=0.03)
 
 
 def test_where_the_catalogue_explains_all_no_force_is_made():

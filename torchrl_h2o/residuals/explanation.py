@@ -99,13 +99,14 @@ def _with_undeclared(
 ) -> list[Part]:
     """The parts, with a force that nobody declared beside them or in their place, if that pays."""
     mended = simulation.with_effects(*(part.effect for part in parts))
-    beside = find_undeclared(mended, measured)
-    if beside is None:
-        return parts
-    candidates = [(_beside(simulation, measured, trace, parts, beside), beside, mended)]
-    alone = find_undeclared(simulation, measured) if parts else None
-    if alone is not None:
+    candidates = []
+    if (beside := find_undeclared(mended, measured)) is not None:
+        candidates.append((_beside(simulation, measured, trace, parts, beside), beside, mended))
+    # Also if there is none: what effects of the catalogue leave of a force that they imitate may look like nothing.
+    if parts and (alone := find_undeclared(simulation, measured)) is not None:
         candidates.append(([Part(alone.effect, False, alone.ci95)], alone, simulation))
+    if not candidates:
+        return parts
     problem = _with_least_noise(simulation, measured, [parts, *(candidate for candidate, _, _ in candidates)])
     judged = measured.judged()
 
