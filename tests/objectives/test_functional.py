@@ -65,6 +65,30 @@ def test_one_network_runs_with_other_parameters_than_its_own(name):
     assert not torch.allclose(got, network(batch.copy())[key])
 
 
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_frozen_network_lets_gradients_through_and_gets_none(name):
+    network, batch = NETWORKS[name](), transitions(4)
+    params = TensorDictParams(TensorDict.from_module(network))
+    batch["observation"].requires_grad_()
+    (key,) = network.out_keys
+    functional.run(network, batch, params, frozen=True)[key].square().sum().backward()
+    assert batch["observation"].grad.any()
+    assert all(leaf.grad is None for leaf in params.values(True, True))
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_mixed_precision_is_the_network_s_own(name):
+    network, batch = NETWORKS[name](), transitions(4)
+    params = TensorDictParams(TensorDict.from_module(network))
+    (key,) = network.out_keys
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        got, expected = functional.run(network, batch, params)[key], network(batch.copy())[key]
+    assert got.dtype == expected.dtype
+    torch.testing.assert_close(got, expected)
+    got.float().square().sum().backward()
+    assert all(leaf.grad.isfinite().all() for leaf in params.values(True, True))
+
+
 def test_a_hook_is_called():
     network, batch = qvalue(), transitions(4)
     network.module[0].register_forward_hook(lambda module, inputs, output: output + 1.0)

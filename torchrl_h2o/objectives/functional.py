@@ -138,7 +138,8 @@ def _perceptron(
 ) -> Tensor | tuple[Tensor, ...]:
     batch_size = x.shape[:-1]
     x = x.reshape(-1, x.shape[-1])
-    depth = 0 if torch.compiler.is_compiling() else _depth_with_relu(layers)
+    plain = torch.compiler.is_compiling() or torch.is_autocast_enabled(x.device.type)  # which see into layers
+    depth = 0 if plain else _depth_with_relu(layers)
     if depth:
         linear = [_weight_and_bias(params, path, frozen) for path, _ in layers[: 2 * depth - 1 : 2]]
         x = relu_perceptron(x, *zip(*linear, strict=True))

@@ -220,8 +220,6 @@ class H2OPlusLoss(MixedBellmanLoss):
         """Eq. (4): V's loss, regressed on the target Q at the data's own actions."""
         if self.num_real is not None and self.reduction != "none":  # no other row counts
             batch, rows = batch[: self.num_real], rows.first(self.num_real)
-        else:
-            batch = batch.copy()
         batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
         return {"loss_value": self.value_loss.value_loss(batch, rows)}
 
