@@ -26,7 +26,7 @@ from learner import Learner
 from omegaconf import DictConfig, OmegaConf
 from population_learner import PopulationLearner
 from turns import calls_per_second
-from update import action_spec, some_transitions
+from update import action_spec, recipe_on, some_transitions
 
 from torchrl_h2o.data import HybridReplayBuffer, PopulationReplay
 
@@ -89,11 +89,10 @@ def captured(learner: PopulationLearner) -> Callable[[], object]:
 
 def measure(cfg: DictConfig, run: DictConfig) -> list[dict]:
     """A line for each size and way: updates of the population a second, and of its members together."""
-    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
     lines = []
     for num_members in cfg.members:
         functions = contenders(cfg, run, num_members)
-        rates = calls_per_second(functions, cfg.seconds, cfg.turns, synchronise, least=cfg.calls)
+        rates = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device, least=cfg.calls)
         lines += [
             {
                 "members": num_members,
@@ -128,10 +127,7 @@ def print_table(result: dict) -> None:
 
 @hydra.main(config_path="../config", config_name="population_benchmark", version_base=None)
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
-    if cfg.device != "cpu":  # a default device slows every call down, also the CPU
-        torch.set_default_device(cfg.device)
-    run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")  # the recipe's own constants
+    run = recipe_on(cfg)
     lines = measure(cfg, run)
     best = max(line["run_updates_per_second"] for line in lines)
     tasks, seeds, updates = cfg.table

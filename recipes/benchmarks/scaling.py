@@ -32,7 +32,7 @@ from scaling_figure import draw_scaling
 from tensordict import TensorDict
 from tqdm import tqdm
 from turns import calls_per_second
-from update import action_spec, some_transitions
+from update import action_spec, recipe_on, some_transitions
 
 from torchrl_h2o.data import HybridReplayBuffer
 
@@ -70,14 +70,12 @@ def fill(real: TensorDict, size: int, device: str, folder: str | None = None) ->
     return replay
 
 
-def make_learner(cfg: DictConfig, replay: HybridReplayBuffer, **constants: object) -> Learner:
+def make_learner(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, **constants: object) -> Learner:
     """H2O+ with the recipe's own constants, or these."""
-    run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")
-    run = OmegaConf.merge(run, constants)
-    return h2o_plus.make_learner(run, cfg.observation_dim, action_spec(cfg), replay)
+    return h2o_plus.make_learner(OmegaConf.merge(run, constants), cfg.observation_dim, action_spec(cfg), replay)
 
 
-def larger_buffers(cfg: DictConfig, real: TensorDict, scratch: str) -> Iterator[tuple[Cost, Learner]]:
+def larger_buffers(cfg: DictConfig, run: DictConfig, real: TensorDict, scratch: str) -> Iterator[tuple[Cost, Learner]]:
     """Learners on buffers that grow, each in memory and in files."""
     rows = real.select("observation", "action", "next")
     each = sum(value.nbytes for value in rows.values(True, True)) // len(rows)
@@ -91,17 +89,17 @@ def larger_buffers(cfg: DictConfig, real: TensorDict, scratch: str) -> Iterator[
             before = held(cfg.device)
             folder = f"{scratch}/{size}" if storage == "memory-mapped" else None
             replay = fill(real, size, cfg.device, folder)
-            yield Cost("buffer", size, storage, held(cfg.device) - before), make_learner(cfg, replay)
+            yield Cost("buffer", size, storage, held(cfg.device) - before), make_learner(cfg, run, replay)
 
 
-def larger_learners(cfg: DictConfig, real: TensorDict) -> Iterator[tuple[Cost, Learner]]:
+def larger_learners(cfg: DictConfig, run: DictConfig, real: TensorDict) -> Iterator[tuple[Cost, Learner]]:
     """Learners with batches, or networks, that grow, on one buffer."""
     replay = fill(real, cfg.transitions, cfg.device)
     batches = {size: {"batch_size": [size] * 2, "discriminator_batch_size": [2 * size] * 2} for size in cfg.batch_sizes}
     widths = {width: {"num_cells": [width] * 2} for width in cfg.widths}
     for grows, choices in {"batch": batches, "width": widths}.items():
         for size, constants in choices.items():
-            learner = make_learner(cfg, replay, **constants)
+            learner = make_learner(cfg, run, replay, **constants)
             yield Cost(grows, size, "in memory", taken_by(learner.update, cfg.device)), learner
 
 
@@ -110,16 +108,15 @@ def sample(learner: Learner) -> list[TensorDict]:
     return [learner.replay.sample(size) for size in learner.batch_sizes]
 
 
-def measure(cfg: DictConfig, scratch: str) -> list[Cost]:
+def measure(cfg: DictConfig, run: DictConfig, scratch: str) -> list[Cost]:
     """Seconds and memory of each contender."""
     real = some_transitions(cfg)
-    contenders = [*larger_buffers(cfg, real, scratch), *larger_learners(cfg, real)]
+    contenders = [*larger_buffers(cfg, run, real, scratch), *larger_learners(cfg, run, real)]
     functions = {}
     for cost, learner in contenders:
         functions[f"update, {cost}"] = learner.update
         functions[f"sample, {cost}"] = partial(sample, learner)
-    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
-    rates = calls_per_second(functions, cfg.seconds, cfg.turns, synchronise)
+    rates = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device)
     return [
         replace(cost, seconds_per_update=1 / rates[f"update, {cost}"], seconds_per_sample=1 / rates[f"sample, {cost}"])
         for cost, _ in contenders
@@ -135,11 +132,9 @@ def print_table(costs: list[Cost]) -> None:
 
 @hydra.main(config_path="../config", config_name="scaling_benchmark", version_base=None)
 def main(cfg: DictConfig) -> None:
-    torch.set_num_threads(cfg.threads)
-    if cfg.device != "cpu":  # a default device slows every call down, also the CPU
-        torch.set_default_device(cfg.device)
+    run = recipe_on(cfg)
     with TemporaryDirectory(dir=cfg.scratch) as scratch:
-        costs = measure(cfg, scratch)
+        costs = measure(cfg, run, scratch)
     directory = Path(HydraConfig.get().runtime.output_dir)
     result = {"costs": [asdict(cost) for cost in costs], "torch": torch.__version__}
     result |= {"threads": cfg.threads, "device": cfg.device}

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 
+import torch
 from tqdm import tqdm
 
 WARM_UP = 10  # calls
@@ -12,7 +13,7 @@ def calls_per_second(
     functions: Mapping[str, Callable[[], object]],
     seconds: float,
     turns: int,
-    synchronise: Callable[[], object] = lambda: None,
+    device: str = "cpu",
     least: int = WARM_UP,
 ) -> dict[str, float]:
     """Calls a second of each function, the best of several turns.
@@ -21,9 +22,10 @@ def calls_per_second(
         functions: by name.
         seconds: of one turn.
         turns: of each function, after one to warm up.
-        synchronise: waits until what was called is done.
+        device: where they compute; a GPU is waited for.
         least: how many calls a turn has at least.
     """
+    synchronise = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
     best = dict.fromkeys(functions, 0.0)
     with tqdm(desc="measuring", total=len(functions) * (1 + turns), unit=" turns") as bar:
         for turn in range(1 + turns):

@@ -17,24 +17,21 @@ import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 import json
 import os
 from collections.abc import Callable
-from functools import partial
 
 import h2o_plus
 import hydra
+import rlpd
 import sac
 import torch
 from hydra.core.hydra_config import HydraConfig
-from learner import Learner, adam
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from textbook import TextbookH2OPlus
 from torch.utils.flop_counter import FlopCounterMode
 from torchrl.data import Bounded
-from torchrl.objectives import SoftUpdate
 from turns import calls_per_second
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import H2OPlusLoss, make_actor, make_qvalue
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
 
@@ -75,15 +72,6 @@ def textbook(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Ca
     return lambda: method.update(draw(real, n_real), draw(sim, n_sim), draw(real, pairs_real), draw(sim, pairs_sim))
 
 
-def sac_of_our_parts(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Learner:
-    """SAC of this library's parts: Eq. (6) on both streams, no V and no ratio."""
-    actor = make_actor(cfg.observation_dim, action_spec(cfg), run.num_cells)
-    qvalues = [make_qvalue(cfg.observation_dim, cfg.action_dim, run.num_cells) for _ in range(2)]
-    loss = H2OPlusLoss(actor, qvalues, None, mixing=0.0)
-    targets = SoftUpdate(loss, tau=run.tau)
-    return Learner(actor, {"loss": loss}, adam(loss, lr=run.lr), targets, replay, [run.batch_size], loss)
-
-
 def action_spec(cfg: DictConfig) -> Bounded:
     return Bounded(-1.0, 1.0, (cfg.action_dim,))
 
@@ -92,16 +80,16 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
     """What is compared, each a function that makes one update."""
     replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
     replay.extend(some_transitions(cfg))
-    make = partial(h2o_plus.make_learner, run, cfg.observation_dim, action_spec(cfg), replay)
-    chosen = {"textbook": textbook(cfg, run, replay), "ours": make().update}
+    what = (run, cfg.observation_dim, action_spec(cfg), replay)
+    chosen = {"textbook": textbook(cfg, run, replay), "ours": h2o_plus.make_learner(*what).update}
     if cfg.compiled:
-        learner = make()
+        learner = h2o_plus.make_learner(*what)
         learner.terms_of = torch.compile(learner.terms_of)
         chosen["ours, compiled"] = learner.update
-    torchrl_sac = sac.make_learner(run, cfg.observation_dim, action_spec(cfg), replay)
+    torchrl_sac = sac.make_learner(*what)
     torchrl_sac.batch_sizes = [run.batch_size]
     chosen["SAC, TorchRL's loss"] = torchrl_sac.update
-    chosen["SAC of our parts"] = sac_of_our_parts(cfg, run, replay).update
+    chosen["SAC of our parts"] = rlpd.make_learner(*what).update  # on both streams, too
     return chosen
 
 
@@ -132,17 +120,21 @@ def print_table(result: dict) -> None:
         print(f"{name:<34}{rate:>10.1f}")
 
 
-@hydra.main(config_path="../config", config_name="update_benchmark", version_base=None)
-def main(cfg: DictConfig) -> None:
+def recipe_on(cfg: DictConfig) -> DictConfig:
+    """The recipe's own constants, with torch on the threads and the device that are to be measured."""
     torch.set_num_threads(cfg.threads)
     if cfg.device != "cpu":  # a default device slows every call down, also the CPU
         torch.set_default_device(cfg.device)
-    run = OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")  # the recipe's own constants
+    return OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")
+
+
+@hydra.main(config_path="../config", config_name="update_benchmark", version_base=None)
+def main(cfg: DictConfig) -> None:
+    run = recipe_on(cfg)
     functions = contenders(cfg, run)
     flop = products_of(functions["textbook"])
-    synchronise = torch.cuda.synchronize if torch.device(cfg.device).type == "cuda" else lambda: None
     functions |= {"product": matrix_product(cfg.device)}
-    measured = calls_per_second(functions, cfg.seconds, cfg.turns, synchronise)
+    measured = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device)
     gflops = 2.0 * PRODUCT**3 * measured.pop("product") / 1e9
     result = {"updates_per_second": measured, "flop": flop, "gflop_per_second": gflops, "limit": gflops * 1e9 / flop}
     directory = Path(HydraConfig.get().runtime.output_dir)
