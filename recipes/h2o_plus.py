@@ -19,7 +19,7 @@ import torch
 from environments import make_simulator
 from job import prepare, resumable, run_job
 from judging import judge, judge_failed
-from learner import Learner, adam
+from learner import Learner, adam, make_networks
 from omegaconf import DictConfig
 from population_training import members_of, train_population
 from real_data import behaviour_in
@@ -40,9 +40,7 @@ from torchrl_h2o.objectives import (
     H2OPlusLoss,
     InSampleValueLoss,
     SparseValueLoss,
-    make_actor,
     make_dynamics_ratio_estimator,
-    make_qvalue,
     make_value,
 )
 
@@ -71,14 +69,10 @@ class H2OPlusTerms(torch.nn.Module):
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """The method: real and simulated batches, one loss, one optimiser."""
-    torch.manual_seed(cfg.seed)
-    action_dim = action_spec.shape[-1]
-
     # Networks. Each is held by the loss that trains it.
-    actor = make_actor(observation_dim, action_spec, cfg.num_cells)
-    qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     value_loss = make_value_loss(cfg, observation_dim)
-    estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
+    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
 
     # Losses. The discriminators have batches of their own, so their loss stands beside H2O+'s.
     num_real, _ = cfg.batch_size

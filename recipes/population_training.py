@@ -5,6 +5,7 @@ draws: on a CPU it reaches that run's numbers, to rounding. A member whose losse
 its networks stay as they are, it is neither simulated nor evaluated, and the others go on as if nothing had happened.
 """
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 from environments import as_observed
 from omegaconf import DictConfig, OmegaConf
 from population_learner import PopulationLearner
-from run import Training, checkpoint_folder, num_epochs, save_config, seed_epoch, write_metrics
+from run import Training, checkpoint_folder, num_epochs, save_config, write_metrics
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
@@ -131,27 +132,27 @@ def train_population(
     learner.updates = training.progress["epoch"] * cfg.updates_per_epoch
     learner.failures = {n: training.failures[name] for n, name in enumerate(members) if name in training.failures}
 
-    for epoch, evaluating in training.epochs():
-        running = [(n, name, trainees[name]) for n, name in enumerate(members) if n not in learner.failures]
-        if not running:
-            break
-        for number, _, trainee in running:
-            seed_epoch(trainee.cfg.seed, epoch, trainee.collector)
-            trainee.simulate()
-            learner.start_stream(number)
-        for _ in training.epoch_updates():
-            terms = learner.update()
-        learner.check_parameters()
-        schedule.step()
-        for number, name, trainee in running:
-            if number in learner.failures:
-                training.note_failure(name, learner.failures[number])
-            elif evaluating:
-                trainee.learner.batches = learner.batches_of(number)
-                losses = {key: term[number].item() for key, term in terms.items()}
-                training.log_member(epoch, name, **trainee.look(training.rows_of(name)), **losses)
-    for trainee in trainees.values():
-        trainee.close()
+    with ExitStack() as stack:
+        for trainee in trainees.values():
+            stack.callback(trainee.close)
+        for epoch, evaluating in training.epochs():
+            running = [(n, name, trainees[name]) for n, name in enumerate(members) if n not in learner.failures]
+            if not running:
+                break
+            for number, _, trainee in running:
+                trainee.begin_epoch(epoch)
+                learner.start_stream(number)
+            for _ in training.epoch_updates():
+                terms = learner.update()
+            learner.check_parameters()
+            schedule.step()
+            for number, name, trainee in running:
+                if number in learner.failures:
+                    training.note_failure(name, learner.failures[number])
+                elif evaluating:
+                    trainee.learner.batches = learner.batches_of(number)
+                    losses = {key: term[number].item() for key, term in terms.items()}
+                    training.log_member(epoch, name, **trainee.look(training.rows_of(name)), **losses)
     return {name: _outcome(name, trainee, training) for name, trainee in trainees.items()}
 
 

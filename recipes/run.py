@@ -14,12 +14,10 @@ from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
-from torchrl.collectors import BaseCollector
 from tqdm import tqdm
 
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
@@ -119,18 +117,12 @@ class Training:
         """The metrics so far, one row an evaluation."""
         return self.progress["rows"]
 
-    def epochs(self, collector: BaseCollector | None = None) -> Iterator[tuple[int, bool]]:
-        """Yields each epoch's number and whether to evaluate at its end; checkpoints after it.
-
-        Args:
-            collector: is seeded before each epoch, with torch; without it the caller does that.
-        """
+    def epochs(self) -> Iterator[tuple[int, bool]]:
+        """Yields each epoch's number and whether to evaluate at its end; checkpoints after it."""
         done = self.progress["epoch"]
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * self.cfg.updates_per_epoch, unit=" updates")
         for epoch in range(done, num_epochs(self.cfg)):
             start = time.perf_counter()
-            if collector is not None:
-                seed_epoch(self.cfg.seed, epoch, collector)
             last = epoch + 1 == num_epochs(self.cfg)
             yield epoch, last or (epoch + 1) % self.cfg.eval_every == 0
             self.progress["epoch"] = epoch + 1
@@ -160,13 +152,6 @@ class Training:
 
     def _row(self, epoch: int, metrics: dict[str, float]) -> dict:
         return {"method": self.name, "updates": (epoch + 1) * self.cfg.updates_per_epoch, **metrics}
-
-
-def seed_epoch(run_seed: int, epoch: int, collector: BaseCollector) -> None:
-    """Starts the random streams of an epoch: torch's global one, and the collector's."""
-    seed = int(np.random.SeedSequence((run_seed, epoch)).generate_state(1)[0])
-    torch.manual_seed(seed)
-    collector.set_seed(seed % 2**31)
 
 
 def keeps_best(cfg: DictConfig) -> bool:

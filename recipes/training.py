@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 
+import numpy as np
 import torch
 from collection import collecting
 from environments import as_observed, learning_reward, make_reality, make_simulator
@@ -39,6 +40,8 @@ class Method:
 class Trainee:
     """A policy in training: what it learns with, its data, the simulator that it acts in, and how it is looked at.
 
+    One that learns from real data alone has no simulator: nothing is simulated, and no policy chosen there.
+
     Args:
         make_learner: from the configuration, the size of the observation, the action's spec and the data.
         cfg: the run's configuration.
@@ -48,24 +51,27 @@ class Trainee:
 
     def __init__(self, make_learner: MakeLearner, cfg: DictConfig, replay: HybridReplayBuffer) -> None:
         self.cfg = cfg
-        simulator, self._reality = make_simulator(cfg, cfg.num_worlds), make_reality(cfg, cfg.eval_episodes)
-        self._trials = make_simulator(cfg, cfg.eval_episodes)
-        observation_dim = simulator.observation_spec["observation"].shape[-1]
+        self._reality = make_reality(cfg, cfg.eval_episodes)
+        observation_dim = self._reality.observation_spec["observation"].shape[-1]
         with replay.device:
-            action_spec = simulator.action_spec_unbatched.to(replay.device)
+            action_spec = self._reality.action_spec_unbatched.to(replay.device)
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
         self._actor = self.learner.actor if replay.device.type == "cpu" else deepcopy(self.learner.actor).cpu()
         self.components = self.learner.components
-        if keeps_best(cfg):
-            self.components["policy"] = deepcopy(self._actor)
         self._open = ExitStack()
-        self.collector = self._open.enter_context(collecting(cfg, simulator, self._actor, replay.keys))
-        self._rollouts = iter(self.collector)
+        self._collector = self._trials = None
+        if self.learner.simulates:
+            simulator = make_simulator(cfg, cfg.num_worlds)
+            self._collector = self._open.enter_context(collecting(cfg, simulator, self._actor, replay.keys))
+            self._rollouts = iter(self._collector)
+            if keeps_best(cfg):
+                self._trials = make_simulator(cfg, cfg.eval_episodes)
+                self.components["policy"] = deepcopy(self._actor)
 
     @property
     def policy(self) -> torch.nn.Module:
         """The one that ``keep`` asks for."""
-        return self.components["policy"] if keeps_best(self.cfg) else self.actor
+        return self.actor if self._trials is None else self.components["policy"]
 
     @property
     def actor(self) -> torch.nn.Module:
@@ -77,10 +83,18 @@ class Trainee:
         if self._actor is not self.learner.actor:
             self._actor.load_state_dict(self.learner.actor.state_dict())
 
-    def simulate(self) -> None:
+    def begin_epoch(self, epoch: int) -> None:
+        """Starts the epoch's random streams, torch's and the simulator's, and simulates its steps."""
+        seed = int(np.random.SeedSequence((self.cfg.seed, epoch)).generate_state(1)[0])
+        torch.manual_seed(seed)
+        if self._collector is not None:
+            self._collector.set_seed(seed % 2**31)
+            self._simulate()
+
+    def _simulate(self) -> None:
         """An epoch's steps of the policy in the simulator, into the replay buffer."""
         self._catch_up()
-        self.collector.update_policy_weights_()
+        self._collector.update_policy_weights_()
         simulated = next(self._rollouts).reshape(-1)
         simulated["next", "reward"] = learning_reward(self.cfg, simulated["next", "reward"])
         self.learner.replay.extend(simulated)
@@ -93,7 +107,7 @@ class Trainee:
         """
         actor, promised = self.actor, {}
         evaluation = evaluate(self._reality, actor, self.cfg.eval_episodes)
-        if keeps_best(self.cfg):
+        if self._trials is not None:
             promised["return_sim"] = evaluate(self._trials, actor, self.cfg.eval_episodes).mean
             if promised["return_sim"] >= max((row["return_sim"] for row in rows), default=-inf):
                 self.components["policy"].load_state_dict(actor.state_dict())
@@ -134,9 +148,8 @@ def train(
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     training = Training(name, cfg, directory, **trainee.components, schedule=schedule)
     with closing(trainee):
-        for epoch, evaluating in training.epochs(trainee.collector):
-            if learner.simulates:
-                trainee.simulate()
+        for epoch, evaluating in training.epochs():
+            trainee.begin_epoch(epoch)
             for _ in training.epoch_updates():
                 losses = learner.update()
             schedule.step()
