@@ -3,56 +3,32 @@
 import multiprocessing
 import shutil
 from importlib.util import find_spec
-from pathlib import Path
 
 import collection
-import hydra
 import pytest
 import torch
 from collection import check_collector, collecting
-from environments import make_simulator, measure_observation_norm
+from environments import make_simulator
 from h2o_plus import train_h2o_plus
-from real_data import read_real_data
 from run import Training
 
 from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS
 from torchrl_h2o.objectives import make_actor
 
-CONFIG = Path(__file__).parents[2] / "recipes" / "config"
-SMALL = [
-    "updates=20",
-    "updates_per_epoch=10",
-    "steps_per_epoch=40",
-    "eval_every=1",
-    "checkpoint_every=1",
-    "eval_episodes=1",
-    "num_cells=[8,8]",
-    "batch_size=[8,8]",
-    "discriminator_batch_size=[8,8]",
-    "threads=1",
-    "env.make.max_episode_steps=40",
-    "env.recording.num_transitions=200",
-]
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is an extra: pip install 'torchrl_h2o[ray]'")
 WORKERS = ["multi_sync", pytest.param("ray", marks=needs_ray)]
 
 
 @pytest.fixture
-def compose(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+def compose(compose, monkeypatch):
     monkeypatch.setenv("RAY_ADDRESS", "local")  # whatever cluster this machine is in, or was
-
-    def build(*overrides):
-        with hydra.initialize_config_dir(str(CONFIG), version_base=None):
-            return hydra.compose("h2o_plus", [*SMALL, *overrides])
-
-    return build
+    return lambda *overrides: compose("updates=20", "updates_per_epoch=10", "keep=last", *overrides)
 
 
 @pytest.fixture
 def actor(compose):
     torch.manual_seed(0)
-    return make_actor(4, make_simulator(compose()).action_spec_unbatched, [8, 8])
+    return make_actor(4, make_simulator(compose()[0]).action_spec_unbatched, [8, 8])
 
 
 def open_collector(cfg, actor):
@@ -61,9 +37,7 @@ def open_collector(cfg, actor):
 
 @pytest.mark.parametrize("kind", WORKERS)
 def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind, monkeypatch):
-    cfg = compose(f"collector={kind}", "gap=joint_noise")
-    real = read_real_data(cfg)
-    measure_observation_norm(cfg, real)
+    cfg, real = compose(f"collector={kind}", "gap=joint_noise")
     log, workers = Training.log, []
 
     def stop_and_go_on(self, epoch, **metrics):
@@ -88,7 +62,7 @@ def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind,
 def test_an_epoch_is_drawn_from_its_seed_and_the_weights_that_were_sent(compose, actor):
     import ray
 
-    cfg = compose("collector=ray", "gap=joint_noise", "updates=100")
+    cfg, _ = compose("collector=ray", "gap=joint_noise", "updates=100")
 
     def draw(seed):
         collector.set_seed(seed)
@@ -104,7 +78,7 @@ def test_an_epoch_is_drawn_from_its_seed_and_the_weights_that_were_sent(compose,
         collector.update_policy_weights_()
         sent = draw(5)
 
-        too_many = compose("collector=ray", "collector.workers=1000", "steps_per_epoch=1000")
+        too_many, _ = compose("collector=ray", "collector.workers=1000", "steps_per_epoch=1000")
         with (
             pytest.raises(RuntimeError, match="ask for fewer, or add machines"),
             open_collector(too_many, actor),
@@ -123,17 +97,17 @@ def test_an_epoch_is_drawn_from_its_seed_and_the_weights_that_were_sent(compose,
 
 def test_workers_that_cannot_share_an_epoch_are_refused(compose):
     with pytest.raises(ValueError, match=r"workers=3.*divisor of steps_per_epoch=40"):
-        check_collector(compose("collector=multi_sync", "collector.workers=3"))
+        check_collector(compose("collector=multi_sync", "collector.workers=3")[0])
 
 
 def test_ray_that_is_not_installed_is_named_with_what_to_do(compose, monkeypatch):
     monkeypatch.setattr(collection, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchrl_h2o\[ray\]'"):
-        check_collector(compose("collector=ray"))
+        check_collector(compose("collector=ray")[0])
 
 
 def test_a_run_of_an_earlier_version_collects_in_its_own_process(compose, actor):
-    cfg = compose()
+    cfg, _ = compose()
     del cfg.collector
     check_collector(cfg)
     with open_collector(cfg, actor) as collector:

@@ -1,78 +1,25 @@
 """The main job as its user runs it: a command line in, files out, and going on after an interruption."""
 
-import csv
 import json
 import os
 import signal
 import subprocess
-import sys
-import zipfile
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from environments import make_simulator, measure_observation_norm
+from environments import make_simulator
 from evaluate import load_policy
 from evaluation import evaluate
 from h2o_plus import train_h2o_plus
-from real_data import read_real_data
 from run import Training
 from sac import train_sac
 from torchrl.checkpoint import CheckpointRotation
 
+from tests.recipes.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
 from torchrl_h2o.data import write_ted
 
-ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
-SMALL = [
-    "updates=60",
-    "updates_per_epoch=20",
-    "steps_per_epoch=40",
-    "eval_every=1",
-    "checkpoint_every=1",
-    "eval_episodes=1",
-    "final_episodes=1",
-    "num_cells=[8,8]",
-    "batch_size=[8,8]",
-    "discriminator_batch_size=[8,8]",
-    "render=false",
-    "threads=1",
-]
-ROBOT = ["env.make.max_episode_steps=40", "env.recording.num_transitions=200"]
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture
-def command(cache, tmp_path):
-    def build(*overrides, script="h2o_plus.py"):
-        env = os.environ | {"XDG_CACHE_HOME": str(cache), "OMP_NUM_THREADS": "1"}
-        arguments = [sys.executable, str(ROOT / "recipes" / script), *overrides]
-        return {"args": arguments, "env": env, "cwd": tmp_path, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-
-    return build
-
-
-def run(options):
-    done = subprocess.run(**options, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    return done.stdout
-
-
-def trained(directory, method="h2o+"):
-    """Every number of the last checkpoint, by the file that it stands in."""
-    latest = CheckpointRotation(directory / "checkpoints" / method, keep_last=1).latest()
-    with zipfile.ZipFile(latest) as archive:
-        return {name: archive.read(name) for name in archive.namelist() if name.startswith("components")}
-
-
-def rows(directory):
-    with open(directory / "metrics.csv") as file:
-        return list(csv.DictReader(file))
 
 
 def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
@@ -161,20 +108,6 @@ def test_what_cannot_be_is_said_with_what_to_do(command, overrides, said):
     assert said in done.stdout
 
 
-@pytest.fixture
-def compose(cache, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-
-    def build(*overrides, config="h2o_plus"):
-        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            cfg = hydra.compose(config, [*SMALL, *ROBOT, *overrides])
-        real = read_real_data(cfg)
-        measure_observation_norm(cfg, real)
-        return cfg, real
-
-    return build
-
-
 def test_recorded_data_can_be_named_by_their_folder(compose, tmp_path):
     cfg, real = compose()
     again, same = compose(f"data={write_ted(real, tmp_path / 'recording')}")
@@ -219,15 +152,6 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
     monkeypatch.undo()
     train_h2o_plus(cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
-
-
-def interrupt_at(epoch, log):
-    def interrupted(self, current, **metrics):
-        if current == epoch:
-            raise KeyboardInterrupt
-        log(self, current, **metrics)
-
-    return interrupted
 
 
 def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):

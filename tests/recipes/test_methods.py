@@ -6,28 +6,19 @@ import subprocess
 import pytest
 import torch
 from environments import as_observed, make_reality
+from evaluate import load_policy
 from methods import METHODS
 from run import Training
 from training import train
 
-from tests.recipes.test_h2o_plus_recipe import (  # noqa: F401  (fixtures)
-    ROBOT,
-    SMALL,
-    cache,
-    command,
-    compose,
-    interrupt_at,
-    rows,
-    run,
-    trained,
-)
+from tests.recipes.small_runs import ROBOT, SMALL, interrupt_at, rows, run, trained
 from torchrl_h2o.data import HybridReplayBuffer
 
 methods = pytest.mark.parametrize("name", METHODS)
 OFFLINE = ("cql", "iql")
 
 
-def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):  # noqa: F811
+def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):
     printed = run(command("method=darc", *SMALL, *ROBOT, "hydra.run.dir=out", script="train.py"))
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["method"] == "DARC"
@@ -39,14 +30,14 @@ def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path): 
     assert "DARC in reality" in replayed
 
 
-def test_a_method_that_there_is_not_is_said(command):  # noqa: F811
+def test_a_method_that_there_is_not_is_said(command):
     done = subprocess.run(**command("method=ppo", script="train.py"), text=True, check=False)
     assert done.returncode != 0
     assert "choose sac, cql, iql" in done.stdout
 
 
 @methods
-def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(compose, tmp_path, name, monkeypatch):  # noqa: F811
+def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1", config="train")
     method = METHODS[name]
     policy, training = train(method.title, method.make_learner, cfg, real, tmp_path / "whole")
@@ -72,7 +63,7 @@ def method_policy(method, cfg, real, directory):
 
 
 @methods
-def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, name, monkeypatch):  # noqa: F811
+def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=20", config="train")
     sizes = []
     monkeypatch.setattr("learner.Learner.update", recorded(sizes))
@@ -96,7 +87,7 @@ def recorded(sizes):
 
 
 @pytest.mark.parametrize("name", OFFLINE)
-def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_path, name):  # noqa: F811
+def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_path, name):
     returns = []
     for gap in ("gap=null", "gap=gravity"):
         cfg, real = compose("updates=20", gap, config="train")
@@ -105,7 +96,7 @@ def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_p
     assert returns[0] == returns[1]
 
 
-def parts(name, compose):  # noqa: F811
+def parts(name, compose):
     """A method's learner and its first batches."""
     cfg, real = compose(f"method={name}", config="train")
     spec = make_reality(cfg).action_spec_unbatched
@@ -116,14 +107,14 @@ def parts(name, compose):  # noqa: F811
     return learner, [replay.sample(size) for size in learner.batch_sizes]
 
 
-def test_darc_learns_from_corrected_rewards(compose):  # noqa: F811
+def test_darc_learns_from_corrected_rewards(compose):
     learner, (batch, pairs) = parts("darc", compose)
     task_s = batch["next", "reward"].clone()
     learner.terms_of(batch, pairs)
     assert (batch["next", "reward"] != task_s).all()
 
 
-def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):  # noqa: F811
+def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):
     learner, (batch, pairs) = parts("h2o", compose)
     losses = learner.terms_of(batch, pairs)
     for key in ("dynamics_ratio", "dynamics_divergence"):
@@ -132,7 +123,7 @@ def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):  # noqa: F8
     assert {"loss_conservative", "loss_qvalue", "loss_ratio_sa"} <= losses.keys()
 
 
-def test_cql_s_policy_is_not_also_told_to_copy(compose):  # noqa: F811
+def test_cql_s_policy_is_not_also_told_to_copy(compose):
     learner, batches = parts("cql", compose)
     assert {"loss_actor", "loss_qvalue", "loss_cql", "loss_alpha"} == {
         name for name in learner.terms_of(*batches).keys() if name.startswith("loss_")
@@ -140,13 +131,17 @@ def test_cql_s_policy_is_not_also_told_to_copy(compose):  # noqa: F811
 
 
 @pytest.mark.parametrize("name", OFFLINE)
-def test_a_method_that_learns_from_real_data_alone_simulates_nothing(compose, tmp_path, name, monkeypatch):  # noqa: F811
-    cfg, real = compose("updates=20", config="train")
+def test_a_method_that_learns_from_real_data_alone_has_no_simulator(compose, tmp_path, name, monkeypatch):
+    cfg, real = compose("updates=20", "keep=best_in_simulator", config="train")
     monkeypatch.delattr(HybridReplayBuffer, "extend")
-    train(METHODS[name].title, METHODS[name].make_learner, cfg, real, tmp_path)
+    monkeypatch.delattr("training.make_simulator")
+    policy, training = train(METHODS[name].title, METHODS[name].make_learner, cfg, real, tmp_path)
+    assert "return_sim" not in training.rows[-1]
+    kept = load_policy(cfg, tmp_path, METHODS[name].title)
+    torch.testing.assert_close(kept.state_dict(), policy.state_dict())
 
 
-def test_cql_s_loss_sees_actions_in_units_of_their_bounds_and_its_policy_acts_in_the_task_s(compose):  # noqa: F811
+def test_cql_s_loss_sees_actions_in_units_of_their_bounds_and_its_policy_acts_in_the_task_s(compose):
     learner, (batch,) = parts("cql", compose)
     asked = batch["action"].clone()
     learner.terms_of(batch)

@@ -12,15 +12,7 @@ from results_file import identity, read_rows
 from torchrl.checkpoint import CheckpointRotation
 from training import train
 
-from tests.recipes.test_h2o_plus_recipe import (  # noqa: F401  (fixtures)
-    ROBOT,
-    ROOT,
-    SMALL,
-    cache,
-    command,
-    compose,
-    trained,
-)
+from tests.recipes.small_runs import ROBOT, ROOT, SMALL, trained
 
 
 def chosen(runs, key):
@@ -85,7 +77,7 @@ def test_every_run_is_an_override_that_hydra_reads():
 GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
 
 
-def test_a_grid_that_is_killed_goes_on_where_it_was(command, compose, tmp_path):  # noqa: F811
+def test_a_grid_that_is_killed_goes_on_where_it_was(command, compose, tmp_path):
     asked = command(*GRID, "methods=[iql,cql]", "updates=200", script="paper.py")
     process = subprocess.Popen(**asked, text=True)
     while not (second := checkpoint_of(tmp_path, "cql")):
@@ -111,7 +103,7 @@ def checkpoint_of(folder, method):
     return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
 
 
-def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):  # noqa: F811
+def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):
     grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "backbone=huber", script="paper.py")
     done = subprocess.run(**grid, text=True, check=False)
     assert done.returncode != 0

@@ -1,78 +1,26 @@
 """A population as its user runs it: one command line, a folder a member, and each member what a single run is."""
 
-import csv
 import json
-import os
-import subprocess
-import sys
-import zipfile
-from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from environments import measure_observation_norm
 from h2o_plus import make_learner, run_population, train_h2o_plus
 from population_learner import PopulationLearner
 from population_training import PopulationTraining, members_of, train_population
-from real_data import read_real_data
-from run import seed_epoch
-from torchrl.checkpoint import CheckpointRotation
 from training import Trainee
 
-ROOT = Path(__file__).parents[2]
-SMALL = [
-    "updates=30",
-    "updates_per_epoch=10",
-    "steps_per_epoch=20",
-    "eval_every=1",
-    "checkpoint_every=1",
-    "eval_episodes=1",
-    "final_episodes=1",
-    "num_cells=[8,8]",
-    "batch_size=[8,8]",
-    "discriminator_batch_size=[8,8]",
-    "render=false",
-    "threads=1",
-    "env.make.max_episode_steps=40",
-    "env.recording.num_transitions=200",
-    "lr_end_factor=0.1",
-]
+from tests.recipes.small_runs import ROBOT, SMALL, rows, run, trained
 
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
+SMALLER = ["updates=30", "updates_per_epoch=10", "steps_per_epoch=20", "lr_end_factor=0.1", "keep=last"]
 
 
 @pytest.fixture
-def compose(cache, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-
-    def build(*overrides):
-        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            cfg = hydra.compose("h2o_plus", [*SMALL, *overrides])
-        real = read_real_data(cfg)
-        measure_observation_norm(cfg, real)
-        return cfg, real
-
-    return build
+def compose(compose):
+    return lambda *overrides: compose(*SMALLER, *overrides)
 
 
 def train(cfg, real, directory):
     return train_population(make_learner, cfg, members_of(cfg), real, directory)
-
-
-def rows(directory):
-    with open(directory / "metrics.csv") as file:
-        return list(csv.DictReader(file))
-
-
-def trained(directory):
-    """Every number of the last checkpoint, by the file that it stands in."""
-    latest = CheckpointRotation(directory / "checkpoints" / "h2o+", keep_last=1).latest()
-    with zipfile.ZipFile(latest) as archive:
-        return {name: archive.read(name) for name in archive.namelist() if name.startswith("components")}
 
 
 def assert_same_figures(some, others, tolerance):
@@ -122,10 +70,13 @@ def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path,
             raise KeyboardInterrupt
         log(self, epoch, member, **metrics)
 
+    closed, close = [], Trainee.close
+    monkeypatch.setattr("training.Trainee.close", lambda self: (closed.append(self.cfg.seed), close(self)))
     monkeypatch.setattr("population_training.PopulationTraining.log_member", interrupt)
     with pytest.raises(KeyboardInterrupt):
         train(cfg, real, tmp_path / "parts")
     monkeypatch.undo()
+    assert sorted(closed) == [0, 1]  # nobody's workers stay behind
     assert trained(tmp_path / "parts") != trained(tmp_path / "whole")
     train(cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
@@ -135,21 +86,15 @@ def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path,
 
 def break_seed_1(monkeypatch, at_epoch):
     """From some epoch on, what seed 1 simulates is no finite number."""
-    simulate = Trainee.simulate
-    started, simulated = {}, []
+    begin_epoch, simulated = Trainee.begin_epoch, []
 
-    def seed(run_seed, epoch, env):
-        started["epoch"] = epoch
-        seed_epoch(run_seed, epoch, env)
-
-    def broken(self):
-        simulate(self)
-        simulated.append((self.cfg.seed, started["epoch"]))
-        if self.cfg.seed == 1 and started["epoch"] >= at_epoch:
+    def broken(self, epoch):
+        begin_epoch(self, epoch)
+        simulated.append((self.cfg.seed, epoch))
+        if self.cfg.seed == 1 and epoch >= at_epoch:
             self.learner.replay.sim.storage[:]["next", "reward"].fill_(float("nan"))
 
-    monkeypatch.setattr("population_training.seed_epoch", seed)
-    monkeypatch.setattr("training.Trainee.simulate", broken)
+    monkeypatch.setattr("training.Trainee.begin_epoch", broken)
     return simulated
 
 
@@ -194,20 +139,16 @@ def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(com
     assert float(table["seed_0"])
 
 
-def test_one_command_leaves_a_folder_a_member_and_one_table(cache, tmp_path):
-    command = [sys.executable, str(ROOT / "recipes" / "h2o_plus.py"), *SMALL, "updates=10", "hydra.run.dir=out"]
-    env = os.environ | {"XDG_CACHE_HOME": str(cache), "OMP_NUM_THREADS": "1"}
-    options = {"env": env, "cwd": tmp_path, "capture_output": True, "text": True, "check": False}
-    done = subprocess.run([*command, "seeds=[0,1]", "gaps=[gravity]"], **options)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_one_command_leaves_a_folder_a_member_and_one_table(command, tmp_path):
+    small = [*SMALL, *ROBOT, *SMALLER, "updates=10", "hydra.run.dir=out"]
+    printed = run(command(*small, "seeds=[0,1]", "gaps=[gravity]"))
     for name, seed in (("seed_0_gravity", 0), ("seed_1_gravity", 1)):
         summary = json.loads((tmp_path / "out" / name / "summary.json").read_text())
         assert (summary["seed"], summary["gap"], summary["updates"]) == (seed, "gravity", 10)
         assert summary["return_real"].keys() >= {"mean", "std", "episodes"}
         assert (tmp_path / "out" / name / "learning_curve.png").stat().st_size > 10_000
-        assert name in done.stdout
-    assert "the data's behaviour" in done.stdout
+        assert name in printed
+    assert "the data's behaviour" in printed
 
-    evaluate = [sys.executable, str(ROOT / "recipes" / "evaluate.py"), "checkpoint=out/seed_1_gravity"]
-    replayed = subprocess.run([*evaluate, "episodes=1", "film=null"], **options)
-    assert "H2O+ in reality" in replayed.stdout, replayed.stderr
+    replayed = run(command("checkpoint=out/seed_1_gravity", "episodes=1", "film=null", script="evaluate.py"))
+    assert "H2O+ in reality" in replayed
