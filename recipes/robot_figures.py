@@ -1,6 +1,7 @@
 """The paper's Figures 3 and 4: how the wheel-legged robot moves in reality, and where it was in the simulator."""
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -64,11 +65,7 @@ def trajectory(cfg: DictConfig, folder: Path) -> list[dict[str, float]]:
         torch.manual_seed(SEED)
         env.set_seed(SEED)
         episode = run_episode(env, load_policy(cfg, folder, METHODS[cfg.method].title))
-    names = OBSERVATIONS[cfg.env.make.task]
-    state = episode["next", "observation"].flatten(0, -2)[:, -len(names) :].double()  # the last of stacked frames
-    if cfg.observation_norm is not None:
-        state = state * torch.tensor(list(cfg.observation_norm.scale)) + torch.tensor(list(cfg.observation_norm.loc))
-    values = state[:, names.index(SHOWN[cfg.env.make.task][0])].tolist()
+    values = _in_units(cfg, episode["next", "observation"].flatten(0, -2), SHOWN[cfg.env.make.task][:1])[:, 0].tolist()
     step = round(EVERY / cfg.env.seconds_per_step)
     kept = sorted({*range(step - 1, len(values), step), len(values) - 1})
     return [{"t": round((i + 1) * cfg.env.seconds_per_step, 3), "value": round(values[i], 4)} for i in kept]
@@ -123,11 +120,16 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     title = METHODS[cfg.method].title
     Checkpoint(replay=replay).load(CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest())
+    return _in_units(cfg, replay.sim[:]["observation"], ("theta", "theta_dot")).numpy()
+
+
+def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str]) -> torch.Tensor:
+    """Some dimensions of what a learner observed ``[N, n]``, of the last of its frames and in their own units."""
     names = OBSERVATIONS[cfg.env.make.task]
-    state = replay.sim[:]["observation"][:, -len(names) :].double()
+    last = observation[:, -len(names) :].double()
     if cfg.observation_norm is not None:
-        state = state * torch.tensor(list(cfg.observation_norm.scale)) + torch.tensor(list(cfg.observation_norm.loc))
-    return state[:, [names.index("theta"), names.index("theta_dot")]].numpy()
+        last = last * torch.tensor(list(cfg.observation_norm.scale)) + torch.tensor(list(cfg.observation_norm.loc))
+    return last[:, [names.index(name) for name in wanted]]
 
 
 def draw_diversity(path: Path, spreads: dict[tuple[str, str, int], np.ndarray]) -> None:
