@@ -33,7 +33,17 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         return losses.exclude("loss_actor_bc")  # the policy's loss where it is to copy the data: the other one's rival
 
     targets = SoftUpdate(loss, tau=cfg.tau)
-    return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [(sum(cfg.batch_size), 0)], terms_of)
+    sizes = [(sum(cfg.batch_size), 0)]
+    return Learner(
+        actor,
+        {"loss": loss},
+        adam(loss, lr=cfg.lr),
+        targets,
+        replay,
+        sizes,
+        terms_of,
+        pays_to_compile=False,  # thousands of actions an update: its time is in products
+    )
 
 
 CQL = Method("CQL", make_learner)

@@ -27,6 +27,7 @@ class Learner:
         batch_sizes: of the batches of one update, (real, simulated) rows each.
         terms_of: takes these batches; returns terms named ``loss_*``, to be added up, and figures to be logged.
         figures: takes the same batches; returns what is logged beside the losses, and costs too much at every update.
+        pays_to_compile: whether ``terms_of`` is faster once it is compiled.
         batches: those of the last update.
     """
 
@@ -38,6 +39,7 @@ class Learner:
     batch_sizes: Sequence[tuple[int, int]]
     terms_of: Callable[..., dict[str, torch.Tensor]]
     figures: Callable[..., dict[str, float]] = lambda *batches: {}
+    pays_to_compile: bool = True
     batches: list[TensorDictBase] = field(default_factory=list)
 
     def update(self) -> dict[str, torch.Tensor]:

@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 
 import torch
+from compiling import maybe_compiled
 from environments import as_observed
 from omegaconf import DictConfig, OmegaConf
 from population_learner import PopulationLearner
@@ -125,8 +126,7 @@ def train_population(
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)
     }
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    if cfg.get("compiled", False):
-        learner.losses_of = torch.compile(learner.losses_of)
+    learner.losses_of = maybe_compiled(cfg, learner.losses_of)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     training = PopulationTraining("H2O+", cfg, directory, **_components(trainees, learner), schedule=schedule)
     learner.updates = training.progress["epoch"] * cfg.updates_per_epoch

@@ -51,6 +51,8 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         raise ValueError(f"updates={cfg.updates}: train for at least one")
     if cfg.get("keep", "last") not in KEEP:
         raise ValueError(f"keep={cfg.keep}: choose {' or '.join(KEEP)}")
+    if cfg.get("compiled") not in (None, "auto", True, False):
+        raise ValueError(f"compiled={cfg.compiled}: choose auto, true or false")
     if cfg.gap is None and cfg.get("gaps") is None and cfg.gap_strength is not None:
         raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
     for key in ("data", "columns", "gap_fix"):  # a resumed run may start elsewhere

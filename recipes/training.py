@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from collection import collecting
+from compiling import maybe_compiled
 from environments import as_observed, learning_reward, make_reality, make_simulator
 from evaluation import evaluate
 from learner import Learner
@@ -143,8 +144,7 @@ def train(
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     trainee = Trainee(make_learner, cfg, replay)
     learner = trainee.learner
-    if cfg.get("compiled", False):  # a run of an earlier version says nothing of it
-        learner.terms_of = torch.compile(learner.terms_of)
+    learner.terms_of = maybe_compiled(cfg, learner.terms_of, pays=learner.pays_to_compile)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     training = Training(name, cfg, directory, **trainee.components, schedule=schedule)
     with closing(trainee):

@@ -174,6 +174,7 @@ class MixedBellmanLoss(HybridLoss):
         dtype = next(iter(self.qvalue_network_params.values(True, True))).dtype
         self.register_coeff_buffer("mixing", mixing, dtype=dtype)
         self.register_coeff_buffer("gamma", 0.99, dtype=dtype)
+        _ = self.vmap_randomness  # TorchRL settles it when it is first asked for: for a compiled loss, too late
         self.register_buffer("log_alpha", torch.tensor(math.log(alpha_init), dtype=dtype))
 
     def _hold_value_network(self, value_network: TensorDictModule | None) -> None:

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives.utils import _vmap_func
 
-from torchrl_h2o.objectives.relu_perceptron import relu_perceptron
+from torchrl_h2o.objectives.relu_perceptron import relu, relu_perceptron
 
 _ELEMENTWISE = (nn.ReLU, nn.Tanh, nn.ELU, nn.SiLU, nn.GELU, nn.Mish, nn.LeakyReLU, nn.Sigmoid, nn.Softplus, nn.Identity)
 _PLAIN = (TensorDictModule, ValueOperator)
@@ -138,21 +138,23 @@ def _perceptron(
 ) -> Tensor | tuple[Tensor, ...]:
     batch_size = x.shape[:-1]
     x = x.reshape(-1, x.shape[-1])
-    plain = torch.compiler.is_compiling() or torch.is_autocast_enabled(x.device.type)  # which see into layers
-    depth = 0 if plain else _depth_with_relu(layers)
+    compiling = torch.compiler.is_compiling()
+    layer_by_layer = compiling or torch.is_autocast_enabled(x.device.type)  # which see into layers
+    depth = 0 if layer_by_layer else _depth_with_relu(layers)
     if depth:
         linear = [_weight_and_bias(params, path, frozen) for path, _ in layers[: 2 * depth - 1 : 2]]
         x = relu_perceptron(x, *zip(*linear, strict=True))
         layers = layers[2 * depth - 1 :]
     for path, layer in layers:
         if type(layer) is not nn.Linear:
-            x = layer(x)
+            x = relu(x) if compiling and type(layer) is nn.ReLU else layer(x)
             continue
         weight, bias = _weight_and_bias(params, path, frozen)
         if weight.ndim == 2:
             x = F.linear(x, weight, bias)
         else:
-            x = x @ weight.mT if bias is None else x @ weight.mT + bias.unsqueeze(1)
+            x = x.expand(weight.shape[0], *x.shape[-2:])
+            x = torch.bmm(x, weight.mT) if bias is None else torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
     if isinstance(x, tuple):
         return tuple(part.reshape(*params.batch_size, *batch_size, part.shape[-1]) for part in x)
     return x.reshape(*params.batch_size, *batch_size, x.shape[-1])

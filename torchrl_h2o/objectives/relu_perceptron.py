@@ -96,3 +96,27 @@ class _ReluPerceptron(torch.autograd.Function):
             gradient = gradient @ weights[0]
             of_input = gradient if weights[0].ndim == 2 else gradient.sum(0)
         return of_input, *of_weights, *of_biases
+
+
+def relu(x: Tensor) -> Tensor:
+    """ReLU for compiled losses.
+
+    For PyTorch's own the compiler keeps a mask of booleans, which CPUs write a number at a time. This one's gradient
+    is masked by the sign of its output.
+    """
+    return _Relu.apply(x)
+
+
+class _Relu(torch.autograd.Function):
+    @staticmethod
+    def forward(x: Tensor) -> Tensor:
+        return x.relu()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(output)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (output,) = ctx.saved_tensors
+        return gradient * output.sign()
