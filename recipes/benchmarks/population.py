@@ -21,6 +21,7 @@ from collections.abc import Callable
 import h2o_plus
 import hydra
 import torch
+from compiling import compiled
 from hydra.core.hydra_config import HydraConfig
 from learner import Learner
 from omegaconf import DictConfig, OmegaConf
@@ -61,7 +62,7 @@ def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, 
         chosen["CUDA graph"] = captured(make_population(cfg, run, num_members))
     if num_members in cfg.compiled:
         learner = make_population(cfg, run, num_members)
-        learner.losses_of = torch.compile(learner.losses_of)
+        learner.losses_of = compiled(learner.losses_of)
         chosen["compiled"] = learner.update
         if on_gpu:
             chosen["compiled, CUDA graph"] = captured(learner)

@@ -23,6 +23,7 @@ import hydra
 import rlpd
 import sac
 import torch
+from compiling import compiled
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
@@ -81,11 +82,12 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
     replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
     replay.extend(some_transitions(cfg))
     what = (run, cfg.observation_dim, action_spec(cfg), replay)
-    chosen = {"textbook": textbook(cfg, run, replay), "ours": h2o_plus.make_learner(*what).update}
+    chosen = {"textbook": textbook(cfg, run, replay)}
     if cfg.compiled:
         learner = h2o_plus.make_learner(*what)
-        learner.terms_of = torch.compile(learner.terms_of)
-        chosen["ours, compiled"] = learner.update
+        learner.terms_of = compiled(learner.terms_of)
+        chosen["ours"] = learner.update
+    chosen["ours, not compiled"] = h2o_plus.make_learner(*what).update
     torchrl_sac = sac.make_learner(*what)
     torchrl_sac.batch_sizes = [run.batch_size]
     chosen["SAC, TorchRL's loss"] = torchrl_sac.update

@@ -99,6 +99,7 @@ def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(co
         (["gap_strength=2"], "belongs to a gap"),
         (["env=halfcheetah", "data=recorded"], "name a data set"),
         (["keep=best"], "choose last or best_in_simulator"),
+        (["compiled=maybe"], "choose auto, true or false"),
         (["resume=nowhere"], "not the folder of a run"),
     ],
 )
