@@ -126,7 +126,7 @@ def train_population(
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)
     }
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    learner.losses_of = maybe_compiled(cfg, learner.losses_of)
+    learner.losses_of = maybe_compiled(cfg, learner.losses_of, pays=False)  # on a CPU, stacked ones are slower so
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     training = PopulationTraining("H2O+", cfg, directory, **_components(trainees, learner), schedule=schedule)
     learner.updates = training.progress["epoch"] * cfg.updates_per_epoch
