@@ -41,7 +41,7 @@ class BatchedMujocoEnv(EnvBase):
         effects: more effects, for all worlds, or one list of them a world.
 
     Keyword Args:
-        num_threads: of ``mujoco.rollout``. As many as there are processors by default.
+        num_threads: of ``mujoco.rollout``, at most one a world. As many as there are processors by default.
 
     Attributes:
         states: (N, size), MuJoCo's full physics state of each world: time, positions, velocities, activations. May be
@@ -83,7 +83,8 @@ class BatchedMujocoEnv(EnvBase):
         self.physics_steps = self._task.frame_skip
         self._models = self._compiled(simulator)
         self._differ = len(set(self._effects)) > 1
-        self._pool = Rollout(nthread=num_threads or cpu_count())
+        threads = min(num_threads or cpu_count(), num_worlds)
+        self._pool = Rollout(nthread=threads if threads > 1 else 0)  # 0 is the caller's own
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
         self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], FULL_PHYSICS)))
         self._steps = np.zeros(num_worlds, dtype=np.int64)
