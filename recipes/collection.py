@@ -35,16 +35,16 @@ def check_collector(cfg: DictConfig) -> None:
 
     Raises:
         ModuleNotFoundError: for Ray's workers without Ray.
-        ValueError: for workers that cannot share an epoch's steps alike.
+        ValueError: for workers and worlds that cannot share an epoch's steps alike.
     """
     chosen = _chosen(cfg)
     if chosen.backend == "ray" and find_spec("ray") is None:
         raise ModuleNotFoundError("collector=ray needs Ray: pip install 'torchrl_h2o[ray]', here and where workers run")
     workers = chosen.get("workers", 1)
-    if workers < 1 or cfg.steps_per_epoch % workers:
+    if workers < 1 or cfg.num_worlds < 1 or cfg.steps_per_epoch % (workers * cfg.num_worlds):
         raise ValueError(
-            f"collector.workers={workers}: workers share the steps of an epoch alike; choose a divisor of "
-            f"steps_per_epoch={cfg.steps_per_epoch}"
+            f"collector.workers={workers} num_worlds={cfg.num_worlds}: all worlds of all workers share the steps of an "
+            f"epoch alike; choose so many that steps_per_epoch={cfg.steps_per_epoch} is a multiple of them"
         )
 
 

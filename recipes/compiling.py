@@ -3,10 +3,12 @@
 It takes half a minute. After that an update takes 4 to 10 ms less, mostly of Python, and draws the same random numbers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torch import Tensor
 from torch._dynamo.exc import TorchDynamoException
 from tqdm import tqdm
 
@@ -26,8 +28,8 @@ def maybe_compiled(cfg: DictConfig, losses_of: Callable, *, pays: bool = True) -
     """
     chosen = cfg.get("compiled", False)  # a run of an earlier version says nothing of it
     if chosen == "auto":
-        return _compiled_if_possible(losses_of) if pays and cfg.updates >= PAYS_FROM else losses_of
-    return compiled(losses_of) if chosen else losses_of
+        chosen = pays and cfg.updates >= PAYS_FROM
+    return _Announced(losses_of, needed=cfg.compiled is True) if chosen else losses_of
 
 
 def compiled(losses_of: Callable) -> Callable:
@@ -35,21 +37,23 @@ def compiled(losses_of: Callable) -> Callable:
     return torch.compile(losses_of, options={"fallback_random": True})
 
 
-def _compiled_if_possible(losses_of: Callable) -> Callable:
-    chosen = compiled(losses_of)
-    is_first = True
+class _Announced:
+    """Compiled losses that say what takes so long; where it cannot be done, and need not, the losses as they are."""
 
-    def call(*batches):
-        nonlocal chosen, is_first
-        if not is_first:
-            return chosen(*batches)
-        is_first = False
-        try:
-            return chosen(*batches)
-        except TorchDynamoException as error:  # such as no C++ compiler, or one without Python's headers
-            reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-            tqdm.write(f"the losses cannot be compiled here, and are slower as they are: {reason}")
-            chosen = losses_of
-            return chosen(*batches)
+    def __init__(self, losses_of: Callable, needed: bool) -> None:
+        self._plain, self._chosen = losses_of, compiled(losses_of)
+        self._needed, self._is_first = needed, True
 
-    return call
+    def __call__(self, *batches: TensorDictBase) -> Mapping[str, Tensor]:
+        if self._is_first:
+            self._is_first = False
+            tqdm.write("compiling the losses, about half a minute (compiled=false does without)")
+            try:
+                return self._chosen(*batches)
+            except TorchDynamoException as error:  # such as no C++ compiler, or one without Python's headers
+                if self._needed:
+                    raise
+                reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+                tqdm.write(f"they cannot be compiled here, and are slower as they are: {reason}")
+                self._chosen = self._plain
+        return self._chosen(*batches)

@@ -95,9 +95,14 @@ def test_an_epoch_is_drawn_from_its_seed_and_the_weights_that_were_sent(compose,
     assert not ray.is_initialized()
 
 
-def test_workers_that_cannot_share_an_epoch_are_refused(compose):
-    with pytest.raises(ValueError, match=r"workers=3.*divisor of steps_per_epoch=40"):
-        check_collector(compose("collector=multi_sync", "collector.workers=3")[0])
+@pytest.mark.parametrize(("workers", "worlds"), [(3, 4), (4, 4), (4, 3), (0, 4), (2, 0)])
+def test_workers_and_worlds_that_cannot_share_an_epoch_are_refused(compose, workers, worlds):
+    with pytest.raises(ValueError, match=rf"workers={workers} num_worlds={worlds}.*steps_per_epoch=40"):
+        check_collector(compose("collector=multi_sync", f"collector.workers={workers}", f"num_worlds={worlds}")[0])
+
+
+def test_workers_and_worlds_that_can_share_an_epoch_are_taken(compose):
+    check_collector(compose("collector=multi_sync", "collector.workers=2", "num_worlds=4")[0])
 
 
 def test_ray_that_is_not_installed_is_named_with_what_to_do(compose, monkeypatch):

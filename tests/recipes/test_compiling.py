@@ -44,16 +44,30 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     assert not counters["graph_break"]
 
 
-def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, monkeypatch, capsys):
-    cfg, real = compose("compiled=auto", f"updates={PAYS_FROM}")
-    expected = updated(learner_of(cfg, real))
+@pytest.fixture
+def no_compiler(monkeypatch):
     torch._dynamo.reset()
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", ("no-such-compiler",))
     monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, capsys):
+    cfg, real = compose("compiled=auto", f"updates={PAYS_FROM}")
+    expected = updated(learner_of(cfg, real))
     learner = learner_of(cfg, real)
     learner.terms_of = maybe_compiled(cfg, learner.terms_of)
     torch.testing.assert_close(updated(learner), expected, rtol=0.0, atol=0.0)
     assert capsys.readouterr().out.count("cannot be compiled here") == 1
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_where_compiled_losses_are_asked_for_it_is_an_error_that_there_can_be_none(compose):
+    cfg, real = compose("compiled=true")
+    learner = learner_of(cfg, real)
+    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    with pytest.raises(RuntimeError, match="compiler"):
+        learner.update()
 
 
 @pytest.mark.parametrize(
