@@ -45,10 +45,10 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
 
 
 @pytest.fixture
-def no_compiler(monkeypatch):
+def no_compiler():
     torch._dynamo.reset()
-    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", ("no-such-compiler",))
-    monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
+    with torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",), "force_disable_caches": True}):
+        yield
 
 
 @pytest.mark.usefixtures("no_compiler")
