@@ -14,7 +14,14 @@ from torchrl_h2o.envs.wheel_legged import MAX_PITCH
 
 
 def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, tmp_path):
-    cfg, _ = compose("method=h2o_plus", "updates=20", "frames=2", "env.make.max_episode_steps=300", config="train")
+    cfg, _ = compose(
+        "method=h2o_plus",
+        "updates=20",
+        "frames=2",
+        "num_worlds=1",
+        "env.make.max_episode_steps=300",
+        config="train",
+    )
     folder = tmp_path / "runs" / "one"
     folder.mkdir(parents=True)
     run_job(cfg, folder, [METHODS["h2o_plus"]])
