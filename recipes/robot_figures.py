@@ -96,7 +96,14 @@ def draw_trajectories(path: Path, rows: list[dict]) -> None:
         axis.set_ylim(-2.5, 2.5)
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
-    axes[0, -1].legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
+    told = {}  # of all panels: a method may not have done every task yet
+    for axis in axes.flat:
+        handles, labels = axis.get_legend_handles_labels()
+        told |= dict(zip(labels, handles, strict=True))
+    first = [METHODS[name].title for name in METHODS]
+    labels = sorted(told, key=lambda label: first.index(label) if label in first else len(first))
+    beside = {"loc": "upper left", "bbox_to_anchor": (1, 1)}
+    axes[0, -1].legend([told[label] for label in labels], labels, frameon=False, **beside)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
