@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 from population_training import members_of, train_population
 from real_data import behaviour_in
 from results import print_population
-from run import Training, open_run
+from run import Training, claimed, open_run
 from sac import SAC
 from tensordict import TensorDictBase
 from torch.nn.functional import pad
@@ -121,7 +121,7 @@ def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
 def main(cfg: DictConfig) -> None:
     cfg, directory = open_run(cfg)
     make_value_loss(cfg, observation_dim=1)  # a backbone that there is not: said before the data are read
-    with resumable(directory):
+    with claimed(directory), resumable(directory):
         if members := members_of(cfg):
             run_population(cfg, members, directory)
         else:

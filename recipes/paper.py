@@ -13,7 +13,7 @@ import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from run import open_run
+from run import claimed, open_run
 from train import train_and_record
 
 
@@ -22,7 +22,8 @@ def main(cfg: DictConfig) -> None:
     """One run of the grid; the sweeper, hydra_plugins/paper_grid.py, has chosen it."""
     cfg.overrides = list(HydraConfig.get().overrides.task)
     cfg, directory = open_run(cfg, go_on=True)
-    train_and_record(cfg, directory)
+    with claimed(directory):
+        train_and_record(cfg, directory)
 
 
 if __name__ == "__main__":

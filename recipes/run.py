@@ -11,10 +11,12 @@ import shlex
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
+from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
@@ -60,6 +62,22 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
             cfg[key] = str(Path(cfg[key]).resolve())
     save_config(cfg, directory)
     return _opened(cfg, directory)
+
+
+@contextmanager
+def claimed(directory: Path) -> Iterator[None]:
+    """Keeps other processes out of a run's folder; one that ends, however it does, leaves it free.
+
+    Raises:
+        RuntimeError: if another process is at work in it.
+    """
+    try:
+        with FileLock(directory / "run.lock", blocking=False):
+            yield
+    except Timeout:
+        raise RuntimeError(
+            f"another process is at work in {os.path.relpath(directory)}: wait for it, or end it"
+        ) from None
 
 
 def _opened(cfg: DictConfig, directory: Path) -> tuple[DictConfig, Path]:

@@ -18,7 +18,7 @@ from methods import method_named
 from omegaconf import DictConfig, OmegaConf
 from population_training import members_of
 from results_file import append_run
-from run import open_run
+from run import claimed, open_run
 
 
 @hydra.main(config_path="config", config_name="train", version_base=None)
@@ -28,7 +28,7 @@ def main(cfg: DictConfig) -> None:
     if members_of(cfg):
         raise ValueError("populations are h2o_plus.py's; here: --multirun seed=0,1 gap=gravity,friction")
     cfg, directory = open_run(cfg)
-    with resumable(directory):
+    with claimed(directory), resumable(directory):
         train_and_record(cfg, directory)
 
 

@@ -1,5 +1,6 @@
 """The paper's grids: which runs they hold, and that a grid loses nothing when it is killed or when a run dies."""
 
+import signal
 import subprocess
 from collections import Counter
 
@@ -77,11 +78,16 @@ def test_every_run_is_an_override_that_hydra_reads():
 GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
 
 
-def test_a_grid_that_is_killed_goes_on_where_it_was(command, compose, tmp_path):
+def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_killed(command, compose, tmp_path):
     asked = command(*GRID, "methods=[iql,cql]", "updates=200", script="paper.py")
     process = subprocess.Popen(**asked, text=True)
     while not (second := checkpoint_of(tmp_path, "cql")):
         assert process.poll() is None, process.communicate()[0]
+    process.send_signal(signal.SIGSTOP)  # as good as at work, for as long as we need
+    beside = subprocess.run(**command(*GRID, "methods=[cql]", "updates=200", "retries=0", script="paper.py"), text=True)
+    assert beside.returncode != 0
+    assert "RuntimeError: another process is at work in outputs/paper/results/cql__" in beside.stdout
+
     process.kill()
     process.communicate()
     assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
