@@ -41,13 +41,13 @@ class _Announced:
     """Compiled losses that say what takes so long; where it cannot be done, and need not, the losses as they are."""
 
     def __init__(self, losses_of: Callable, needed: bool) -> None:
-        self._plain, self._chosen = losses_of, compiled(losses_of)
-        self._needed, self._is_first = needed, True
+        self._plain, self._needed = losses_of, needed
+        self._chosen: Callable | None = None  # until the first call
 
     def __call__(self, *batches: TensorDictBase) -> Mapping[str, Tensor]:
-        if self._is_first:
-            self._is_first = False
+        if self._chosen is None:
             tqdm.write("compiling the losses, about half a minute (compiled=false does without)")
+            self._chosen = compiled(self._plain)
             try:
                 return self._chosen(*batches)
             except TorchDynamoException as error:  # such as no C++ compiler, or one without Python's headers
