@@ -42,9 +42,13 @@ class Learner:
     pays_to_compile: bool = True
     batches: list[TensorDictBase] = field(default_factory=list)
 
+    def sample(self) -> list[TensorDictBase]:
+        """The batches of one update."""
+        return [self.replay.sample(size) for size in self.batch_sizes]
+
     def update(self) -> dict[str, torch.Tensor]:
         """One update of everything; returns what ``terms_of`` did."""
-        self.batches = [self.replay.sample(size) for size in self.batch_sizes]
+        self.batches = self.sample()
         losses = self.terms_of(*self.batches)
         self.optimiser.zero_grad()
         total_loss(losses).backward()

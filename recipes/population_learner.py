@@ -82,9 +82,13 @@ class PopulationLearner:
             why = f"{' and '.join(bad) or 'its parameters'} not finite"
             self.failures.setdefault(number, {"updates": self.updates, "why": why})
 
+    def sample(self) -> list[TensorDictBase]:
+        """The batches of one update of all members, ``[N, B]`` each."""
+        return [self.replay.sample(size, self.generators) for size in self.learners[0].batch_sizes]
+
     def _draw(self) -> None:
         """The members' batches, ``[N, B]``, with the noise of a forward on them."""
-        self._batches = [self.replay.sample(size, self.generators) for size in self.learners[0].batch_sizes]
+        self._batches = self.sample()
         if self.generators is None:
             noise = self.learners[0].terms_of.draw_noise(*self._batches)
         else:

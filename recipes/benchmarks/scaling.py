@@ -1,4 +1,4 @@
-"""Measures how the cost of an update grows: seconds and memory against buffer, batch and width.
+"""Measures how the cost of an update grows: seconds and memory against buffer, batch, width and population.
 
 python recipes/benchmarks/scaling.py                       # three minutes; up to ten million transitions
 python recipes/benchmarks/scaling.py buffer_sizes=[100_000,100_000_000] scratch=/data
@@ -18,7 +18,6 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from tempfile import TemporaryDirectory
 
 import h2o_plus
@@ -28,6 +27,8 @@ from hydra.core.hydra_config import HydraConfig
 from learner import Learner
 from memory import held, room_in_memory, room_on_disk, taken_by
 from omegaconf import DictConfig, OmegaConf
+from population import make_population
+from population_learner import PopulationLearner
 from scaling_figure import draw_scaling
 from tensordict import TensorDict
 from tqdm import tqdm
@@ -42,7 +43,7 @@ class Cost:
     """What an update costs.
 
     Args:
-        grows: buffer, batch (rows of a stream) or width (of a hidden layer).
+        grows: buffer, batch (rows of a stream), width (of a hidden layer) or population (runs).
         size: of what grows.
         storage: where simulated transitions are.
         memory: bytes that a buffer holds, without mapped files; of what else grows, what a first update takes at its
@@ -95,6 +96,7 @@ def larger_buffers(cfg: DictConfig, run: DictConfig, real: TensorDict, scratch: 
 def larger_learners(cfg: DictConfig, run: DictConfig, real: TensorDict) -> Iterator[tuple[Cost, Learner]]:
     """Learners with batches, or networks, that grow, on one buffer."""
     replay = fill(real, cfg.transitions, cfg.device)
+    make_learner(cfg, run, replay).update()  # takes what only a process's first one does
     batches = {size: {"batch_size": [size] * 2, "discriminator_batch_size": [2 * size] * 2} for size in cfg.batch_sizes}
     widths = {width: {"num_cells": [width] * 2} for width in cfg.widths}
     for grows, choices in {"batch": batches, "width": widths}.items():
@@ -103,19 +105,25 @@ def larger_learners(cfg: DictConfig, run: DictConfig, real: TensorDict) -> Itera
             yield Cost(grows, size, "in memory", taken_by(learner.update, cfg.device)), learner
 
 
-def sample(learner: Learner) -> list[TensorDict]:
-    """The batches of one update."""
-    return [learner.replay.sample(size) for size in learner.batch_sizes]
+def larger_populations(cfg: DictConfig, run: DictConfig) -> Iterator[tuple[Cost, PopulationLearner]]:
+    """Populations that grow, each member with a buffer of its own."""
+    for size in cfg.populations:
+        learner = make_population(cfg, run, size)
+        yield Cost("population", size, "in memory", taken_by(learner.update, cfg.device)), learner
 
 
 def measure(cfg: DictConfig, run: DictConfig, scratch: str) -> list[Cost]:
     """Seconds and memory of each contender."""
     real = some_transitions(cfg)
-    contenders = [*larger_buffers(cfg, run, real, scratch), *larger_learners(cfg, run, real)]
+    contenders = [
+        *larger_buffers(cfg, run, real, scratch),
+        *larger_learners(cfg, run, real),
+        *larger_populations(cfg, run),
+    ]
     functions = {}
     for cost, learner in contenders:
         functions[f"update, {cost}"] = learner.update
-        functions[f"sample, {cost}"] = partial(sample, learner)
+        functions[f"sample, {cost}"] = learner.sample
     rates = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device)
     return [
         replace(cost, seconds_per_update=1 / rates[f"update, {cost}"], seconds_per_sample=1 / rates[f"sample, {cost}"])

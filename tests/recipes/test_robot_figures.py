@@ -3,12 +3,13 @@
 import json
 import math
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from job import run_job
 from methods import METHODS
 from results_file import read_rows
-from robot_figures import draw_robot, simulated_states, spread_entropy
+from robot_figures import draw_robot, draw_trajectories, simulated_states, spread_entropy
 
 from torchrl_h2o.envs.wheel_legged import MAX_PITCH
 
@@ -40,6 +41,20 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     assert 0.05 < abs(pitch).max() < 1.5 * MAX_PITCH  # and where they end
     for name in ("wheel_legged_trajectories.png", "wheel_legged_diversity.png"):
         assert (tmp_path / name).stat().st_size > 10_000
+
+
+def test_the_legend_names_the_methods_of_both_panels_once(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    done = [("standing_still", "sac"), ("standing_still", "h2o"), ("moving_forward", "iql"), ("moving_forward", "sac")]
+    rows = [
+        {"task": task, "method": method, "seed": 0, "updates": 20, "t": t, "value": 0.1}
+        for task, method in done
+        for t in (0.0, 29.95)
+    ]
+    draw_trajectories(tmp_path / "drawn.png", rows)
+    (legend,) = (axis.get_legend() for axis in figures[0].axes if axis.get_legend())
+    assert [text.get_text() for text in legend.get_texts()] == [*(METHODS[name].title for name in ("sac", "iql", "h2o")), "target"]
 
 
 def test_entropy_counts_the_cells_that_are_filled_evenly():

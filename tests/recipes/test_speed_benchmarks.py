@@ -57,14 +57,19 @@ def test_a_population_s_updates_are_set_beside_a_single_run_s(tmp_path):
 def test_costs_are_told_for_all_that_grows_and_mapped_buffers_leave_nothing(tmp_path):
     (tmp_path / "scratch").mkdir()
     small = ["transitions=1000", "buffer_sizes=[500,20000,1000000000000]", "batch_sizes=[8,16]", "widths=[8,512]"]
+    small.append("populations=[1,4]")
     out = run("scaling.py", tmp_path, "seconds=0.01", "turns=1", "threads=1", f"scratch={tmp_path / 'scratch'}", *small)
     costs = json.loads((tmp_path / "scaling.json").read_text())["costs"]
     buffers = [(cost["size"], cost["storage"]) for cost in costs if cost["grows"] == "buffer"]
     assert buffers == [(size, where) for size in (500, 20_000) for where in ("in memory", "memory-mapped")]
-    assert [cost["size"] for cost in costs if cost["grows"] != "buffer"] == [8, 16, 8, 512]
+    others = [(cost["grows"], cost["size"]) for cost in costs if cost["grows"] != "buffer"]
+    assert others == [("batch", 8), ("batch", 16), ("width", 8), ("width", 512), ("population", 1), ("population", 4)]
     assert all(0.0 < cost["seconds_per_sample"] < cost["seconds_per_update"] for cost in costs)
     narrow, wide = (cost["memory"] for cost in costs if cost["grows"] == "width")
     assert wide > narrow + 10_000_000  # five networks of 0.28 million weights: gradients, and Adam's two moments
+    alone, stacked = (cost for cost in costs if cost["grows"] == "population")
+    assert stacked["memory"] > alone["memory"] + 10_000_000  # three members' gradients, moments and activations more
+    assert stacked["seconds_per_update"] > alone["seconds_per_update"]
     assert "ms a sample" in out
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
     assert not list((tmp_path / "scratch").iterdir())
