@@ -54,7 +54,8 @@ def test_the_legend_names_the_methods_of_both_panels_once(tmp_path, monkeypatch)
     ]
     draw_trajectories(tmp_path / "drawn.png", rows)
     (legend,) = (axis.get_legend() for axis in figures[0].axes if axis.get_legend())
-    assert [text.get_text() for text in legend.get_texts()] == [*(METHODS[name].title for name in ("sac", "iql", "h2o")), "target"]
+    expected = [METHODS[name].title for name in ("sac", "iql", "h2o")]
+    assert [text.get_text() for text in legend.get_texts()] == [*expected, "target"]
 
 
 def test_entropy_counts_the_cells_that_are_filled_evenly():
