@@ -10,7 +10,7 @@ import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 from pathlib import Path
 
 import hydra
-from aggregates import BASE, common_scores, improvements, interquartile_means
+from aggregates import BASE, Scores, common_scores, improvements, interquartile_means
 from methods import METHODS
 from omegaconf import DictConfig
 from report_figures import draw_aggregates, draw_curves
@@ -56,12 +56,8 @@ def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> N
     )
     lines.append(f"After {int(rows[0]['updates']):,} updates. The paper's: five seeds, 1,000,000 updates.")
     scores = common_scores(table)
-    if len(scores.by_method) > 1 and scores.seeds and all(task[0] in REFERENCES for task in scores.tasks):
-        means = interquartile_means(scores, reps)
-        better = improvements(scores, reps) if BASE in scores.by_method else {}
-        note = f"{len(scores.tasks)} tasks, seeds {', '.join(map(str, scores.seeds))}; 95 % bootstrap intervals"
-        draw_aggregates(to / f"{group}_aggregates.png", means, better, TITLES, note)
-        lines += ["", aggregate_table(means, better), "", note[0].upper() + note[1:] + "."]
+    if len(scores.by_method) > 1 and all(task[0] in REFERENCES for task in scores.tasks):
+        lines += ["", *aggregate_lines(group, scores, to, reps)]
     text = "\n".join(lines) + "\n"
     to.mkdir(parents=True, exist_ok=True)
     (to / f"{group}.md").write_text(text)
@@ -70,6 +66,18 @@ def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> N
     curves = [row for row in read_rows(curves_of(results / f"{group}.csv")) if row["updates"] in budget]
     if curves:
         draw_curves(to / f"{group}_curves.png", placed(curves, variants), TITLES)
+
+
+def aggregate_lines(group: str, scores: Scores, to: Path, reps: int) -> list[str]:
+    """What the methods come to over all tasks, drawn too; of one seed, whose intervals would have no width, nothing."""
+    if len(scores.seeds) < 2:
+        return ["Interquartile means and their intervals take two seeds of every method, or more."]
+    means = interquartile_means(scores, reps)
+    better = improvements(scores, reps) if BASE in scores.by_method else {}
+    number = f"{len(scores.tasks)} task{'s' * (len(scores.tasks) > 1)}"
+    note = f"{number}, seeds {', '.join(map(str, scores.seeds))}; 95 % bootstrap intervals"
+    draw_aggregates(to / f"{group}_aggregates.png", means, better, TITLES, note)
+    return [aggregate_table(means, better), "", f"{note}."]
 
 
 def aggregate_table(means: dict, better: dict) -> str:

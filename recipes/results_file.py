@@ -26,7 +26,7 @@ RESULT = (
     "command",
 )
 #: overrides that other columns tell of, or that change no number
-TOLD = {*IDENTITY, "gap_strength", "results", "folder", "resume", "render", "threads", "compiled"}
+TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
 #: overrides of paper.py, which choose among runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "seeds", "retries"}
 EVALUATED = {"mean": "return_real", "std": "return_real_std"}

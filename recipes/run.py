@@ -8,6 +8,7 @@ import csv
 import json
 import os
 import shlex
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -205,7 +206,16 @@ def write_metrics(directory: Path, method: str, rows: list[dict]) -> None:
 def write_summary(directory: Path, summary: dict) -> None:
     """summary.json, with the versions and the command that made it."""
     summary = summary | {
-        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}},
+        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
         "command": shlex.join(["python", *sys.argv]),
     }
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _commit() -> dict[str, str]:
+    """The commit of the recipes, where they are in a repository."""
+    asked = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        return {"commit": subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()}
+    except (OSError, subprocess.CalledProcessError):
+        return {}

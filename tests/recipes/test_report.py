@@ -120,6 +120,15 @@ def test_one_command_makes_tables_and_pictures(tmp_path):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+def test_one_seed_has_no_intervals(tmp_path):
+    write(tmp_path / "returns.csv", [r for r in fixture() if r["seed"] == "0"])
+    command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "take two seeds" in (tmp_path / "returns.md").read_text()
+    assert not (tmp_path / "returns_aggregates.png").exists()
+
+
 def test_runs_of_several_budgets_are_not_set_beside_each_other(tmp_path):
     write(tmp_path / "returns.csv", [row("sac", 0, 1), row("sac", 1, 1, updates="2000")])
     command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}"]
