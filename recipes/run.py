@@ -213,9 +213,12 @@ def write_summary(directory: Path, summary: dict) -> None:
 
 
 def _commit() -> dict[str, str]:
-    """The commit of the recipes, where they are in a repository."""
-    asked = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
+    """The commit of the recipes, where they are in a repository; results that runs append to do not make it dirty."""
+    git = ["git", "-C", str(Path(__file__).parent)]
     try:
-        return {"commit": subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()}
+        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return {}
+    unchanged = [*git, "diff", "--quiet", "HEAD", "--", ":/", ":(exclude,top)recipes/results"]
+    dirty = "-dirty" * (subprocess.run(unchanged, check=False).returncode != 0)
+    return {"commit": commit.stdout.strip() + dirty}
