@@ -1,6 +1,7 @@
 """TD3 on real and simulated rows, the simulated ones weighed by the dynamics ratio: TorchRL's loss, weighted by ours.
 
-The policy is the other methods': TD3 reads its mean, and explores in the simulator with the spread it starts with.
+The Bellman error alone is weighed. The policy is the other methods': TD3 reads its mean, and explores in the simulator
+with the spread it starts with. It is updated at every step, not at every second one.
 """
 
 from learner import Learner, adam, make_networks
@@ -20,7 +21,8 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
     td3 = TD3Loss(actor, qvalues, action_spec=action_spec, loss_function="l2", reduction="none")
     td3.make_value_estimator(gamma=cfg.gamma)
-    loss, ratio_loss = ImportanceWeightedLoss(td3), DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    loss = ImportanceWeightedLoss(td3, terms=["loss_qvalue"])
+    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
 
     def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict:
         ratio_losses = ratio_loss(pairs)

@@ -82,6 +82,21 @@ def test_real_rows_keep_weight_one(batch):
     torch.testing.assert_close(weighted, torch.where(batch["real"], terms, 0.0))
 
 
+def test_terms_that_are_not_named_are_reduced_as_they_are(batch):
+    inner = iql(Parts())
+    batch["dynamics_ratio"] = torch.linspace(0.0, 2.0, batch.shape[0], dtype=torch.float64)
+    plain = inner(batch.copy())
+    named = ImportanceWeightedLoss(inner, terms=["loss_qvalue"])(batch)
+    every = ImportanceWeightedLoss(inner)(batch)
+    assert set(named.keys()) == set(every.keys())
+    torch.testing.assert_close(named["loss_qvalue"], every["loss_qvalue"])
+    for key in ("loss_actor", "loss_value"):
+        torch.testing.assert_close(named[key], plain[key].mean())
+        assert not torch.allclose(named[key], every[key])
+    with pytest.raises(ValueError, match="has no loss_q to weigh, but loss_actor"):
+        ImportanceWeightedLoss(inner, terms=["loss_q"])
+
+
 def test_weights_of_one_are_the_loss_itself(batch):
     parts = Parts()
     batch["dynamics_ratio"] = torch.ones(batch.shape[0], 1, dtype=torch.float64)

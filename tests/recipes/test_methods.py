@@ -111,7 +111,11 @@ def test_darc_learns_from_corrected_rewards(compose):
     learner, (batch, pairs) = parts("darc", compose)
     task_s = batch["next", "reward"].clone()
     learner.terms_of(batch, pairs)
-    assert (batch["next", "reward"] != task_s).all()
+    log_ratio = learner.losses["ratio_loss"].estimator(batch.clone())["log_dynamics_ratio"]
+    scale = compose("method=darc", config="train")[0].reward_scale
+    assert scale != 1.0
+    # Δr of DARC's Eq. (1): log p_reality − log p_simulator, in the scale of the task's own reward
+    torch.testing.assert_close(batch["next", "reward"].squeeze(-1), task_s.squeeze(-1) + scale * log_ratio)
 
 
 def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):

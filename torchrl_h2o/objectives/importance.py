@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -17,7 +17,7 @@ class ImportanceWeightedLoss(LossWrapper):
     """A TorchRL loss with every row's terms multiplied by a weight found in the batch.
 
     If the batch has ``real``, rows marked True keep weight 1, as in Eq. (8): measured rows need no correction. Only
-    the ``loss_*`` terms are weighted, and the weights are constants. ``SoftUpdate`` works on it as on the loss inside.
+    ``loss_*`` terms are weighted, and the weights are constants. ``SoftUpdate`` works on it as on the loss inside.
 
     Args:
         loss (LossModule): built with ``reduction="none"`` (TorchRL's SACLoss and IQLLoss also want
@@ -25,11 +25,13 @@ class ImportanceWeightedLoss(LossWrapper):
         key (NestedKey, optional): the weights, ``[*B]`` or ``[*B, 1]``. Defaults to ``"dynamics_ratio"``.
 
     Keyword Args:
+        terms (sequence of str, optional): those that are weighted, such as ``["loss_qvalue"]`` for the Bellman error
+            alone. Defaults to every ``loss_*`` term.
         reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"`` of the weighted terms over all rows.
             Defaults to ``"mean"``.
 
     Raises:
-        ValueError: if the loss inside reduces its terms already.
+        ValueError: if the loss inside reduces its terms already, or has none of a name in ``terms``.
         KeyError: if the batch has no weights.
 
     Source:
@@ -52,7 +54,14 @@ class ImportanceWeightedLoss(LossWrapper):
         >>> loss(batch)["loss_qvalue"].backward()
     """
 
-    def __init__(self, loss: LossModule, key: NestedKey = "dynamics_ratio", *, reduction: str = "mean") -> None:
+    def __init__(
+        self,
+        loss: LossModule,
+        key: NestedKey = "dynamics_ratio",
+        *,
+        terms: Sequence[str] | None = None,
+        reduction: str = "mean",
+    ) -> None:
         super().__init__(loss, reduction=reduction)
         if getattr(loss, "reduction", None) != "none":
             raise ValueError(
@@ -60,6 +69,10 @@ class ImportanceWeightedLoss(LossWrapper):
                 "weighted: build it with reduction='none'."
             )
         self.key = key
+        there = self._written_keys()
+        self.terms = tuple(there if terms is None else terms)
+        if unknown := set(self.terms) - set(there):
+            raise ValueError(f"{type(loss).__name__} has no {', '.join(unknown)} to weigh, but {', '.join(there)}")
 
     def _read_keys(self) -> Iterable[NestedKey]:
         return *self.loss.in_keys, self.key
@@ -72,12 +85,10 @@ class ImportanceWeightedLoss(LossWrapper):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        terms = self.loss(tensordict)
+        terms = self.loss(tensordict).select(*self._written_keys())
         weights = self._weights(tensordict)
-        return self._output(
-            {key: self._reduce_loss(_scale(terms.get(key), weights), tensordict) for key in self._written_keys()},
-            tensordict,
-        )
+        weighted = {key: _scale(value, weights) if key in self.terms else value for key, value in terms.items()}
+        return self._output({key: self._reduce_loss(value, tensordict) for key, value in weighted.items()}, tensordict)
 
     def _weights(self, tensordict: TensorDictBase) -> Tensor:
         weights = tensordict.get(self.key, None)
