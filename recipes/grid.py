@@ -4,7 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
 
+from methods import METHODS
 from omegaconf import DictConfig
+from results_file import key_of
 
 from torchrl_h2o.effects import PAPER_GAPS
 
@@ -94,7 +96,37 @@ def group_name(cfg: DictConfig) -> str:
 
 
 def chosen_grid(cfg: DictConfig) -> Grid:
-    """The grid that was asked for, with the choices of the command line in the place of the paper's."""
-    grid = (TABLES | FIGURES)[group_name(cfg)]
-    chosen = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
-    return Grid(**{**vars(grid), **{key: tuple(value) for key, value in chosen.items()}})
+    """The grid that was asked for, with the choices of the command line in the place of the paper's.
+
+    Raises:
+        ValueError: for a choice that there is not, or that these runs would not read.
+    """
+    name = group_name(cfg)
+    asked = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks")}
+    chosen = {key: tuple(value) for key, value in asked.items() if value is not None}
+    there = {"methods": METHODS, "gaps": PAPER_GAPS}
+    for key, names in there.items():
+        for unknown in set(chosen.get(key, ())) - set(names):
+            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}")
+    for data in chosen.get("datasets", ()):
+        if data.partition("/")[0] not in ENVS:
+            raise ValueError(f"datasets=[{data}]: its environment is none of {', '.join(ENVS)}")
+    grid = Grid(**(vars((TABLES | FIGURES)[name]) | chosen))
+    if not grid.datasets and (idle := [key for key in ("gaps", "strengths") if key in chosen]):
+        raise ValueError(f"{name} has no data sets that {' and '.join(idle)} would be put to: leave that out")
+    return grid
+
+
+def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
+    """Refuses what each run of a grid says for itself.
+
+    Raises:
+        ValueError: naming what chooses among the runs.
+    """
+    chooses = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
+    chooses["seed"] = "seeds"
+    of_runs = {key_of(override) for run in runs for override in run}
+    for override in overrides:
+        if (key := key_of(override)) in of_runs:
+            instead = f"choose with {chooses[key]}=[...]" if key in chooses else "leave it out, or take another grid"
+            raise ValueError(f"{override}: the runs of this grid set {key} themselves; {instead}")

@@ -48,17 +48,18 @@ def identity(cfg: DictConfig) -> dict[str, str]:
         "backbone": cfg.backbone if h2o_plus else "",
         "mixing": str(float(cfg.mixing)) if h2o_plus else "",
         "ratio": str(bool(cfg.ratio)) if h2o_plus else "",
-        "others": " ".join(sorted(o for o in cfg.overrides or () if _key(o) not in TOLD | GRID)),
+        "others": " ".join(sorted(o for o in cfg.overrides or () if key_of(o) not in TOLD | GRID)),
     }
 
 
-def _key(override: str) -> str:
+def key_of(override: str) -> str:
+    """What an override sets."""
     return override.lstrip("+~").partition("=")[0]
 
 
 def repeating_command(cfg: DictConfig) -> str:
     """What repeats a run, wherever its results go."""
-    chosen = [o for o in cfg.overrides or () if _key(o) not in GRID | {"results", "folder", "resume"}]
+    chosen = [o for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
     return shlex.join(["python", "recipes/train.py", *chosen])
 
 
@@ -115,6 +116,16 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
         if file.seek(0, 2) == 0:
             writer.writeheader()
         writer.writerows(rows)
+
+
+def adopt_run(path: Path, who: Mapping[str, str]) -> None:
+    """Takes a run that another group of the same folder has done, with its curve, if there is one."""
+    for other in sorted(path.parent.glob("*.csv")):
+        rows = [row for row in read_rows(other) if row.keys() >= {*IDENTITY, *RESULT} and _is(row, who)]
+        if rows and other != path:
+            append_rows(path, (*IDENTITY, *RESULT), rows, who)
+            curve = [row for row in read_rows(curves_of(other)) if _is(row, who)]
+            append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, who)
 
 
 def curves_of(path: Path) -> Path:

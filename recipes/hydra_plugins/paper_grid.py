@@ -26,12 +26,16 @@ class PaperGrid(Sweeper):
 
     def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
         # Hydra imports every plugin at each start of any recipe: the library comes when a grid is run.
-        from grid import chosen_grid, group_name
-        from results_file import GRID
+        from grid import check_overrides, chosen_grid, group_name
+        from results_file import GRID, adopt_run
 
         self.results = Path(self.config.results or RESULTS / f"{group_name(self.config)}.csv").resolve()
         self.of_all = [argument for argument in arguments if argument.partition("=")[0] not in GRID | {"results"}]
-        runs = [[*run, *self.of_all] for run in chosen_grid(self.config).runs(tuple(self.config.seeds))]
+        own = list(chosen_grid(self.config).runs(tuple(self.config.seeds)))
+        check_overrides(self.of_all, own)
+        runs = [[*run, *self.of_all] for run in own]
+        for run in runs:
+            adopt_run(self.results, self._identity(run))
         remaining = self._remaining(runs)
         print(f"{len(runs)} runs, {len(runs) - len(remaining)} of them done; results go to {self.results}")
         errors: dict[str, str] = {}

@@ -6,10 +6,10 @@ from collections import Counter
 
 import hydra
 import pytest
-from grid import FIGURES, TABLES, chosen_grid
+from grid import FIGURES, TABLES, check_overrides, chosen_grid
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from methods import METHODS
-from results_file import identity, read_rows
+from results_file import CURVE, IDENTITY, RESULT, adopt_run, append_rows, identity, read_rows
 from torchrl.checkpoint import CheckpointRotation
 from training import train
 
@@ -57,6 +57,35 @@ def test_a_grid_that_there_is_not_is_said(overrides):
         chosen_grid(paper(*overrides))
 
 
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["table=returns", "methods=[ppo]"], r"methods=\[ppo\]: choose sac, cql"),
+        (["table=returns", "gaps=[gravty]"], r"gaps=\[gravty\]: choose gravity"),
+        (["table=returns", "datasets=[hopper/medium-v0]"], "its environment is none of halfcheetah, walker2d"),
+        (["figure=wheel_legged", "gaps=[gravity]"], "has no data sets that gaps would be put to"),
+    ],
+)
+def test_a_choice_that_there_is_not_is_said_before_anything_runs(overrides, said):
+    with pytest.raises(ValueError, match=said):
+        chosen_grid(paper(*overrides))
+
+
+@pytest.mark.parametrize(
+    ("grid", "override", "said"),
+    [
+        (TABLES["returns"], "gap=friction", r"set gap themselves; choose with gaps="),
+        (TABLES["returns"], "+seed=1", r"choose with seeds="),
+        (FIGURES["backbones"], "backbone=sparse", "leave it out, or take another grid"),
+    ],
+)
+def test_what_each_run_says_for_itself_is_no_override_of_all(grid, override, said):
+    runs = list(grid.runs((0,)))
+    with pytest.raises(ValueError, match=said):
+        check_overrides(["updates=10", override], runs)
+    check_overrides(["updates=10", "env.make.max_episode_steps=40", "mixing=0.3"], list(TABLES["returns"].runs((0,))))
+
+
 @pytest.mark.parametrize("grid", [TABLES["mixing"], TABLES["gaps"]])
 def test_runs_that_differ_have_different_identities(grid):
     found = []
@@ -101,6 +130,19 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     cfg, real = compose("updates=200", "method=cql", config="train")
     train(METHODS["cql"].title, METHODS["cql"].make_learner, cfg, real, tmp_path / "unbroken")
     assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
+
+
+def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path):
+    who = dict.fromkeys(IDENTITY, "x")
+    for name, columns in (("a.csv", (*IDENTITY, *RESULT)), ("a_curves.csv", (*IDENTITY, *CURVE))):
+        rows = [dict.fromkeys(columns, "1") | whose for whose in (who, who | {"seed": "y"})]
+        for row in rows:
+            append_rows(tmp_path / name, columns, [row], {key: row[key] for key in IDENTITY})
+    for _ in range(2):
+        adopt_run(tmp_path / "b.csv", who)
+        adopt_run(tmp_path / "b.csv", who | {"seed": "z"})
+    assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]
+    assert [row["seed"] for row in read_rows(tmp_path / "b_curves.csv")] == ["x"]
 
 
 def checkpoint_of(folder, method):
