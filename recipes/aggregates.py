@@ -1,8 +1,10 @@
 """Over all tasks of a group: interquartile mean and probability of improvement, with intervals, by rliable."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from grid import OFFLINE, SIX
 from rliable import library, metrics
 from score_table import Cell, Task, normalised
 
@@ -26,46 +28,74 @@ class Scores:
     """Normalised scores of some methods on the tasks and seeds that all of them have.
 
     Args:
-        by_method: ``[num_seeds, num_tasks]`` each.
-        tasks: of the columns.
+        runs: by method, ``[num_seeds, num_runs]``. A method without simulator has one run for all gaps of its data.
+        columns: by method, which of its runs each task reads, ``[num_tasks]``.
+        tasks: that are compared.
         seeds: of the rows.
     """
 
-    by_method: dict[str, np.ndarray]
+    runs: dict[str, np.ndarray]
+    columns: dict[str, np.ndarray]
     tasks: list[Task]
     seeds: list[int]
 
+    def by_task(self, name: str) -> Callable[[np.ndarray], np.ndarray]:
+        """What spreads a method's runs, or runs drawn anew of them, over the tasks: ``[num_seeds, num_tasks]``."""
+        return lambda runs: runs[:, self.columns[name]]
+
 
 def common_scores(table: dict[Task, dict[str, Cell]]) -> Scores:
-    """The largest full block of a table: the tasks that every method has, and the seeds that all of these have."""
-    methods = sorted({name for cells in table.values() for name in cells})
-    tasks = sorted(task for task, cells in table.items() if set(cells) == set(methods))
-    of_each = [set(table[task][name].returns) for task in tasks for name in methods]
-    seeds = sorted(set.intersection(*of_each)) if of_each else []
+    """The tasks that every method of the paper has that is there at all, and the seeds that they all have in these.
 
-    def score(name: str, seed: int, task: Task) -> float:
-        return normalised(task[0], table[task][name].returns[seed])
+    Further methods are in if they have all of these.
+    """
+    there = {name for cells in table.values() for name in cells}
+    methods = [name for name in SIX if name in there] or sorted(there)
+    tasks = sorted(task for task, cells in table.items() if set(methods) <= set(cells))
+    methods += [name for name in sorted(there - set(methods)) if all(name in table[task] for task in tasks)]
+    seeds = sorted(set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods))) if tasks else []
+    runs, columns = {}, {}
+    for name in methods:
+        first = {_seen(name, task): task for task in reversed(tasks)}
+        order = list(first)
+        cells = [(task[0], table[task][name]) for task in first.values()]
+        runs[name] = np.array([[normalised(env, cell.returns[seed]) for env, cell in cells] for seed in seeds])
+        columns[name] = np.array([order.index(_seen(name, task)) for task in tasks], dtype=int)
+    return Scores(runs, columns, tasks, seeds)
 
-    by_method = {name: np.array([[score(name, seed, task) for task in tasks] for seed in seeds]) for name in methods}
-    return Scores(by_method, tasks, seeds)
+
+def _seen(name: str, task: Task) -> Task:
+    """What of a task a method's run depends on: without a simulator, not on its gap."""
+    env, data, gap, *variant = task
+    return (env, data, "" if name in OFFLINE else gap, *variant)
 
 
 def interquartile_means(scores: Scores, reps: int, seed: int = 0) -> dict[str, Interval]:
-    """Of each method, with an interval from seeds drawn anew within each task."""
-    return _intervals(scores.by_method, lambda x: np.array([metrics.aggregate_iqm(x)]), reps, seed)
+    """Of each method, with an interval from runs drawn anew among the seeds."""
+
+    def statistic(name: str) -> Callable:
+        spread = scores.by_task(name)
+        return lambda x: np.array([metrics.aggregate_iqm(spread(x))])
+
+    return {name: _interval(runs, statistic(name), reps, seed) for name, runs in scores.runs.items()}
 
 
 def improvements(scores: Scores, reps: int, seed: int = 0, base: str = BASE) -> dict[str, Interval]:
     """The probability that a run of ``base`` does better than one of each other method, averaged over tasks."""
-    pairs = {name: (scores.by_method[base], x) for name, x in scores.by_method.items() if name != base}
-    return _intervals(pairs, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps, seed)
+
+    def statistic(name: str) -> Callable:
+        ours, theirs = scores.by_task(base), scores.by_task(name)
+        return lambda x, y: np.array([metrics.probability_of_improvement(ours(x), theirs(y))])
+
+    others = {name: runs for name, runs in scores.runs.items() if name != base}
+    return {name: _interval((scores.runs[base], runs), statistic(name), reps, seed) for name, runs in others.items()}
 
 
-def _intervals(scores: dict, statistic, reps: int, seed: int) -> dict[str, Interval]:
+def _interval(runs: np.ndarray | tuple[np.ndarray, ...], statistic: Callable, reps: int, seed: int) -> Interval:
     state = np.random.get_state()
     np.random.seed(seed)  # rliable draws from the global generator, whatever random_state it is given
     try:
-        points, bounds = library.get_interval_estimates(scores, statistic, reps=reps)
+        points, bounds = library.get_interval_estimates({"": runs}, statistic, reps=reps)
     finally:
         np.random.set_state(state)
-    return {name: Interval(float(points[name][0]), *(float(b) for b in bounds[name][:, 0])) for name in scores}
+    return Interval(float(points[""][0]), *(float(bound) for bound in bounds[""][:, 0]))

@@ -19,6 +19,10 @@ from robot_figures import draw_robot
 from score_table import REFERENCES, VARIANTS, Row, Task, cells, markdown, placed
 
 TITLES = {name: method.title for name, method in METHODS.items()}
+SCORES = (
+    "Scores are returns on a scale from D4RL's random policy, 0, to its expert, 100; the robot's from nothing to 30 s "
+    "without a fault, a scale of ours."
+)
 ABLATIONS = ("mixing", "backbones")  # one method, whose variants are compared
 
 
@@ -50,14 +54,18 @@ def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> N
     """Writes a group's table, learning curves and aggregates, and prints the table."""
     variants = group in ABLATIONS
     table = cells(placed(rows, variants))
-    lines = [markdown(table, TITLES, paper_cells(read_rows(results / "paper.csv"), group, table)), ""]
+    theirs = paper_cells(read_rows(results / "paper.csv"), group, table)
+    lines = [markdown(table, TITLES, theirs), ""]
     lines.append(
         "Returns in reality: mean ± standard deviation over the seeds (how many); of one seed, over its episodes."
     )
-    lines.append(f"After {int(rows[0]['updates']):,} updates. The paper's: five seeds, 1,000,000 updates.")
+    lines.append(f"After {int(rows[0]['updates']):,} updates, by the last policy.")
+    if theirs:
+        lines.append("The paper's: five seeds, 1,000,000 updates.")
+    lines.append(SCORES)
     scores = common_scores(table)
-    if len(scores.by_method) > 1 and all(task[0] in REFERENCES for task in scores.tasks):
-        lines += ["", *aggregate_lines(group, scores, to, reps)]
+    if len(scores.runs) > 1 and all(task[0] in REFERENCES for task in scores.tasks):
+        lines += ["", *aggregate_lines(group, scores, len(table), to, reps)]
     text = "\n".join(lines) + "\n"
     to.mkdir(parents=True, exist_ok=True)
     (to / f"{group}.md").write_text(text)
@@ -68,13 +76,13 @@ def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> N
         draw_curves(to / f"{group}_curves.png", placed(curves, variants), TITLES)
 
 
-def aggregate_lines(group: str, scores: Scores, to: Path, reps: int) -> list[str]:
+def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:
     """What the methods come to over all tasks, drawn too; of one seed, whose intervals would have no width, nothing."""
     if len(scores.seeds) < 2:
         return ["Interquartile means and their intervals take two seeds of every method, or more."]
     means = interquartile_means(scores, reps)
-    better = improvements(scores, reps) if BASE in scores.by_method else {}
-    number = f"{len(scores.tasks)} task{'s' * (len(scores.tasks) > 1)}"
+    better = improvements(scores, reps) if BASE in scores.runs else {}
+    number = f"{len(scores.tasks)} of {num_tasks} tasks" if len(scores.tasks) < num_tasks else f"{num_tasks} tasks"
     note = f"{number}, seeds {', '.join(map(str, scores.seeds))}; 95 % bootstrap intervals"
     draw_aggregates(to / f"{group}_aggregates.png", means, better, TITLES, note)
     return [aggregate_table(means, better), "", f"{note}."]

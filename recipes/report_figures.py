@@ -59,7 +59,7 @@ def _curves(rows: Sequence[Row]) -> dict[tuple[Task, str], dict[int, list[float]
 def _draw_band(axis: plt.Axes, curve: Mapping[int, list[float]], title: str) -> None:
     at = sorted(curve)
     mean = np.array([np.mean(curve[x]) for x in at])
-    spread = np.array([np.std(curve[x]) for x in at])
+    spread = np.array([np.std(curve[x], ddof=1) if len(curve[x]) > 1 else 0.0 for x in at])
     colour = COLOURS.get(title)
     axis.plot(at, mean, color=colour, label=title, lw=1.5)
     axis.fill_between(at, mean - spread, mean + spread, color=colour, alpha=0.2, lw=0)

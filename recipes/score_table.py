@@ -3,7 +3,9 @@
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from grid import OFFLINE
 
 #: Returns that count as 0 and as 100: D4RL's random and expert policies (Fu et al., 2020, arXiv 2004.07219); for the
 #: robot nothing, and 30 s without a fault.
@@ -13,7 +15,6 @@ REFERENCES = {
     "wheel_legged/standing_still": (0.0, 180_000.0),
     "wheel_legged/moving_forward": (0.0, 90_000.0),
 }
-OFFLINE = ("cql", "iql")
 
 Row = Mapping[str, str]
 Task = tuple[str, ...]
@@ -26,16 +27,26 @@ class Cell:
     Args:
         returns: mean return of each run, by its seed.
         within: standard deviation over the episodes of each run.
+        seconds: how long an episode lasts on average, of each run.
     """
 
-    returns: dict[int, float]
-    within: dict[int, float]
+    returns: dict[int, float] = field(default_factory=dict)
+    within: dict[int, float] = field(default_factory=dict)
+    seconds: dict[int, float] = field(default_factory=dict)
 
     def text(self) -> str:
         """Mean and standard deviation over the seeds; of a single seed, over its episodes."""
         values = list(self.returns.values())
         spread = statistics.stdev(values) if len(values) > 1 else next(iter(self.within.values()))
         return f"{statistics.mean(values):,.0f} ± {spread:,.0f} ({len(values)})"
+
+    def lasts(self) -> str:
+        """Mean length of an episode, in s."""
+        return f"{statistics.mean(self.seconds.values()):.1f}" if self.seconds else ""
+
+    def score(self, env: str) -> str:
+        """The mean return on the scale of :data:`REFERENCES`."""
+        return f"{normalised(env, statistics.mean(self.returns.values())):.1f}" if self.returns else ""
 
 
 #: what tells H2O+'s variants apart in the ablations, and how a table says it
@@ -70,12 +81,22 @@ def placed(rows: Iterable[Row], variants: bool) -> list[Row]:
 
 
 def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
-    """Cells by task and method, of rows that are :func:`placed`."""
+    """Cells by task and method, of rows that are :func:`placed`.
+
+    Raises:
+        ValueError: if a method has two runs of a seed in a task.
+    """
     table: dict[Task, dict[str, Cell]] = defaultdict(dict)
     for row in rows:
-        cell = table[task_of(row)].setdefault(row["method"], Cell({}, {}))
-        cell.returns[int(row["seed"])] = float(row["return_mean"])
-        cell.within[int(row["seed"])] = float(row["return_std"])
+        cell, seed = table[task_of(row)].setdefault(row["method"], Cell()), int(row["seed"])
+        if seed in cell.returns:
+            raise ValueError(
+                f"{row['method']} has two runs of seed {seed} in {' '.join(filter(None, task_of(row)))}, of another "
+                f"{', '.join(VARIANTS)}: give those a file of their own, results=..."
+            )
+        cell.returns[seed] = float(row["return_mean"])
+        cell.within[seed] = float(row["return_std"])
+        cell.seconds[seed] = float(row["seconds"])
     return dict(table)
 
 
@@ -105,6 +126,12 @@ def markdown(table: dict[Task, dict[str, Cell]], titles: Mapping[str, str], pape
         ours = [table[task][name].text() if name in table[task] else "" for name in present]
         first = [env, data, gap, ", ".join(variant)]
         lines.append("| " + " | ".join([*first, "ours", *ours]) + " |")
+        if len({seconds for cell in table[task].values() for seconds in cell.seconds.values()}) > 1:
+            lasts = [table[task].get(name, Cell()).lasts() for name in present]
+            lines.append("| " + " | ".join(["", "", "", "", "lasts, s", *lasts]) + " |")
+        if env in REFERENCES:
+            scores = [table[task].get(name, Cell()).score(env) for name in present]
+            lines.append("| " + " | ".join(["", "", "", "", "score", *scores]) + " |")
         if task in paper:
             theirs = [paper[task].get(name, "") for name in present]
             lines.append("| " + " | ".join(["", "", "", "", "paper", *theirs]) + " |")

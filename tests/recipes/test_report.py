@@ -19,7 +19,10 @@ def row(method, seed, value, gap="gravity", **others):
     who = dict.fromkeys((*IDENTITY, *RESULT), "") | CHEETAH | {"updates": "1000", "episodes": "5"}
     strength = {"gravity": "2.0", "friction": "0.3", "": ""}[gap]
     told = {"method": method, "seed": str(seed), "gap": gap, "strength": strength}
-    return who | told | {"return_mean": str(value), "return_std": "10.0"} | others
+    return who | told | {"return_mean": str(value), "return_std": "10.0", "seconds": "50.0"} | others
+
+
+GAPS = ("gravity", "friction")
 
 
 def fixture():
@@ -67,7 +70,20 @@ def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
     head, _, *lines = text.splitlines()
     assert head.endswith("| H2O+ | SAC |")
     assert lines[-1].endswith("| paper |  | 4,513 ± 513 |")
-    assert lines[-2].endswith("| ours | 2,100 ± 100 (3) | 600 ± 100 (3) |")
+    assert lines[-2].endswith("| score | 19.2 | 7.1 |")  # of D4RL's -280 to 12,135
+    assert lines[-3].endswith("| ours | 2,100 ± 100 (3) | 600 ± 100 (3) |")
+
+
+def test_how_long_episodes_last_is_told_where_some_end_early():
+    rows = [row("sac", s, 1, seconds=str(10.0 + s)) for s in range(2)] + [row("h2o_plus", 0, 1)]
+    lines = markdown(cells(rows), {"sac": "SAC", "cql": "CQL", "h2o_plus": "H2O+"}, {}).splitlines()
+    assert [line for line in lines if "lasts" in line] == ["|  |  |  |  | lasts, s | 10.5 | 50.0 |"]
+
+
+def test_two_runs_of_a_seed_are_not_taken_for_one():
+    rows = [row("h2o_plus", 0, value, mixing=str(value)) for value in (0.1, 0.5)]
+    with pytest.raises(ValueError, match=r"h2o_plus has two runs of seed 0 in .* results="):
+        cells(placed(rows, variants=False))
 
 
 def test_the_interquartile_mean_is_that_of_the_middle_half():
@@ -96,7 +112,28 @@ def test_aggregates_are_of_tasks_and_seeds_that_every_method_has():
     scores = common_scores(cells(placed(rows, variants=False)))
     assert [task[2] for task in scores.tasks] == ["gravity 2"]
     assert scores.seeds == [0, 1]
-    assert {x.shape for x in scores.by_method.values()} == {(2, 1)}
+    assert {x.shape for x in scores.runs.values()} == {(2, 1)}
+
+
+def test_a_method_that_has_done_little_does_not_take_tasks_from_the_others():
+    table = cells(placed([*fixture(), row("td3", 0, 5)], variants=False))
+    scores = common_scores(table)
+    assert len(scores.tasks) == 2
+    assert "td3" not in scores.runs
+    scores = common_scores(cells(placed([*fixture(), *(row("td3", s, 5, g) for s in range(3) for g in GAPS)], False)))
+    assert scores.runs["td3"].shape == (3, 2)
+
+
+def test_runs_that_count_in_several_gaps_are_drawn_anew_together():
+    scores = common_scores(cells(placed(fixture(), variants=False)))
+    assert scores.runs["iql"].shape == (3, 1)
+    both = interquartile_means(scores, reps=200)["iql"]
+    once = [r for r in fixture() if r["gap"] != "friction"]
+    alone = interquartile_means(common_scores(cells(placed(once, variants=False))), reps=200)["iql"]
+    values = [normalised("HalfCheetah-v5", 1000 + 100 * seed) for seed in range(3)]
+    assert both.value == pytest.approx(values[1])
+    assert (both.low, both.high) == pytest.approx((values[0], values[2]))
+    assert (alone.low, alone.high) == pytest.approx((values[0], values[2]))
 
 
 def test_one_command_makes_tables_and_pictures(tmp_path):
