@@ -17,7 +17,7 @@ from evaluation import evaluate
 from methods import method_named
 from omegaconf import DictConfig
 from rendering import film
-from run import checkpoint_folder, load_config
+from run import checkpoint_folder, keeps_best, load_config
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from torchrl_h2o.objectives import make_actor
@@ -35,7 +35,8 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
         raise FileNotFoundError(f"{directory} has no checkpoint of {method!r}; it has {there or 'none'}")
     env = make_reality(cfg)
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
-    chosen = "policy" if "policy" in Checkpoint.manifest(latest)["components"] else "actor"
+    has_best = "policy" in Checkpoint.manifest(latest)["components"]  # not of a method that has no simulator
+    chosen = "policy" if keeps_best(cfg) and has_best else "actor"
     Checkpoint(**{chosen: actor}).load(latest)
     return actor
 

@@ -8,6 +8,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+SEED = 1_000_000  # of a table's first episode
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -33,7 +35,7 @@ class Evaluation:
 
 
 def evaluate(
-    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int, seed: int = 1_000_000
+    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int, seed: int = SEED
 ) -> Evaluation:
     """Runs whole episodes, the first from the given seed, without touching the run's own random streams.
 

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from report_figures import draw_aggregates, draw_curves
 from results_file import curves_of, read_rows
 from robot_figures import draw_robot
+from robot_results import kept_results
 from score_table import REFERENCES, VARIANTS, Row, Task, cells, markdown, placed
 
 TITLES = {name: method.title for name, method in METHODS.items()}
@@ -35,7 +36,7 @@ def main(cfg: DictConfig) -> None:
         if rows:
             report(group, rows, results, to, cfg.reps)
             if group == "wheel_legged":
-                draw_robot(Path(cfg.runs) / group, results, to)
+                draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))
 
 
 def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:

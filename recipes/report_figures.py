@@ -16,7 +16,7 @@ from score_table import Row, Task, task_of
 
 
 def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> None:
-    """Returns over the updates, an axis a task: the seeds' mean, and a band of their standard deviation.
+    """Returns over the updates, an axis a task: the seeds' mean, and a band from the lowest to the highest.
 
     Args:
         path: of the PNG.
@@ -44,7 +44,10 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
         axis.set_visible(False)
     axes[-1, 0].set(xlabel="updates", ylabel="return in reality")
     handles = {label: handle for a in axes.flat for handle, label in zip(*a.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=len(handles))
+    labels = [title for title in titles.values() if title in handles]
+    beside = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
+    figure.legend([handles[label] for label in labels], labels, **beside)
+    figure.suptitle("The policy in training, at each evaluation; bands from the lowest seed to the highest", fontsize=8)
     _save(figure, path)
 
 
@@ -58,11 +61,9 @@ def _curves(rows: Sequence[Row]) -> dict[tuple[Task, str], dict[int, list[float]
 
 def _draw_band(axis: plt.Axes, curve: Mapping[int, list[float]], title: str) -> None:
     at = sorted(curve)
-    mean = np.array([np.mean(curve[x]) for x in at])
-    spread = np.array([np.std(curve[x], ddof=1) if len(curve[x]) > 1 else 0.0 for x in at])
     colour = COLOURS.get(title)
-    axis.plot(at, mean, color=colour, label=title, lw=1.5)
-    axis.fill_between(at, mean - spread, mean + spread, color=colour, alpha=0.2, lw=0)
+    axis.plot(at, [np.mean(curve[x]) for x in at], color=colour, label=title, lw=1.5)
+    axis.fill_between(at, [min(curve[x]) for x in at], [max(curve[x]) for x in at], color=colour, alpha=0.2, lw=0)
 
 
 def draw_aggregates(
