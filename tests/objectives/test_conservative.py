@@ -12,7 +12,7 @@ from tests.objectives import reference
 from tests.objectives.conftest import Parts, make_batch
 from tests.objectives.test_importance import iql, td3
 from tests.objectives.test_reward_correction import log_ratio_of
-from torchrl_h2o.objectives import ConservativeLoss, DynamicsDivergence, ImportanceWeightedLoss
+from torchrl_h2o.objectives import ConservativeLoss, DynamicsDivergence, DynamicsRatioEstimator, ImportanceWeightedLoss
 
 NO_BONUS = TensorDictModule(torch.zeros_like, in_keys=["_log_prob"], out_keys=["exploration_bonus"])
 
@@ -90,6 +90,21 @@ def test_the_divergence_is_the_mean_log_ratio_at_noisy_next_states_clamped(parts
     assert min(got) == 0.1
     assert max(got) == 0.4
     assert any(0.1 < u < 0.4 for u in got)
+
+
+def test_next_states_are_noisy_whatever_their_key_is(parts, batch):
+    sas = parts.estimator.sas_network
+    with torch.no_grad():  # rows look simulated, some more, some less
+        sas.module[-1].bias[:] = torch.tensor([-2.0, 2.0])
+    flat = TensorDictModule(sas.module, in_keys=["observation", "action", "next_observation"], out_keys=sas.out_keys)
+    batch["next_observation"] = batch["next", "observation"].clone()
+    divergences = []
+    for estimator in (parts.estimator, DynamicsRatioEstimator(parts.estimator.sa_network, flat)):
+        torch.manual_seed(7)
+        divergence = DynamicsDivergence(estimator, noise=1.0, clamp=(1e-9, 1e9))
+        divergences.append(divergence(batch.copy())["dynamics_divergence"])
+    torch.testing.assert_close(*divergences)
+    assert divergences[0].unique().numel() > 1
 
 
 def test_without_the_term_and_the_ratio_h2o_is_sac_on_both_streams(batch):

@@ -1,6 +1,7 @@
 """Every method of the comparison: it trains through the one recipe, goes on where it stopped, and can be replayed."""
 
 import json
+import math
 import subprocess
 
 import pytest
@@ -96,9 +97,10 @@ def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_p
     assert returns[0] == returns[1]
 
 
-def parts(name, compose):
-    """A method's learner and its first batches."""
-    cfg, real = compose(f"method={name}", config="train")
+def parts(name, compose, *overrides):
+    """A method's learner and its first batches, the same at each call."""
+    cfg, real = compose(f"method={name}", *overrides, config="train")
+    torch.manual_seed(0)
     spec = make_reality(cfg).action_spec_unbatched
     real = as_observed(cfg, real)
     replay = HybridReplayBuffer(real, sim_capacity=100)
@@ -125,6 +127,18 @@ def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):
         assert (batch[key][batch["real"]] == 1.0).all()
     assert (batch["dynamics_divergence"][~batch["real"]] != 1.0).all()
     assert {"loss_conservative", "loss_qvalue", "loss_ratio_sa"} <= losses.keys()
+
+
+def test_h2o_s_backup_holds_no_entropy_and_its_term_alpha_c(compose):
+    found = []
+    for alpha_c, alpha in ((0.01, 1.0), (0.02, 50.0)):
+        learner, batches = parts("h2o", compose, f"h2o.alpha_c={alpha_c}")
+        learner.losses["loss"].loss.log_alpha.data.fill_(math.log(alpha))
+        torch.manual_seed(1)
+        found.append(learner.terms_of(*batches))
+    torch.testing.assert_close(found[1]["loss_conservative"], 2 * found[0]["loss_conservative"])
+    torch.testing.assert_close(found[1]["loss_qvalue"], found[0]["loss_qvalue"])
+    assert not torch.allclose(found[1]["loss_actor"], found[0]["loss_actor"])
 
 
 def test_cql_s_policy_is_not_also_told_to_copy(compose):

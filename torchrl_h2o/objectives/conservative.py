@@ -27,8 +27,9 @@ class DynamicsDivergence(TensorDictModuleBase):
 
     Args:
         estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`.
-        noise (Tensor or float): σ, in the observation's units, ``[observation_dim]`` or one for all. The authors take
-            the standard deviation of the real data's observations.
+        noise (Tensor or float): σ, in the observation's units, ``[observation_dim]`` or one for all: that of the
+            real data's observations, say. The authors' is smaller: their code takes it with the zeros of a buffer's
+            simulated part, still empty, among the observations.
         num_samples (int, optional): N. Defaults to 10, the authors'.
 
     Keyword Args:
@@ -72,16 +73,16 @@ class DynamicsDivergence(TensorDictModuleBase):
         self.clamp = clamp
         self.in_keys = list(estimator.in_keys)
         self.out_keys = list(out_keys)
+        self._next_keys = [key for key in self.in_keys if key not in estimator.sa_network.in_keys]
 
     @dispatch
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = tensordict.select(*self.in_keys)
         samples = inputs.expand(self.num_samples, *inputs.batch_size).copy()
-        for key in self.in_keys:
-            if key[0] == "next":
-                value = samples.get(key)
-                samples.set(key, value + self.noise.to(value) * torch.randn_like(value))
+        for key in self._next_keys:
+            value = samples.get(key)
+            samples.set(key, value + self.noise.to(value) * torch.randn_like(value))
         log_ratio = self.estimator(samples).get(self.estimator.out_keys[0])
         return tensordict.set(self.out_keys[0], (-log_ratio.mean(0)).clamp(*self.clamp))
 
