@@ -24,13 +24,13 @@ from omegaconf import DictConfig
 from population_training import members_of, train_population
 from real_data import behaviour_in
 from results import print_population
-from run import Training, claimed, open_run
+from run import claimed, open_run
 from sac import SAC
 from tensordict import TensorDictBase
 from torch.nn.functional import pad
 from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
-from training import Method, train
+from training import Method
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
@@ -98,11 +98,6 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
 
 
 H2O_PLUS = Method("H2O+", make_learner)
-
-
-def train_h2o_plus(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
-    """Real and simulated data, the simulator's weighed by how real they look."""
-    return train(H2O_PLUS.title, make_learner, cfg, real, directory)
 
 
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:

@@ -42,7 +42,7 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
 
     policies, trainings = {}, {}
     for method in methods:
-        policy, training = train(method.title, method.make_learner, cfg, real, directory)
+        policy, training = train(method, cfg, real, directory)
         policies[method.title], trainings[method.title] = policy, training
     wall_s += sum(training.progress["seconds"] for training in trainings.values())
 

@@ -1,15 +1,10 @@
 """SAC in the simulator alone: TorchRL's own loss, on the same budget. What zero-shot transfer comes to."""
 
-from pathlib import Path
-
-import torch
 from learner import Learner, adam, make_networks
 from omegaconf import DictConfig
-from run import Training
-from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.objectives import SACLoss, SoftUpdate
-from training import Method, train
+from training import Method
 
 from torchrl_h2o.data import HybridReplayBuffer
 
@@ -24,8 +19,3 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
 
 
 SAC = Method("SAC in the simulator", make_learner)
-
-
-def train_sac(cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
-    """SAC on simulated batches; of the real data it sees nothing but the scale of the observations."""
-    return train(SAC.title, make_learner, cfg, real, directory)

@@ -125,14 +125,11 @@ class Trainee:
         self._open.close()
 
 
-def train(
-    name: str, make_learner: MakeLearner, cfg: DictConfig, real: TensorDictBase, directory: Path
-) -> tuple[torch.nn.Module, Training]:
+def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path) -> tuple[torch.nn.Module, Training]:
     """Trains one method.
 
     Args:
-        name: what the bar and the tables call it.
-        make_learner: from the configuration, the size of the observation, the action's spec and the data.
+        method: what it learns with.
         cfg: the run's configuration.
         real: the measured transitions.
         directory: the run's folder.
@@ -142,11 +139,11 @@ def train(
     """
     real = as_observed(cfg, real)  # both streams show observations and rewards in the same way
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
-    trainee = Trainee(make_learner, cfg, replay)
+    trainee = Trainee(method.make_learner, cfg, replay)
     learner = trainee.learner
     learner.terms_of = maybe_compiled(cfg, learner.terms_of, pays=learner.pays_to_compile)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
-    training = Training(name, cfg, directory, **trainee.components, schedule=schedule)
+    training = Training(method.title, cfg, directory, **trainee.components, schedule=schedule)
     with closing(trainee):
         for epoch, evaluating in training.epochs():
             trainee.begin_epoch(epoch)

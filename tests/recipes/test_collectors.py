@@ -9,8 +9,9 @@ import pytest
 import torch
 from collection import check_collector, collecting
 from environments import make_simulator
-from h2o_plus import train_h2o_plus
+from h2o_plus import H2O_PLUS
 from run import Training
+from training import train
 
 from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS
 from torchrl_h2o.objectives import make_actor
@@ -47,9 +48,9 @@ def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind,
         log(self, epoch, **metrics)
 
     monkeypatch.setattr("run.Training.log", stop_and_go_on)
-    _, whole = train_h2o_plus(cfg, real, tmp_path / "whole")
+    _, whole = train(H2O_PLUS, cfg, real, tmp_path / "whole")
     monkeypatch.undo()
-    _, parts = train_h2o_plus(cfg, real, tmp_path / "parts")
+    _, parts = train(H2O_PLUS, cfg, real, tmp_path / "parts")
     assert parts.rows == whole.rows
     assert len(whole.rows) == 2
     if kind == "multi_sync":

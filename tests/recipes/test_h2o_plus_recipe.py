@@ -11,10 +11,11 @@ import torch
 from environments import make_simulator
 from evaluate import load_policy
 from evaluation import evaluate
-from h2o_plus import train_h2o_plus
+from h2o_plus import H2O_PLUS
 from run import Training
-from sac import train_sac
+from sac import SAC
 from torchrl.checkpoint import CheckpointRotation
+from training import train
 
 from tests.recipes.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
 from torchrl_h2o.data import write_ted
@@ -121,27 +122,27 @@ def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
     losses = []
     for number, overrides in enumerate(chosen):
         cfg, real = compose("updates=20", *overrides)
-        _, training = train_h2o_plus(cfg, real, tmp_path / str(number))
+        _, training = train(H2O_PLUS, cfg, real, tmp_path / str(number))
         losses.append((training.rows[-1]["loss_qvalue"], training.rows[-1]["loss_value"]))
     assert len(set(losses)) == len(chosen)
 
 
-@pytest.mark.parametrize("train", [train_h2o_plus, train_sac])
-def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, train, monkeypatch):
+@pytest.mark.parametrize("method", [H2O_PLUS, SAC])
+def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, method, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1")
-    train(cfg, real, tmp_path / "whole")
+    train(method, cfg, real, tmp_path / "whole")
     monkeypatch.setattr("run.Training.log", interrupt_at(epoch=1, log=Training.log))
     with pytest.raises(KeyboardInterrupt):
-        train(cfg, real, tmp_path / "parts")
+        train(method, cfg, real, tmp_path / "parts")
     monkeypatch.undo()
-    train(cfg, real, tmp_path / "parts")
-    (method,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
-    assert trained(tmp_path / "parts", method) == trained(tmp_path / "whole", method)
+    train(method, cfg, real, tmp_path / "parts")
+    (name,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
+    assert trained(tmp_path / "parts", name) == trained(tmp_path / "whole", name)
 
 
 def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
     cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=1")
-    policy, training = train_h2o_plus(cfg, real, tmp_path / "whole")
+    policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
     promised = [row["return_sim"] for row in training.rows]
     assert max(promised) > promised[-1]
     assert evaluate(make_simulator(cfg, 1), policy, 1).mean == max(promised)
@@ -149,19 +150,19 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
 
     monkeypatch.setattr("run.Training.log", interrupt_at(epoch=promised.index(max(promised)) + 1, log=Training.log))
     with pytest.raises(KeyboardInterrupt):
-        train_h2o_plus(cfg, real, tmp_path / "parts")
+        train(H2O_PLUS, cfg, real, tmp_path / "parts")
     monkeypatch.undo()
-    train_h2o_plus(cfg, real, tmp_path / "parts")
+    train(H2O_PLUS, cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
 
 
 def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
     cfg, real = compose("updates=20")
-    train_sac(cfg, real, tmp_path)
+    train(SAC, cfg, real, tmp_path)
     (archive,) = (tmp_path / "checkpoints" / "sac_in_the_simulator").glob("checkpoint*")
     archive.write_bytes(archive.read_bytes()[:-2000])
     with pytest.raises(RuntimeError, match="no checkpoint that can be read"):
-        train_sac(cfg, real, tmp_path)
+        train(SAC, cfg, real, tmp_path)
 
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured data are not there: {DATA}")

@@ -41,7 +41,7 @@ def test_a_method_that_there_is_not_is_said(command):
 def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1", config="train")
     method = METHODS[name]
-    policy, training = train(method.title, method.make_learner, cfg, real, tmp_path / "whole")
+    policy, training = train(method, cfg, real, tmp_path / "whole")
     assert len(training.rows) == 3
     assert all(torch.isfinite(torch.tensor(value)) for row in training.rows for value in list(row.values())[1:])
     first = method_policy(method, cfg, real, tmp_path / "first")
@@ -49,9 +49,9 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
 
     monkeypatch.setattr("run.Training.log", interrupt_at(epoch=1, log=Training.log))
     with pytest.raises(KeyboardInterrupt):
-        train(method.title, method.make_learner, cfg, real, tmp_path / "parts")
+        train(method, cfg, real, tmp_path / "parts")
     monkeypatch.undo()
-    train(method.title, method.make_learner, cfg, real, tmp_path / "parts")
+    train(method, cfg, real, tmp_path / "parts")
     (folder,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
     assert trained(tmp_path / "parts", folder) == trained(tmp_path / "whole", folder)
 
@@ -60,7 +60,7 @@ def method_policy(method, cfg, real, directory):
     """The policy that the method starts with."""
     still = cfg.copy()
     still.lr = 0.0
-    return train(method.title, method.make_learner, still, real, directory)[0]
+    return train(method, still, real, directory)[0]
 
 
 @methods
@@ -68,7 +68,7 @@ def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, na
     cfg, real = compose("updates=20", config="train")
     sizes = []
     monkeypatch.setattr("learner.Learner.update", recorded(sizes))
-    train(METHODS[name].title, METHODS[name].make_learner, cfg, real, tmp_path)
+    train(METHODS[name], cfg, real, tmp_path)
     policy_s, *discriminators = sizes[0]
     expected = {"sac": (0, 16), "darc": (0, 16), "cql": (16, 0), "iql": (16, 0)}
     assert tuple(policy_s) == expected.get(name, (8, 8))
@@ -92,7 +92,7 @@ def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_p
     returns = []
     for gap in ("gap=null", "gap=gravity"):
         cfg, real = compose("updates=20", gap, config="train")
-        _, training = train(METHODS[name].title, METHODS[name].make_learner, cfg, real, tmp_path / gap)
+        _, training = train(METHODS[name], cfg, real, tmp_path / gap)
         returns.append(training.rows[-1]["return_real"])
     assert returns[0] == returns[1]
 
@@ -153,7 +153,7 @@ def test_a_method_that_learns_from_real_data_alone_has_no_simulator(compose, tmp
     cfg, real = compose("updates=20", "keep=best_in_simulator", config="train")
     monkeypatch.delattr(HybridReplayBuffer, "extend")
     monkeypatch.delattr("training.make_simulator")
-    policy, training = train(METHODS[name].title, METHODS[name].make_learner, cfg, real, tmp_path)
+    policy, training = train(METHODS[name], cfg, real, tmp_path)
     assert "return_sim" not in training.rows[-1]
     kept = load_policy(cfg, tmp_path, METHODS[name].title)
     torch.testing.assert_close(kept.state_dict(), policy.state_dict())

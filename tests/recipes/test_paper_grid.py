@@ -128,7 +128,7 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql", "cql"]
 
     cfg, real = compose("updates=200", "method=cql", config="train")
-    train(METHODS["cql"].title, METHODS["cql"].make_learner, cfg, real, tmp_path / "unbroken")
+    train(METHODS["cql"], cfg, real, tmp_path / "unbroken")
     assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
 
 

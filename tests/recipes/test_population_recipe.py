@@ -4,10 +4,10 @@ import json
 
 import pytest
 import torch
-from h2o_plus import make_learner, run_population, train_h2o_plus
+from h2o_plus import H2O_PLUS, make_learner, run_population
 from population_learner import PopulationLearner
 from population_training import PopulationTraining, members_of, train_population
-from training import Trainee
+from training import Trainee, train
 
 from tests.recipes.small_runs import ROBOT, SMALL, rows, run, trained
 
@@ -19,7 +19,7 @@ def compose(compose):
     return lambda *overrides: compose(*SMALLER, *overrides)
 
 
-def train(cfg, real, directory):
+def train_all(cfg, real, directory):
     return train_population(make_learner, cfg, members_of(cfg), real, directory)
 
 
@@ -47,11 +47,11 @@ def test_every_combination_is_a_member_with_a_name(compose):
 
 def test_each_member_learns_what_a_single_run_learns(compose, tmp_path):
     cfg, real = compose("seeds=[0,1]", "gaps=[null,gravity]", "mixings=[0.2]")
-    outcomes = train(cfg, real, tmp_path / "population")
+    outcomes = train_all(cfg, real, tmp_path / "population")
     figures = set()
     for name in ("seed_0_gravity_mixing_0.2", "seed_1_no_gap_mixing_0.2"):
         own = members_of(cfg)[name]
-        policy, training = train_h2o_plus(own, real, tmp_path / name)
+        policy, training = train(H2O_PLUS, own, real, tmp_path / name)
         assert_same_figures(outcomes[name].rows, training.rows, 1e-5)
         assert_same_figures(rows(tmp_path / "population" / name), rows(tmp_path / name), 1e-5)
         for mine, its in zip(outcomes[name].policy.parameters(), policy.parameters(), strict=True):
@@ -62,7 +62,7 @@ def test_each_member_learns_what_a_single_run_learns(compose, tmp_path):
 
 def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path, monkeypatch):
     cfg, real = compose("seeds=[0,1]", "keep=best_in_simulator")
-    train(cfg, real, tmp_path / "whole")
+    train_all(cfg, real, tmp_path / "whole")
     log = PopulationTraining.log_member
 
     def interrupt(self, epoch, member, **metrics):
@@ -74,11 +74,11 @@ def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path,
     monkeypatch.setattr("training.Trainee.close", lambda self: (closed.append(self.cfg.seed), close(self)))
     monkeypatch.setattr("population_training.PopulationTraining.log_member", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        train(cfg, real, tmp_path / "parts")
+        train_all(cfg, real, tmp_path / "parts")
     monkeypatch.undo()
     assert sorted(closed) == [0, 1]  # nobody's workers stay behind
     assert trained(tmp_path / "parts") != trained(tmp_path / "whole")
-    train(cfg, real, tmp_path / "parts")
+    train_all(cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
     for member in ("seed_0", "seed_1"):
         assert rows(tmp_path / "parts" / member) == rows(tmp_path / "whole" / member)
@@ -100,9 +100,9 @@ def break_seed_1(monkeypatch, at_epoch):
 
 def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(compose, tmp_path, monkeypatch):
     cfg, real = compose("seeds=[0,1,2]")
-    healthy = train(cfg, real, tmp_path / "healthy")
+    healthy = train_all(cfg, real, tmp_path / "healthy")
     simulated = break_seed_1(monkeypatch, at_epoch=1)
-    outcomes = train(cfg, real, tmp_path / "broken")
+    outcomes = train_all(cfg, real, tmp_path / "broken")
     failed = outcomes["seed_1"]
     assert [epoch for seed, epoch in simulated if seed == 1] == [0, 1]
     assert failed.failure == {"updates": 10, "why": "loss_qvalue not finite"}
@@ -112,7 +112,7 @@ def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(c
     for name in ("seed_0", "seed_2"):
         assert outcomes[name].failure is None
         assert outcomes[name].rows == healthy[name].rows
-    again = train(cfg, real, tmp_path / "broken")  # from the last checkpoint, which remembers
+    again = train_all(cfg, real, tmp_path / "broken")  # from the last checkpoint, which remembers
     assert again["seed_1"].failure == failed.failure
     assert again["seed_0"].rows == healthy["seed_0"].rows
 
