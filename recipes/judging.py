@@ -42,7 +42,7 @@ def judge(
     in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
     in_simulator = evaluate(simulator, policies[main], 1)
     behaviour = behaviour_in(cfg, real)
-    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour.mean, cfg)
+    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, cfg)
     write_summary(
         directory,
         {

@@ -7,6 +7,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from evaluation import Evaluation
 from omegaconf import DictConfig
 
 COLOURS = {
@@ -21,6 +22,9 @@ COLOURS = {
 }
 
 
+BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 3, "fontsize": 8}
+
+
 class Trained(Protocol):
     """What is told of a training when it is over."""
 
@@ -29,9 +33,9 @@ class Trained(Protocol):
     updates_per_second: float
 
 
-def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: float, cfg: DictConfig) -> None:
+def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Evaluation, cfg: DictConfig) -> None:
     """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(3, 2))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained", width_ratios=(3, 2))
     for name, training in trainings.items():
         updates, mean, std = (
             [row[key] for row in training.rows] for key in ("updates", "return_real", "return_real_std")
@@ -45,14 +49,17 @@ def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: fl
             alpha=0.2,
             lw=0,
         )
-    top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour])
+    top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour.mean])
     if left.get_ylim()[0] < -abs(top):  # a robot that runs away loses without bound and would flatten all else
         left.set_ylim(-0.25 * abs(top), 1.1 * top)
         left.text(0.01, 0.01, "returns below are cut off", transform=left.transAxes, fontsize=8, color="0.4")
-    left.axhline(behaviour, color="0.4", ls="--", lw=1, label="the data's behaviour")
+    label = "the data's behaviour"
+    if behaviour.mean_length > max(row["length_real"] for t in trainings.values() for row in t.rows):
+        label += f" (episodes of {behaviour.mean_length * cfg.env.seconds_per_step:.0f} s)"
+    left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=label)
     gap = f", simulator with {cfg.gap}" if cfg.gap else ""
     left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
-    left.legend(frameon=False)
+    left.legend(**BELOW)
 
     _draw_discriminators(right, next(iter(trainings.values())).rows)
     for axis in (left, right):
@@ -77,4 +84,4 @@ def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
     for key, style, colour, label in lines:
         axis.plot(updates, [row[key] for row in rows], style, ms=3, color=colour, label=label)
     axis.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (0.5: cannot be told)")
-    axis.legend(frameon=False, loc="lower right")
+    axis.legend(**BELOW)
