@@ -33,7 +33,11 @@ def main(cfg: DictConfig) -> None:
     to = Path(cfg.to or results)
     for group in cfg.groups:
         rows = of_one_budget(read_rows(results / f"{group}.csv"), cfg.updates, group)
-        if rows:
+        if not rows:
+            print(
+                f"{group}: no run in {results / group}.csv" + f" of {cfg.updates} updates" * (cfg.updates is not None)
+            )
+        else:
             report(group, rows, results, to, cfg.reps)
             if group == "wheel_legged":
                 draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))

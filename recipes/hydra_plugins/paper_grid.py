@@ -29,10 +29,13 @@ class PaperGrid(Sweeper):
         from grid import check_overrides, chosen_grid, group_name
         from results_file import GRID, adopt_run
 
-        self.results = Path(self.config.results or RESULTS / f"{group_name(self.config)}.csv").resolve()
         self.of_all = [argument for argument in arguments if argument.partition("=")[0] not in GRID | {"results"}]
-        own = list(chosen_grid(self.config).runs(tuple(self.config.seeds)))
-        check_overrides(self.of_all, own)
+        try:
+            self.results = Path(self.config.results or RESULTS / f"{group_name(self.config)}.csv").resolve()
+            own = list(chosen_grid(self.config).runs(tuple(self.config.seeds)))
+            check_overrides(self.of_all, own)
+        except ValueError as error:
+            sys.exit(f"{type(error).__name__}: {error}")
         runs = [[*run, *self.of_all] for run in own]
         for run in runs:
             adopt_run(self.results, self._identity(run))
