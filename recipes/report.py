@@ -34,13 +34,12 @@ def main(cfg: DictConfig) -> None:
     for group in cfg.groups:
         rows = of_one_budget(read_rows(results / f"{group}.csv"), cfg.updates, group)
         if not rows:
-            print(
-                f"{group}: no run in {results / group}.csv" + f" of {cfg.updates} updates" * (cfg.updates is not None)
-            )
-        else:
-            report(group, rows, results, to, cfg.reps)
-            if group == "wheel_legged":
-                draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))
+            asked = "" if cfg.updates is None else f" of {cfg.updates} updates"
+            print(f"{group}: no run{asked} in {results / group}.csv")
+            continue
+        report(group, rows, results, to, cfg.reps)
+        if group == "wheel_legged":
+            draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))
 
 
 def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:
