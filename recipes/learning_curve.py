@@ -22,7 +22,7 @@ COLOURS = {
 }
 
 
-BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 3, "fontsize": 8}
+BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 2, "fontsize": 8}
 
 
 class Trained(Protocol):
