@@ -3,11 +3,14 @@
 import signal
 import subprocess
 from collections import Counter
+from importlib.util import find_spec
+from types import SimpleNamespace
 
 import hydra
 import pytest
 from grid import FIGURES, TABLES, check_overrides, chosen_grid
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra_plugins.paper_grid import PaperGrid
 from methods import METHODS
 from results_file import CURVE, IDENTITY, RESULT, adopt_run, append_rows, identity, read_rows
 from torchrl.checkpoint import CheckpointRotation
@@ -130,6 +133,60 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     cfg, real = compose("updates=200", "method=cql", config="train")
     train(METHODS["cql"], cfg, real, tmp_path / "unbroken")
     assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
+
+
+def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
+    asked = command(*GRID, "methods=[cql,iql]", "updates=20000", script="paper.py")
+    process = subprocess.Popen(**asked, text=True)
+    while not checkpoint_of(tmp_path, "cql"):
+        assert process.poll() is None, process.communicate()[0]
+    process.send_signal(signal.SIGINT)
+    printed, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert printed.strip().endswith("interrupted with 2 runs to go; the same command goes on with them")
+
+
+@pytest.mark.skipif(find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="an extra: .[launchers]")
+def test_runs_at_once_record_what_runs_in_turn_do(command, tmp_path):
+    launchers = {"in_turn": [], "at_once": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
+    recorded = []
+    for name, overrides in launchers.items():
+        folder = [f"results={name}.csv", f"hydra.sweep.dir=outputs/{name}", *overrides]
+        small = [*GRID[:-1], "methods=[iql,sac]", "updates=20", *folder]
+        done = subprocess.run(**command(*small, script="paper.py"), text=True, check=False)
+        assert done.returncode == 0, done.stdout
+        rows = sorted(read_rows(tmp_path / f"{name}.csv"), key=lambda row: row["method"])
+        recorded.append([(row["method"], row["return_mean"], row["return_std"]) for row in rows])
+    assert recorded[0] == recorded[1]
+    assert len(recorded[0]) == 2
+
+
+def test_a_run_that_died_once_is_done_by_the_second_try(tmp_path, monkeypatch):
+    """As when a worker is killed, which takes the launcher's other jobs with it."""
+    launched = []
+
+    class Launcher:
+        def launch(self, jobs, initial_job_idx):
+            launched.append(len(jobs))
+            if len(launched) == 1:
+                raise RuntimeError("a worker was killed")
+            for number, _ in enumerate(jobs):
+                who = identity_of([f"method={number}"])
+                append_rows(grid.results, (*IDENTITY, *RESULT), [dict.fromkeys(RESULT, "1") | who], who)
+            return [SimpleNamespace(return_value=None) for _ in jobs]
+
+    def identity_of(run):
+        return dict.fromkeys(IDENTITY, "") | {"method": run[0].partition("=")[2]}
+
+    runs = [["method=0"], ["method=1"]]
+    monkeypatch.setattr("grid.chosen_grid", lambda cfg: SimpleNamespace(runs=lambda seeds: runs))
+    monkeypatch.setattr(PaperGrid, "_identity", lambda self, run: identity_of(run))
+    monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **kwargs: Launcher())
+    grid = PaperGrid()
+    cfg = paper("figure=wheel_legged", f"results={tmp_path / 'results.csv'}")
+    grid.setup(hydra_context=None, task_function=None, config=cfg)
+    grid.sweep([])
+    assert launched == [2, 2]
 
 
 def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path):
