@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from aggregates import common_scores, improvements, interquartile_means
+from report import ABLATIONS, paper_cells
+from report_figures import draw_curves
 from results_file import IDENTITY, RESULT, append_rows, read_rows
 from score_table import cells, markdown, normalised, placed
 
@@ -72,6 +75,48 @@ def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
     assert lines[-1].endswith("| paper |  | 4,513 ± 513 |")
     assert lines[-2].endswith("| score | 19.2 | 7.1 |")  # of D4RL's -280 to 12,135
     assert lines[-3].endswith("| ours | 2,100 ± 100 (3) | 600 ± 100 (3) |")
+
+
+@pytest.mark.parametrize(
+    ("group", "runs", "figures"),
+    [
+        (
+            "mixing",
+            [
+                row("h2o_plus", 0, 1, mixing=mixing, ratio=ratio)
+                for mixing, ratio in (("0.1", "True"), ("0.1", "False"))
+            ],
+            {"6,861 ± 268", "5,579 ± 530"},
+        ),
+        (
+            "gaps",
+            [row(method, 0, 1, strength=strength) for method in ("h2o", "h2o_plus") for strength in ("1.25", "3.0")],
+            {"6,846 ± 572", "6,171 ± 1,209", "7,165 ± 134", "6,135 ± 811"},
+        ),
+    ],
+)
+def test_the_paper_s_figures_stand_beside_the_ablations_they_are_of(group, runs, figures):
+    table = cells(placed(runs, variants=group in ABLATIONS))
+    theirs = paper_cells(read_rows(ROOT / "recipes" / "results" / "paper.csv"), group, table)
+    assert {text for cells_of_task in theirs.values() for text in cells_of_task.values()} == figures
+    assert theirs.keys() == table.keys()
+
+
+def test_curves_are_the_seeds_mean_and_their_range(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    rows = [row("sac", seed, seed * at, at=str(at)) for seed in (1, 2, 6) for at in (10, 20)]
+    draw_curves(tmp_path / "curves.png", rows, {"h2o_plus": "H2O+", "sac": "SAC"})
+    (axis,) = figures[0].axes
+    (line,) = axis.lines
+    assert line.get_xydata().tolist() == [[10.0, 30.0], [20.0, 60.0]]
+    (band,) = axis.collections
+    corners = band.get_paths()[0].vertices
+    assert [(corners[corners[:, 0] == at, 1].min(), corners[corners[:, 0] == at, 1].max()) for at in (10, 20)] == [
+        (10.0, 60.0),
+        (20.0, 120.0),
+    ]
+    assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["SAC"]
 
 
 def test_how_long_episodes_last_is_told_where_some_end_early():
