@@ -84,7 +84,7 @@ def draw_aggregates(
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 0.45 * len(means) + 1.6), layout="constrained")
     _draw_intervals(left, means, titles)
-    left.set_xlabel("interquartile mean of the normalised score")
+    left.set(xlabel="interquartile mean of the normalised score", xlim=(min(0.0, left.get_xlim()[0]), None))
     _draw_intervals(right, better, titles)
     right.axvline(0.5, color="0.6", ls="--", lw=1)
     right.set(xlabel="P(H2O+ does better)", xlim=(-0.02, 1.02))
