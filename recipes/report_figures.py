@@ -47,7 +47,8 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
     labels = [title for title in titles.values() if title in handles]
     beside = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
     figure.legend([handles[label] for label in labels], labels, **beside)
-    figure.suptitle("The policy in training, at each evaluation; bands from the lowest seed to the highest", fontsize=8)
+    said = "The policy in training, at each evaluation;\nbands from the lowest seed to the highest"
+    figure.suptitle(said, fontsize=8)
     _save(figure, path)
 
 
