@@ -15,7 +15,7 @@ from compiling import maybe_compiled
 from environments import as_observed
 from omegaconf import DictConfig, OmegaConf
 from population_learner import PopulationLearner
-from run import Training, checkpoint_folder, num_epochs, save_config, write_metrics
+from run import Training, checkpoint_folder, num_epochs, save_config, uninterrupted, write_metrics
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
@@ -173,7 +173,8 @@ def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outco
     rotation = CheckpointRotation(checkpoint_folder(training.directory / name, training.name), keep_last=1)
     failure = training.failures.get(name)
     updates = training.updates if failure is None else failure["updates"]
-    rotation.save(Checkpoint(format="archive", **policies), step=updates)
+    with uninterrupted():
+        rotation.save(Checkpoint(format="archive", **policies), step=updates)
     return Outcome(
         trainee.policy,
         training.rows_of(name),

@@ -8,8 +8,10 @@ import csv
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -81,6 +83,22 @@ def claimed(directory: Path) -> Iterator[None]:
         ) from None
 
 
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """A Ctrl-C inside takes effect at the end: one that breaks off file operations can come out as an OSError."""
+    if threading.current_thread() is not threading.main_thread():  # which alone is interrupted
+        yield
+        return
+    came = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
 def _opened(cfg: DictConfig, directory: Path) -> tuple[DictConfig, Path]:
     torch.set_num_threads(cfg.threads)
     tqdm.write(f"run folder: {os.path.relpath(directory)}")
@@ -149,7 +167,8 @@ class Training:
             self.progress["epoch"] = epoch + 1
             self.progress["seconds"] += time.perf_counter() - start
             if last or (epoch + 1) % self.cfg.checkpoint_every == 0:
-                self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
+                with uninterrupted():
+                    self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
         self._bar.close()
 
     def epoch_updates(self) -> Iterator[int]:

@@ -14,7 +14,7 @@ from evaluation import evaluate
 from h2o_plus import H2O_PLUS
 from run import Training
 from sac import SAC
-from torchrl.checkpoint import CheckpointRotation
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from training import train
 
 from tests.recipes.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
@@ -154,6 +154,21 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
     monkeypatch.undo()
     train(H2O_PLUS, cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
+
+
+def test_ctrl_c_waits_until_the_checkpoint_is_written(compose, tmp_path, monkeypatch):
+    cfg, real = compose("updates=60")
+    save = CheckpointRotation.save
+
+    def interrupted(self, *args, **kwargs):
+        signal.raise_signal(signal.SIGINT)
+        return save(self, *args, **kwargs)
+
+    monkeypatch.setattr(CheckpointRotation, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(SAC, cfg, real, tmp_path)
+    latest = CheckpointRotation(tmp_path / "checkpoints" / "sac_in_the_simulator", keep_last=1).latest()
+    assert Checkpoint.manifest(latest)["metadata"]["progress"]["epoch"] == 1
 
 
 def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
