@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from omegaconf import DictConfig
+from run import uninterrupted
 
 from torchrl_h2o.effects import PAPER_GAPS
 
@@ -99,8 +100,14 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
             who | {"at": row["updates"], **{f"return_{key}": _rounded(row[name]) for key, name in EVALUATED.items()}}
             for row in csv.DictReader(file)
         ]
-    append_rows(path, (*IDENTITY, *RESULT), [result], who)
-    append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, who)
+    _append(path, result, curve)
+
+
+def _append(path: Path, result: Mapping, curve: Iterable[Mapping]) -> None:
+    """Appends a run's curve and its result, which says that the run is done: last, should it be killed here."""
+    with uninterrupted():
+        append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, result)
+        append_rows(path, (*IDENTITY, *RESULT), [result], result)
 
 
 def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who: Mapping[str, str]) -> None:
@@ -110,7 +117,7 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
         fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may be done at the same moment
         file.seek(0)
         there = list(csv.DictReader(file))
-        if any(_is(row, who) for row in there):
+        if any(_key(row) == _key(who) for row in there):
             return
         writer = csv.DictWriter(file, list(columns))
         if file.seek(0, 2) == 0:
@@ -118,14 +125,22 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
         writer.writerows(rows)
 
 
-def adopt_run(path: Path, who: Mapping[str, str]) -> None:
-    """Takes a run that another group of the same folder has done, with its curve, if there is one."""
+def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
+    """Takes what other groups of the same folder have done of some runs, with the curves."""
+    missing = {_key(who) for who in runs} - recorded(path)
     for other in sorted(path.parent.glob("*.csv")):
-        rows = [row for row in read_rows(other) if row.keys() >= {*IDENTITY, *RESULT} and _is(row, who)]
-        if rows and other != path:
-            append_rows(path, (*IDENTITY, *RESULT), rows, who)
-            curve = [row for row in read_rows(curves_of(other)) if _is(row, who)]
-            append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, who)
+        if other == path or not _is_group(other):
+            continue
+        rows, curves = read_rows(other), read_rows(curves_of(other))
+        for row in rows:
+            if _key(row) in missing:
+                _append(path, row, [point for point in curves if _key(point) == _key(row)])
+
+
+def _is_group(path: Path) -> bool:
+    """Whether a CSV, which may be anybody's, is that of a group of runs."""
+    with open(path, newline="", errors="replace") as file:
+        return next(csv.reader(file), None) == [*IDENTITY, *RESULT]
 
 
 def curves_of(path: Path) -> Path:
@@ -141,13 +156,13 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def is_recorded(path: Path, who: Mapping[str, str]) -> bool:
-    """Whether a run's row stands in the CSV."""
-    return any(_is(row, who) for row in read_rows(path))
+def recorded(path: Path) -> set[tuple[str, ...]]:
+    """The identities, as tuples in the order of :data:`IDENTITY`, of the runs that stand in the CSV."""
+    return {_key(row) for row in read_rows(path)}
 
 
-def _is(row: Mapping[str, str], who: Mapping[str, str]) -> bool:
-    return all(row[key] == value for key, value in who.items())
+def _key(who: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(who[column] for column in IDENTITY)
 
 
 def _rounded(value: float | str) -> float:

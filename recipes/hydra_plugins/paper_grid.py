@@ -27,7 +27,7 @@ class PaperGrid(Sweeper):
     def sweep(self, arguments: list[str]) -> Sequence[JobReturn]:
         # Hydra imports every plugin at each start of any recipe: the library comes when a grid is run.
         from grid import check_overrides, chosen_grid, group_name
-        from results_file import GRID, adopt_run
+        from results_file import GRID, adopt_runs
 
         self.of_all = [argument for argument in arguments if argument.partition("=")[0] not in GRID | {"results"}]
         try:
@@ -37,8 +37,7 @@ class PaperGrid(Sweeper):
         except ValueError as error:
             sys.exit(f"{type(error).__name__}: {error}")
         runs = [[*run, *self.of_all] for run in own]
-        for run in runs:
-            adopt_run(self.results, self._identity(run))
+        adopt_runs(self.results, [self._identity(run) for run in runs])
         remaining = self._remaining(runs)
         print(f"{len(runs)} runs, {len(runs) - len(remaining)} of them done; results go to {self.results}")
         errors: dict[str, str] = {}
@@ -66,9 +65,10 @@ class PaperGrid(Sweeper):
         return {self._folder(run): said for run, job in zip(runs, returns, strict=True) if (said := _error_of(job))}
 
     def _remaining(self, runs: list[list[str]]) -> list[list[str]]:
-        from results_file import is_recorded
+        from results_file import recorded
 
-        return [run for run in runs if not is_recorded(self.results, self._identity(run))]
+        done = recorded(self.results)
+        return [run for run in runs if tuple(self._identity(run).values()) not in done]
 
     def _identity(self, run: list[str]) -> dict[str, str]:
         from results_file import identity

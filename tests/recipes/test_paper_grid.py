@@ -12,7 +12,7 @@ from grid import FIGURES, TABLES, check_overrides, chosen_grid
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.paper_grid import PaperGrid
 from methods import METHODS
-from results_file import CURVE, IDENTITY, RESULT, adopt_run, append_rows, identity, read_rows
+from results_file import CURVE, IDENTITY, RESULT, adopt_runs, append_rows, identity, read_rows
 from torchrl.checkpoint import CheckpointRotation
 from training import train
 
@@ -194,10 +194,11 @@ def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path
     for name, columns in (("a.csv", (*IDENTITY, *RESULT)), ("a_curves.csv", (*IDENTITY, *CURVE))):
         rows = [dict.fromkeys(columns, "1") | whose for whose in (who, who | {"seed": "y"})]
         for row in rows:
-            append_rows(tmp_path / name, columns, [row], {key: row[key] for key in IDENTITY})
+            append_rows(tmp_path / name, columns, [row], row)
+    (tmp_path / "notes.csv").write_bytes(b"anybody's\xff, x\n")
+    (tmp_path / "empty.csv").touch()
     for _ in range(2):
-        adopt_run(tmp_path / "b.csv", who)
-        adopt_run(tmp_path / "b.csv", who | {"seed": "z"})
+        adopt_runs(tmp_path / "b.csv", [who, who | {"seed": "z"}])
     assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]
     assert [row["seed"] for row in read_rows(tmp_path / "b_curves.csv")] == ["x"]
 
