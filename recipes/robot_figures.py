@@ -27,8 +27,8 @@ def draw_robot(to: Path, kept: Mapping[str, np.ndarray]) -> None:
     """
     by_kind: dict[str, dict[tuple[str, str], list[np.ndarray]]] = {"way": {}, "states": {}}
     for key, array in sorted(kept.items()):
-        kind, task, method, *_ = key.split(" ")
-        by_kind[kind].setdefault((task, method), []).append(array)
+        kind, method, env, *_ = key.split(" ")
+        by_kind[kind].setdefault((env.rpartition("/")[2], method), []).append(array)
     if by_kind["way"]:
         draw_trajectories(to / "wheel_legged_trajectories.png", by_kind["way"])
     if by_kind["states"]:

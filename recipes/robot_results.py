@@ -1,7 +1,8 @@
 """What the paper's Figures 3 and 4 are drawn of: the robot's way in reality, and where it was in the simulator.
 
-Kept beside the results, in wheel_legged_figures.npz, as runs' folders do not last: for each run, by its name,
-``way <run>``, ``[episodes, T]``, every 0.2 s, NaN once it fell, and ``states <run>``, ``[pitch, pitch rate]``, counts.
+Kept beside the results, in wheel_legged_figures.npz, as runs' folders do not last: for each run, by its identity in
+the CSV with ``-`` for what is empty, ``way <run>``, ``[episodes, T]``, every 0.2 s, NaN once it fell, and
+``states <run>``, ``[pitch, pitch rate]``, counts.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,7 +40,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
         told: the rows of the results that are asked for; folders of other runs are left alone.
 
     Returns:
-        The arrays by ``way`` or ``states`` and the run's name: task, method, seed, updates and what else was chosen.
+        The arrays by ``way`` or ``states`` and the run's identity.
     """
     asked = {tuple(row[key] for key in IDENTITY): _name(row) for row in told}
     arrays = dict(np.load(path)) if path.exists() else {}
@@ -57,8 +58,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
 
 
 def _name(row: Mapping[str, str]) -> str:
-    task = row["env"].rpartition("/")[2]
-    return " ".join(filter(None, (task, row["method"], row["seed"], row["updates"], row["others"])))
+    return " ".join(row[key] or "-" for key in IDENTITY)
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:

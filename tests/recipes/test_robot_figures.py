@@ -25,7 +25,9 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     append_run(tmp_path / "wheel_legged.csv", cfg, folder)
     rows = read_rows(tmp_path / "wheel_legged.csv")
     kept = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
-    way, states = kept["way standing_still h2o_plus 0 20"], kept["states standing_still h2o_plus 0 20"]
+    (run,) = {key.partition(" ")[2] for key in kept}
+    assert run.startswith("h2o_plus wheel_legged/standing_still recorded - - 0 20 expectile 0.3 True ")
+    way, states = kept[f"way {run}"], kept[f"states {run}"]
     assert way.shape == (5, 7)  # 1.5 s
     lasts = json.loads((folder / "summary.json").read_text())["return_real"]["mean_length"] * cfg.env.seconds_per_step
     seen = (~np.isnan(way)).sum() / 5 * EVERY
@@ -41,7 +43,7 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     shutil.rmtree(folder)
     again = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
     np.testing.assert_equal(again, kept)
-    assert not kept_results(tmp_path / "kept.npz", tmp_path / "runs", [rows[0] | {"updates": "30"}])
+    assert not kept_results(tmp_path / "kept.npz", tmp_path / "runs", [rows[0] | {"mixing": "0.9"}])
     draw_robot(tmp_path, again)
     for name in ("wheel_legged_trajectories.png", "wheel_legged_diversity.png"):
         assert (tmp_path / name).stat().st_size > 10_000
