@@ -53,10 +53,7 @@ def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Ev
     if left.get_ylim()[0] < -abs(top):  # a robot that runs away loses without bound and would flatten all else
         left.set_ylim(-0.25 * abs(top), 1.1 * top)
         left.text(0.01, 0.01, "returns below are cut off", transform=left.transAxes, fontsize=8, color="0.4")
-    label = "the data's behaviour"
-    if behaviour.mean_length > max(row["length_real"] for t in trainings.values() for row in t.rows):
-        label += f" (episodes of {behaviour.mean_length * cfg.env.seconds_per_step:.0f} s)"
-    left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=label)
+    left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=_label_of(behaviour, cfg))
     gap = f", simulator with {cfg.gap}" if cfg.gap else ""
     left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
     left.legend(**BELOW)
@@ -67,6 +64,14 @@ def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Ev
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=150)
     plt.close(figure)
+
+
+def _label_of(behaviour: Evaluation, cfg: DictConfig) -> str:
+    """Says how long the data's episodes are, where those of a policy end sooner and so can return less."""
+    longest = cfg.env.make.get("max_episode_steps")
+    if longest is None or behaviour.mean_length <= longest:
+        return "the data's behaviour"
+    return f"the data's behaviour (episodes of {behaviour.mean_length * cfg.env.seconds_per_step:.0f} s)"
 
 
 def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
