@@ -56,11 +56,11 @@ def common_scores(table: dict[Task, dict[str, Cell]]) -> Scores:
     seeds = sorted(set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods))) if tasks else []
     runs, columns = {}, {}
     for name in methods:
-        first = {_seen(name, task): task for task in reversed(tasks)}
-        order = list(first)
-        cells = [(task[0], table[task][name]) for task in first.values()]
+        seen = [_seen(name, task) for task in tasks]
+        own = dict(zip(seen, tasks, strict=True))  # one task of each run's
+        cells = [(task[0], table[task][name]) for task in own.values()]
         runs[name] = np.array([[normalised(env, cell.returns[seed]) for env, cell in cells] for seed in seeds])
-        columns[name] = np.array([order.index(_seen(name, task)) for task in tasks], dtype=int)
+        columns[name] = np.array([list(own).index(run) for run in seen], dtype=int)
     return Scores(runs, columns, tasks, seeds)
 
 
