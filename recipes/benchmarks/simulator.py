@@ -17,16 +17,15 @@ import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 import json
 import os
 from collections.abc import Callable
-
 from itertools import cycle
 
 import hydra
 import mujoco
 import numpy as np
+import torch
 from hydra.core.hydra_config import HydraConfig
 from mujoco.rollout import Rollout
 from omegaconf import DictConfig
-import torch
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv
 from torchrl.envs.utils import step_mdp

@@ -31,7 +31,7 @@ class TaskRules(ABC):
 
     @abstractmethod
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """The observations, (N, n), of states (N, nq) and (N, nv)."""
+        """The observations, (N, n), of states (N, nq) and (N, nv): a new array, as the env goes on writing to those."""
 
     @abstractmethod
     def reward(
