@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from itertools import product
 
 from methods import METHODS
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from results_file import key_of
 
 from torchrl_h2o.effects import PAPER_GAPS
@@ -22,7 +22,7 @@ class Grid:
 
     Args:
         methods: by the names of methods.py.
-        datasets: by their Minari names, whose first part is the environment; none for the robot's own.
+        datasets: Minari names or files, in whose name the environment's stands; none for the robot's own.
         gaps: by the names of the paper; those that an environment has not are left out.
         strengths: of the gap; None is the paper's.
         tasks: environments with data of their own, instead of data sets and gaps.
@@ -39,24 +39,30 @@ class Grid:
     def runs(self, seeds: tuple[int, ...]) -> Iterator[list[str]]:
         """The overrides of each run, seed by seed, so that a grid that is broken off has every cell once."""
         for seed in seeds:
-            worlds = [*product(self.datasets, self.gaps, self.strengths), *((task, None, None) for task in self.tasks)]
+            worlds = [*product(self.datasets, self.gaps, self.strengths), *product(self.tasks, (None,), (None,))]
             done = set()
             for (world, gap, strength), method, variant in product(worlds, self.methods, self.variants):
-                overrides = _run(world, None if method in OFFLINE else gap, strength, method, variant, seed)
+                env, data = (world, None) if world in self.tasks else (env_of(world), world)
+                gap = None if method in OFFLINE else gap
+                overrides = _run(env, data, gap, strength, method, variant, seed)
                 if overrides is not None and tuple(overrides) not in done:
                     done.add(tuple(overrides))
                     yield overrides
 
 
+def env_of(data: str) -> str | None:
+    """The environment whose name stands in that of a data set."""
+    return next((env for env in ENVS if env in data), None)
+
+
 def _run(
-    world: str, gap: str | None, strength: float | None, method: str, variant: tuple, seed: int
+    env: str, data: str | None, gap: str | None, strength: float | None, method: str, variant: tuple, seed: int
 ) -> list[str] | None:
-    env, _, dataset = world.partition("/")
     chosen = [f"method={method}", f"env={env}"]
-    if dataset:
+    if data is not None:
         if gap is not None and ENVS[env] not in PAPER_GAPS[gap].tasks:
             return None
-        chosen += [f"data={world}", f"gap={'null' if gap is None else gap}"]
+        chosen += [f"data={data}", f"gap={'null' if gap is None else gap}"]
         if gap is not None and strength is not None:
             chosen.append(f"gap_strength={strength}")
     return [*chosen, *variant, f"seed={seed}"]
@@ -70,6 +76,7 @@ TABLES = {
         variants=(*((f"mixing={value}",) for value in (0.0, 0.1, 0.2, 0.5, 1.0)), WITHOUT_RATIO),
     ),
     "gaps": Grid(("h2o", "h2o_plus"), (REPLAY,), strengths=(1.25, 1.5, 2.0, 3.0)),
+    "methods": Grid(SIX),  # not the paper's: on tasks of one's own
 }
 FIGURES = {
     "backbones": Grid(
@@ -102,16 +109,21 @@ def chosen_grid(cfg: DictConfig) -> Grid:
         ValueError: for a choice that there is not, or that these runs would not read.
     """
     name = group_name(cfg)
-    asked = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks")}
-    chosen = {key: tuple(value) for key, value in asked.items() if value is not None}
+    asked = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
+    for key, value in asked.items():
+        if not OmegaConf.is_list(value):
+            raise ValueError(f"{key}={value}: give a list, {key}=[{value}]")
+    chosen = {key: tuple(value) for key, value in asked.items()}
     there = {"methods": METHODS, "gaps": PAPER_GAPS}
     for key, names in there.items():
         for unknown in set(chosen.get(key, ())) - set(names):
             raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}")
     for data in chosen.get("datasets", ()):
-        if data.partition("/")[0] not in ENVS:
-            raise ValueError(f"datasets=[{data}]: its environment is none of {', '.join(ENVS)}")
+        if env_of(data) is None:
+            raise ValueError(f"datasets=[{data}]: {' or '.join(ENVS)} is to stand in its name; see tasks=[...] too")
     grid = Grid(**(vars((TABLES | FIGURES)[name]) | chosen))
+    if not grid.datasets and not grid.tasks:
+        raise ValueError(f"{name} is of no environment yet: name tasks=[...], files in recipes/config/env/")
     if not grid.datasets and (idle := [key for key in ("gaps", "strengths") if key in chosen]):
         raise ValueError(f"{name} has no data sets that {' and '.join(idle)} would be put to: leave that out")
     return grid
@@ -126,6 +138,7 @@ def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
     chooses = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
     chooses["seed"] = "seeds"
     of_runs = {key_of(override) for run in runs for override in run}
+    of_runs |= {"gap_strength"} if "gap" in of_runs else set()
     for override in overrides:
         if (key := key_of(override)) in of_runs:
             instead = f"choose with {chooses[key]}=[...]" if key in chooses else "leave it out, or take another grid"

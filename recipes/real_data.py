@@ -32,7 +32,7 @@ def read_real_data(cfg: DictConfig) -> TensorDictBase:
     if columns is None and Path(cfg.data).is_file() and Path(cfg.data).suffix not in (".hdf5", ".h5"):
         columns = cfg.env.get("columns")  # a log of this robot
     reward = instantiate(cfg.env.reward) if "reward" in cfg.env else None
-    data = load(cfg.data, columns=columns, reward=reward, task=cfg.env.name)
+    data = load(cfg.data, columns=columns, reward=reward, task=cfg.env.make.get("env_name", cfg.env.name))
     check_specs(data, make_reality(cfg, raw=True), source=cfg.data)
     return data
 

@@ -26,7 +26,7 @@ RESULT = (
     "versions",
     "command",
 )
-#: overrides that other columns tell of, or that change no number
+#: overrides that other columns tell of, or that change nothing but how numbers round
 TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
 #: overrides of paper.py, which choose among runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "seeds", "retries"}

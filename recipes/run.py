@@ -60,11 +60,16 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         raise ValueError(f"compiled={cfg.compiled}: choose auto, true or false")
     if cfg.gap is None and cfg.get("gaps") is None and cfg.gap_strength is not None:
         raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
-    for key in ("data", "columns", "gap_fix"):  # a resumed run may start elsewhere
-        if cfg[key] is not None and Path(cfg[key]).exists():
-            cfg[key] = str(Path(cfg[key]).resolve())
+    resolve_paths(cfg)
     save_config(cfg, directory)
     return _opened(cfg, directory)
+
+
+def resolve_paths(cfg: DictConfig) -> None:
+    """Makes what names files absolute, in place: a resumed run may start elsewhere."""
+    for key in ("data", "columns", "gap_fix"):
+        if cfg[key] is not None and Path(cfg[key]).exists():
+            cfg[key] = str(Path(cfg[key]).resolve())
 
 
 @contextmanager

@@ -72,6 +72,7 @@ class PaperGrid(Sweeper):
 
     def _identity(self, run: list[str]) -> dict[str, str]:
         from results_file import identity
+        from run import resolve_paths
 
         own = run[: len(run) - len(self.of_all)]
         cfg = self._composed(next(override for override in own if override.startswith("env="))).copy()
@@ -79,6 +80,7 @@ class PaperGrid(Sweeper):
             if override.key_or_group != "env":
                 cfg[override.key_or_group] = override.value()
         cfg.overrides = run
+        resolve_paths(cfg)
         return identity(cfg)
 
     def _composed(self, env: str) -> DictConfig:

@@ -13,10 +13,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra_plugins.paper_grid import PaperGrid
 from methods import METHODS
 from results_file import CURVE, IDENTITY, RESULT, adopt_runs, append_rows, identity, read_rows
+from run import load_config
 from torchrl.checkpoint import CheckpointRotation
 from training import train
 
 from tests.recipes.small_runs import ROBOT, ROOT, SMALL, trained
+from torchrl_h2o.data import write_ted
 
 
 def chosen(runs, key):
@@ -54,6 +56,16 @@ def test_any_subset_is_an_override():
     assert chosen(runs, "gap") == {"gravity": 6, "friction": 6, "null": 6}
 
 
+def test_data_sets_are_any_that_have_the_environment_in_their_name_and_tasks_any_environment():
+    public, hdf5 = "mujoco/walker2d/expert-v0", "files/halfcheetah_medium-v2.hdf5"
+    cfg = paper("table=returns", f"datasets=[{public},{hdf5}]", "gaps=[gravity]", "methods=[sac]")
+    runs = list(chosen_grid(cfg).runs((0,)))
+    assert [run[1:3] for run in runs] == [["env=walker2d", f"data={public}"], ["env=halfcheetah", f"data={hdf5}"]]
+    own = list(chosen_grid(paper("table=methods", "tasks=[mine]")).runs((0,)))
+    assert chosen(own, "env") == {"mine": 6}
+    assert not chosen(own, "gap")
+
+
 @pytest.mark.parametrize("overrides", [["table=main"], [], ["table=returns", "figure=backbones"]])
 def test_a_grid_that_there_is_not_is_said(overrides):
     with pytest.raises(ValueError, match=r"choose returns, mixing, gaps|name one"):
@@ -65,7 +77,9 @@ def test_a_grid_that_there_is_not_is_said(overrides):
     [
         (["table=returns", "methods=[ppo]"], r"methods=\[ppo\]: choose sac, cql"),
         (["table=returns", "gaps=[gravty]"], r"gaps=\[gravty\]: choose gravity"),
-        (["table=returns", "datasets=[hopper/medium-v0]"], "its environment is none of halfcheetah, walker2d"),
+        (["table=returns", "datasets=[hopper/medium-v0]"], "halfcheetah or walker2d is to stand in its name"),
+        (["table=returns", "methods=iql"], r"give a list, methods=\[iql\]"),
+        (["table=methods"], r"name tasks=\[...\]"),
         (["figure=wheel_legged", "gaps=[gravity]"], "has no data sets that gaps would be put to"),
     ],
 )
@@ -79,6 +93,7 @@ def test_a_choice_that_there_is_not_is_said_before_anything_runs(overrides, said
     [
         (TABLES["returns"], "gap=friction", r"set gap themselves; choose with gaps="),
         (TABLES["returns"], "+seed=1", r"choose with seeds="),
+        (TABLES["returns"], "gap_strength=3", r"choose with strengths="),
         (FIGURES["backbones"], "backbone=sparse", "leave it out, or take another grid"),
     ],
 )
@@ -134,6 +149,13 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     train(METHODS["cql"], cfg, real, tmp_path / "unbroken")
     assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
 
+    one = load_config(second)
+    assert one.seeds is None  # or h2o_plus.py would go on with it as a population
+    moved = [*GRID[:-1], "results=elsewhere/results.csv", "methods=[cql]", "updates=200"]
+    done = subprocess.run(**command(*moved, script="paper.py"), text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert [row["method"] for row in read_rows(tmp_path / "elsewhere" / "results.csv")] == ["cql"]
+
 
 def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
     asked = command(*GRID, "methods=[cql,iql]", "updates=20000", script="paper.py")
@@ -147,12 +169,14 @@ def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
 
 
 @pytest.mark.skipif(find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="an extra: .[launchers]")
-def test_runs_at_once_record_what_runs_in_turn_do(command, tmp_path):
+def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
+    _, real = compose()
+    write_ted(real, tmp_path / "recording")
     launchers = {"in_turn": [], "at_once": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
     recorded = []
     for name, overrides in launchers.items():
         folder = [f"results={name}.csv", f"hydra.sweep.dir=outputs/{name}", *overrides]
-        small = [*GRID[:-1], "methods=[iql,sac]", "updates=20", *folder]
+        small = [*GRID[:-1], "methods=[iql,sac]", "updates=20", "data=recording", *folder]
         done = subprocess.run(**command(*small, script="paper.py"), text=True, check=False)
         assert done.returncode == 0, done.stdout
         rows = sorted(read_rows(tmp_path / f"{name}.csv"), key=lambda row: row["method"])
