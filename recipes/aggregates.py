@@ -1,12 +1,12 @@
 """Over all tasks of a group: interquartile mean and probability of improvement, with intervals, by rliable."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from grid import OFFLINE, SIX
 from rliable import library, metrics
-from score_table import Cell, Task, normalised
+from score_table import REFERENCES, Cell, Reference, Task, normalised
 
 BASE = "h2o_plus"
 
@@ -44,24 +44,27 @@ class Scores:
         return lambda runs: runs[:, self.columns[name]]
 
 
-def common_scores(table: dict[Task, dict[str, Cell]]) -> Scores:
+def common_scores(table: dict[Task, dict[str, Cell]], references: Mapping[str, Reference] = REFERENCES) -> Scores:
     """The tasks that every method of the paper has that is there at all, and the seeds that they all have in these.
 
-    Further methods are in if they have all of these.
+    Further methods are in if they have all of these tasks and seeds.
     """
     there = {name for cells in table.values() for name in cells}
     methods = [name for name in SIX if name in there] or sorted(there)
     tasks = sorted(task for task, cells in table.items() if set(methods) <= set(cells))
-    methods += [name for name in sorted(there - set(methods)) if all(name in table[task] for task in tasks)]
-    seeds = sorted(set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods))) if tasks else []
+    seeds = set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods)) if tasks else set()
+    further = sorted(there - set(methods))
+    methods += [m for m in further if all(m in table[t] and seeds <= set(table[t][m].returns) for t in tasks)]
     runs, columns = {}, {}
     for name in methods:
         seen = [_seen(name, task) for task in tasks]
         own = dict(zip(seen, tasks, strict=True))  # one task of each run's
         cells = [(task[0], table[task][name]) for task in own.values()]
-        runs[name] = np.array([[normalised(env, cell.returns[seed]) for env, cell in cells] for seed in seeds])
+        runs[name] = np.array(
+            [[normalised(cell.returns[seed], references[env]) for env, cell in cells] for seed in sorted(seeds)]
+        )
         columns[name] = np.array([list(own).index(run) for run in seen], dtype=int)
-    return Scores(runs, columns, tasks, seeds)
+    return Scores(runs, columns, tasks, sorted(seeds))
 
 
 def _seen(name: str, task: Task) -> Task:

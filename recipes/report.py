@@ -3,10 +3,12 @@
 python recipes/report.py                              # all that is there
 python recipes/report.py groups=[returns] updates=50000
 python recipes/report.py groups=[wheel_legged] runs=outputs/paper    # with the robot's trajectories
+python recipes/report.py results=. groups=[mine] +references.Hopper-v5=[0,3200]    # mine.csv; what is 0 and 100
 """
 
 import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
+import sys
 from pathlib import Path
 
 import hydra
@@ -17,7 +19,7 @@ from report_figures import draw_aggregates, draw_curves
 from results_file import curves_of, read_rows
 from robot_figures import draw_robot
 from robot_results import kept_results
-from score_table import REFERENCES, VARIANTS, Row, Task, cells, markdown, placed
+from score_table import REFERENCES, VARIANTS, MixedRunsError, Reference, Row, Task, cells, markdown, placed
 
 TITLES = {name: method.title for name, method in METHODS.items()}
 SCORES = (
@@ -31,45 +33,60 @@ ABLATIONS = ("mixing", "backbones")  # one method, whose variants are compared
 def main(cfg: DictConfig) -> None:
     results = Path(cfg.results or Path(__file__).parent / "results")
     to = Path(cfg.to or results)
+    references = REFERENCES | {env: tuple(returns) for env, returns in cfg.references.items()}
+    refused = []
     for group in cfg.groups:
-        rows = of_one_budget(read_rows(results / f"{group}.csv"), cfg.updates, group)
-        if not rows:
-            asked = "" if cfg.updates is None else f" of {cfg.updates} updates"
-            print(f"{group}: no run{asked} in {results / group}.csv")
+        try:
+            rows = of_one_budget(read_rows(results / f"{group}.csv"), cfg.updates, group)
+            if not rows:
+                asked = "" if cfg.updates is None else f" of {cfg.updates} updates"
+                print(f"{group}: no run{asked} in {results / group}.csv")
+                continue
+            report(group, rows, results, to, references, cfg.reps)
+        except MixedRunsError as error:
+            refused.append(str(error))
             continue
-        report(group, rows, results, to, cfg.reps)
         if group == "wheel_legged":
             draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))
+    if refused:
+        sys.exit("\n".join(refused))
 
 
 def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:
     """The runs of one number of updates, so that none is set beside one that learnt for longer.
 
     Raises:
-        ValueError: if there are several numbers and none is asked for.
+        MixedRunsError: if there are several numbers and none is asked for.
     """
     budgets = sorted({int(row["updates"]) for row in rows})
     if updates is None and len(budgets) > 1:
-        raise ValueError(f"{group}.csv holds runs of {budgets} updates: choose one with updates=...")
+        raise MixedRunsError(f"{group}.csv holds runs of {budgets} updates: choose one with updates=...")
     return [row for row in rows if updates is None or int(row["updates"]) == updates]
 
 
-def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> None:
-    """Writes a group's table, learning curves and aggregates, and prints the table."""
+def report(group: str, rows: list[Row], results: Path, to: Path, references: dict[str, Reference], reps: int) -> None:
+    """Writes a group's table, learning curves and aggregates, and prints the table.
+
+    Raises:
+        MixedRunsError: if a method has two runs of a seed in a task.
+    """
     variants = group in ABLATIONS
     table = cells(placed(rows, variants))
     theirs = paper_cells(read_rows(results / "paper.csv"), group, table)
-    lines = [markdown(table, TITLES, theirs), ""]
+    lines = [markdown(table, TITLES, theirs, references), ""]
     lines.append(
         "Returns in reality: mean ± standard deviation over the seeds (how many); of one seed, over its episodes."
     )
-    lines.append(f"After {int(rows[0]['updates']):,} updates, by the last policy.")
+    kept = "" if any("keep=" in row["others"] for row in rows) else ", by the last policy"
+    lines.append(f"After {int(rows[0]['updates']):,} updates{kept}.")
     if theirs:
-        lines.append("The paper's: five seeds, 1,000,000 updates.")
+        lines.append("The paper's: five seeds, 1,000,000 updates, D4RL's data.")
     lines.append(SCORES)
-    scores = common_scores(table)
-    if len(scores.runs) > 1 and all(task[0] in REFERENCES for task in scores.tasks):
-        lines += ["", *aggregate_lines(group, scores, len(table), to, reps)]
+    (to / f"{group}_aggregates.png").unlink(missing_ok=True)  # of other runs, perhaps
+    if unknown := sorted({task[0] for task in table} - references.keys()):
+        lines.append(f"No scores without returns that count as 0 and 100: +references.{unknown[0]}=[...,...].")
+    elif len({name for methods in table.values() for name in methods}) > 1:
+        lines += ["", *aggregate_lines(group, common_scores(table, references), len(table), to, reps)]
     text = "\n".join(lines) + "\n"
     to.mkdir(parents=True, exist_ok=True)
     (to / f"{group}.md").write_text(text)
@@ -82,6 +99,8 @@ def report(group: str, rows: list[Row], results: Path, to: Path, reps: int) -> N
 
 def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:
     """What the methods come to over all tasks, drawn too; of one seed, whose intervals would have no width, nothing."""
+    if not scores.tasks:
+        return ["Interquartile means take a task that every method has done."]
     if len(scores.seeds) < 2:
         return ["Interquartile means and their intervals take two seeds of every method, or more."]
     means = interquartile_means(scores, reps)

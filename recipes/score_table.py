@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from grid import OFFLINE
 
+Reference = tuple[float, float]  # returns that count as 0 and as 100
 #: Returns that count as 0 and as 100: D4RL's random and expert policies (Fu et al., 2020, arXiv 2004.07219); for the
 #: robot nothing, and 30 s without a fault.
 REFERENCES = {
@@ -18,6 +19,10 @@ REFERENCES = {
 
 Row = Mapping[str, str]
 Task = tuple[str, ...]
+
+
+class MixedRunsError(ValueError):
+    """Runs that one table cannot hold."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +49,9 @@ class Cell:
         """Mean length of an episode, in s."""
         return f"{statistics.mean(self.seconds.values()):.1f}" if self.seconds else ""
 
-    def score(self, env: str) -> str:
-        """The mean return on the scale of :data:`REFERENCES`."""
-        return f"{normalised(env, statistics.mean(self.returns.values())):.1f}" if self.returns else ""
+    def score(self, reference: Reference) -> str:
+        """The mean return, normalised."""
+        return f"{normalised(statistics.mean(self.returns.values()), reference):.1f}" if self.returns else ""
 
 
 #: what tells H2O+'s variants apart in the ablations, and how a table says it
@@ -84,13 +89,13 @@ def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
     """Cells by task and method, of rows that are :func:`placed`.
 
     Raises:
-        ValueError: if a method has two runs of a seed in a task.
+        MixedRunsError: if a method has two runs of a seed in a task.
     """
     table: dict[Task, dict[str, Cell]] = defaultdict(dict)
     for row in rows:
         cell, seed = table[task_of(row)].setdefault(row["method"], Cell()), int(row["seed"])
         if seed in cell.returns:
-            raise ValueError(
+            raise MixedRunsError(
                 f"{row['method']} has two runs of seed {seed} in {' '.join(filter(None, task_of(row)))}, of another "
                 f"{', '.join(VARIANTS)}: give those a file of their own, results=..."
             )
@@ -100,23 +105,25 @@ def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
     return dict(table)
 
 
-def normalised(env: str, value: float) -> float:
-    """A return on the scale of :data:`REFERENCES`.
-
-    Raises:
-        KeyError: for an environment that has none.
-    """
-    low, high = REFERENCES[env]
+def normalised(value: float, reference: Reference) -> float:
+    """A return on the scale of an environment's reference, as of :data:`REFERENCES`."""
+    low, high = reference
     return 100 * (value - low) / (high - low)
 
 
-def markdown(table: dict[Task, dict[str, Cell]], titles: Mapping[str, str], paper: dict[Task, dict[str, str]]) -> str:
+def markdown(
+    table: dict[Task, dict[str, Cell]],
+    titles: Mapping[str, str],
+    paper: dict[Task, dict[str, str]],
+    references: Mapping[str, Reference] = REFERENCES,
+) -> str:
     """The table, ours above the paper's, as GitHub shows it.
 
     Args:
         table: of :func:`cells`.
         titles: methods in the order of the columns, with their titles.
         paper: the paper's cells, as text.
+        references: by environment; without one, no scores.
     """
     present = [name for name in titles if any(name in methods for methods in table.values())]
     head = ["environment", "data", "gap", "variant", "", *(titles[name] for name in present)]
@@ -129,8 +136,8 @@ def markdown(table: dict[Task, dict[str, Cell]], titles: Mapping[str, str], pape
         if len({seconds for cell in table[task].values() for seconds in cell.seconds.values()}) > 1:
             lasts = [table[task].get(name, Cell()).lasts() for name in present]
             lines.append("| " + " | ".join(["", "", "", "", "lasts, s", *lasts]) + " |")
-        if env in REFERENCES:
-            scores = [table[task].get(name, Cell()).score(env) for name in present]
+        if env in references:
+            scores = [table[task].get(name, Cell()).score(references[env]) for name in present]
             lines.append("| " + " | ".join(["", "", "", "", "score", *scores]) + " |")
         if task in paper:
             theirs = [paper[task].get(name, "") for name in present]

@@ -12,7 +12,7 @@ from aggregates import common_scores, improvements, interquartile_means
 from report import ABLATIONS, paper_cells
 from report_figures import draw_curves
 from results_file import IDENTITY, RESULT, append_rows, read_rows
-from score_table import cells, markdown, normalised, placed
+from score_table import REFERENCES, cells, markdown, normalised, placed
 
 ROOT = Path(__file__).parents[2]
 CHEETAH = {"env": "HalfCheetah-v5", "data": "halfcheetah/medium-replay-v0"}
@@ -135,7 +135,7 @@ def test_the_interquartile_mean_is_that_of_the_middle_half():
     scores = common_scores(cells(placed(fixture(), variants=False)))
     means = interquartile_means(scores, reps=100)
     assert scores.seeds == [0, 1, 2]
-    values = sorted(normalised("HalfCheetah-v5", 2000 + 100 * s - h) for s in range(3) for h in (0, 500))
+    values = sorted(normalised(2000 + 100 * s - h, REFERENCES["HalfCheetah-v5"]) for s in range(3) for h in (0, 500))
     assert means["h2o_plus"].value == pytest.approx(np.mean(values[1:-1]))  # a quarter of six is one and a half: one
     assert means["h2o_plus"].low <= means["h2o_plus"].value <= means["h2o_plus"].high
     np.random.seed(7)
@@ -167,6 +167,9 @@ def test_a_method_that_has_done_little_does_not_take_tasks_from_the_others():
     assert "td3" not in scores.runs
     scores = common_scores(cells(placed([*fixture(), *(row("td3", s, 5, g) for s in range(3) for g in GAPS)], False)))
     assert scores.runs["td3"].shape == (3, 2)
+    scores = common_scores(cells(placed([*fixture(), *(row("td3", 0, 5, g) for g in GAPS)], variants=False)))
+    assert scores.seeds == [0, 1, 2]
+    assert "td3" not in scores.runs
 
 
 def test_runs_that_count_in_several_gaps_are_drawn_anew_together():
@@ -175,7 +178,7 @@ def test_runs_that_count_in_several_gaps_are_drawn_anew_together():
     both = interquartile_means(scores, reps=200)["iql"]
     once = [r for r in fixture() if r["gap"] != "friction"]
     alone = interquartile_means(common_scores(cells(placed(once, variants=False))), reps=200)["iql"]
-    values = [normalised("HalfCheetah-v5", 1000 + 100 * seed) for seed in range(3)]
+    values = [normalised(1000 + 100 * seed, REFERENCES["HalfCheetah-v5"]) for seed in range(3)]
     assert both.value == pytest.approx(values[1])
     assert (both.low, both.high) == pytest.approx((values[0], values[2]))
     assert (alone.low, alone.high) == pytest.approx((values[0], values[2]))
@@ -213,10 +216,33 @@ def test_one_seed_has_no_intervals(tmp_path):
 
 def test_runs_of_several_budgets_are_not_set_beside_each_other(tmp_path):
     write(tmp_path / "returns.csv", [row("sac", 0, 1), row("sac", 1, 1, updates="2000")])
+    write(tmp_path / "methods.csv", [row("sac", 0, 1)])
     command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "holds runs of [1000, 2000] updates: choose one" in done.stderr
+    assert not (tmp_path / "returns.md").exists()
+    assert (tmp_path / "methods.md").exists()
+
+
+def test_a_task_of_one_s_own_is_scored_by_returns_of_its_own(tmp_path):
+    (tmp_path / "methods_aggregates.png").write_text("of other runs")
+    write(tmp_path / "methods.csv", [r | {"env": "Hopper-v5"} for r in fixture()])
+    command = [
+        sys.executable,
+        str(ROOT / "recipes" / "report.py"),
+        f"results={tmp_path}",
+        "groups=[methods]",
+        "reps=50",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "+references.Hopper-v5=" in (tmp_path / "methods.md").read_text()
+    assert not (tmp_path / "methods_aggregates.png").exists()
+    done = subprocess.run([*command, "+references.Hopper-v5=[600,2600]"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "|  |  |  |  | score | 0.0 | 25.0 | 75.0 |" in (tmp_path / "methods.md").read_text()
+    assert (tmp_path / "methods_aggregates.png").stat().st_size > 10_000
 
 
 def test_a_run_is_recorded_once(tmp_path):
