@@ -42,7 +42,10 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
         axis.spines[["top", "right"]].set_visible(False)
     for axis in axes.flat[len(tasks) :]:
         axis.set_visible(False)
-    axes[-1, 0].set(xlabel="updates", ylabel="return in reality")
+    for axis in axes[-1]:
+        axis.set_xlabel("updates")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("return in reality")
     handles = {label: handle for a in axes.flat for handle, label in zip(*a.get_legend_handles_labels(), strict=True)}
     labels = [title for title in titles.values() if title in handles]
     beside = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
