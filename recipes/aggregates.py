@@ -52,19 +52,17 @@ def common_scores(table: dict[Task, dict[str, Cell]], references: Mapping[str, R
     there = {name for cells in table.values() for name in cells}
     methods = [name for name in SIX if name in there] or sorted(there)
     tasks = sorted(task for task, cells in table.items() if set(methods) <= set(cells))
-    seeds = set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods)) if tasks else set()
+    seeds = sorted(set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods))) if tasks else []
     further = sorted(there - set(methods))
-    methods += [m for m in further if all(m in table[t] and seeds <= set(table[t][m].returns) for t in tasks)]
+    methods += [m for m in further if all(m in table[t] and set(seeds) <= set(table[t][m].returns) for t in tasks)]
     runs, columns = {}, {}
     for name in methods:
         seen = [_seen(name, task) for task in tasks]
         own = dict(zip(seen, tasks, strict=True))  # one task of each run's
         cells = [(task[0], table[task][name]) for task in own.values()]
-        runs[name] = np.array(
-            [[normalised(cell.returns[seed], references[env]) for env, cell in cells] for seed in sorted(seeds)]
-        )
+        runs[name] = np.array([[normalised(cell.returns[s], references[env]) for env, cell in cells] for s in seeds])
         columns[name] = np.array([list(own).index(run) for run in seen], dtype=int)
-    return Scores(runs, columns, tasks, sorted(seeds))
+    return Scores(runs, columns, tasks, seeds)
 
 
 def _seen(name: str, task: Task) -> Task:

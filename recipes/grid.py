@@ -138,7 +138,8 @@ def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
     chooses = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
     chooses["seed"] = "seeds"
     of_runs = {key_of(override) for run in runs for override in run}
-    of_runs |= {"gap_strength"} if "gap" in of_runs else set()
+    if "gap" in of_runs:
+        of_runs.add("gap_strength")  # some of them have no gap
     for override in overrides:
         if (key := key_of(override)) in of_runs:
             instead = f"choose with {chooses[key]}=[...]" if key in chooses else "leave it out, or take another grid"
