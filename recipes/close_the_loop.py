@@ -1,111 +1,12 @@
-"""Finds what a simulator lacks from measured data, puts it in, and shows how much closer the simulator now is.
+"""Finds what a simulator lacks from measured data: the console command ``close-the-loop`` as a script.
 
 python recipes/close_the_loop.py                                           # the wheel-legged robot, nothing downloaded
 python recipes/close_the_loop.py data=standing_still.txt                   # the same with the real robot's log
 python recipes/close_the_loop.py simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/close_the_loop.py simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
-python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json  # then train in the mended simulator
 """
 
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
-
-import os
-import re
-import sys
-from fnmatch import fnmatchcase
-from pathlib import Path
-
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
-from measured_data import Recording, read_recording
-from omegaconf import DictConfig
-from torchrl.envs import TransformedEnv
-
-from torchrl_h2o.effects import CatalogueEntry, paper_gap
-from torchrl_h2o.envs import DynamicsGap
-from torchrl_h2o.residuals import Report, Simulation, close_the_loop
-
-
-def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
-    """The simulator as its user has it: the task or MJCF file, with its own effects and the paper's gap, if named."""
-    effects = [instantiate(effect) for effect in cfg.simulator.effects]
-    if cfg.simulator.gap is not None:
-        effects.append(paper_gap(cfg.simulator.gap, cfg.simulator.gap_strength))
-    elif cfg.simulator.gap_strength is not None:
-        raise ValueError(
-            f"simulator.gap_strength={cfg.simulator.gap_strength} belongs to a gap: name one, such as "
-            "simulator.gap=gravity"
-        )
-    if "path" in cfg.simulator:
-        names, step = recording.coordinates(cfg.simulator.coordinates), cfg.simulator.control_step
-        simulation = Simulation.from_mjcf(cfg.simulator.path, names, step or recording.control_step(), effects)
-        recording.check_actuators(simulation.model)
-        return simulation
-    return Simulation.from_env(TransformedEnv(instantiate(cfg.simulator.make), DynamicsGap(*effects)))
-
-
-def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEntry] | None:
-    """The entries of the simulator's catalogue that ``catalogue`` names; None for all."""
-    if cfg.catalogue is None:
-        return None
-    patterns = [cfg.catalogue] if isinstance(cfg.catalogue, str) else list(cfg.catalogue)
-    entries = simulation.catalogue()
-    names = {entry.name: type(entry.effect).__name__ for entry in entries}
-    for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in names.values()):
-            raise ValueError(f"catalogue={pattern} names no effect; choose of {', '.join(sorted(set(names.values())))}")
-    return [entry for entry in entries if any(fnmatchcase(names[entry.name], pattern) for pattern in patterns)]
-
-
-@hydra.main(config_path="config", config_name="close_the_loop", version_base=None)
-def main(cfg: DictConfig) -> None:
-    directory = Path(HydraConfig.get().runtime.output_dir)
-    recording = read_recording(cfg)
-    simulation = make_simulation(cfg, recording)
-    report = close_the_loop(
-        simulation,
-        recording.transitions,
-        chosen_entries(cfg, simulation),
-        source=recording.source,
-        held_out=cfg.held_out,
-        seed=cfg.seed,
-    )
-    report.save(directory)
-    print_report(report, directory)
-
-
-def print_report(report: Report, directory: Path) -> None:
-    """The report's sentence, its effects and errors as tables, and where the rest lies."""
-    print(f"\n{report.sentence()}\n\ndata       {report.data.source}")
-    if report.found:
-        print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
-    for found in report.found:
-        for row, (name, parameter) in enumerate(found.effect.parameters.items()):
-            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-            low, high = found.ci95.get(name, (float("nan"), float("nan")))
-            label = found.name if row == 0 else ""
-            print(f"{label:<48}{name:<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}")
-    if report.error is not None:
-        print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
-        for dimension in report.error.per_dimension:
-            print(f"{dimension.name:<48}{dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
-    folder = os.path.relpath(directory)
-    print(f"\nresults    {folder}/report.json\nlook at    {folder}/report.html")
-    if report.found:
-        print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")
-
-
-def in_full(argument: str) -> list[str]:
-    """What a short form stands for: neither ``simulator=robot.xml`` nor ``simulator=HalfCheetah-v5`` is in config/."""
-    key, _, name = argument.partition("=")
-    if key == "simulator" and name.endswith(".xml"):
-        return ["simulator=mjcf", f"simulator.path={name}"]
-    if key == "simulator" and re.search(r"-v\d+$", name):
-        return ["simulator=gymnasium", f"simulator.task={name}"]
-    return [argument]
-
+from torchrl_h2o.commands.close_the_loop import run
 
 if __name__ == "__main__":
-    sys.argv[1:] = [full for argument in sys.argv[1:] for full in in_full(argument)]
-    main()
+    run()

@@ -9,13 +9,15 @@ PYTHONPATH=$PWD/recipes python recipes/paper.py table=mixing hydra/launcher=subm
 Ctrl-C loses nothing: the same command goes on. recipes/report.py makes tables and pictures of what is there.
 """
 
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from run import claimed, open_run
+from torchrl_h2o.training.run_folder import claimed, open_run
 from train import train_and_record
+
+from torchrl_h2o.comparison.sweeper import register_sweeper
 
 
 @hydra.main(config_path="config", config_name="paper", version_base=None)
@@ -31,4 +33,5 @@ def main(cfg: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    register_sweeper()
     main()

@@ -7,18 +7,18 @@ python recipes/train.py --multirun hydra/launcher=joblib method=sac,h2o    # at 
 python recipes/train.py resume=outputs/wheel_legged/...                    # go on after an interruption
 """
 
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from job import resumable, run_job
-from methods import method_named
+from torchrl_h2o.training.job import resumable, run_job
+from torchrl_h2o.training.methods import method_named
 from omegaconf import DictConfig, OmegaConf
-from population_training import members_of
-from results_file import append_run
-from run import claimed, open_run
+from torchrl_h2o.training.populations.loop import members_of
+from torchrl_h2o.comparison.results_file import append_run
+from torchrl_h2o.training.run_folder import claimed, open_run
 
 
 @hydra.main(config_path="config", config_name="train", version_base=None)

@@ -8,11 +8,7 @@ python recipes/benchmarks/close_the_loop.py logs=path/to/logs                  #
 Leaves results.json, results.csv (a row a case) and each case's report.html in the run's folder.
 """
 
-import sys
 from pathlib import Path
-
-sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
 import hydra
 from families import choose_families
@@ -23,6 +19,7 @@ from running import Job, run_all
 from speed import steps_per_second
 from systems import SYSTEMS
 
+import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.residuals import Simulation, close_the_loop
 
 

@@ -7,29 +7,26 @@ Beside it, in the same run, a single run as `recipes/h2o_plus.py` makes it. Samp
 none. Leaves population.json in the run's folder.
 """
 
-import sys
-from pathlib import Path
-
-sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
-
 import json
 import os
 import platform
 from collections.abc import Callable
+from pathlib import Path
 
 import h2o_plus
 import hydra
 import torch
-from compiling import compiled
 from hydra.core.hydra_config import HydraConfig
-from learner import Learner
 from omegaconf import DictConfig, OmegaConf
-from population_learner import PopulationLearner
 from turns import calls_per_second
 from update import action_spec, recipe_on, some_transitions
 
-from torchrl_h2o.data import HybridReplayBuffer, PopulationReplay
+import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training.compiling import compiled
+from torchrl_h2o.training.learner import Learner
+from torchrl_h2o.training.populations import PopulationReplay
+from torchrl_h2o.training.populations.learner import PopulationLearner
 
 SINGLE = "a single run"
 

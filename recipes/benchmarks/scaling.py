@@ -8,34 +8,30 @@ One thing grows at a time. Contenders take turns. Memory-mapped buffers are remo
 left out, with a note. Leaves scaling.json and scaling.png in the run's folder.
 """
 
-import sys
-from pathlib import Path
-
-sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
-
 import json
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import h2o_plus
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from learner import Learner
 from memory import held, room_in_memory, room_on_disk, taken_by
 from omegaconf import DictConfig, OmegaConf
 from population import make_population
-from population_learner import PopulationLearner
 from scaling_figure import draw_scaling
 from tensordict import TensorDict
 from tqdm import tqdm
 from turns import calls_per_second
 from update import action_spec, recipe_on, some_transitions
 
+import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training.learner import Learner
+from torchrl_h2o.training.populations.learner import PopulationLearner
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,11 @@ from states that the env came by, under the same actions. Leaves simulator.json 
 one machine to another, not steps a second.
 """
 
-import sys
-from pathlib import Path
-
-sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
-
 import json
 import os
 from collections.abc import Callable
 from itertools import cycle
+from pathlib import Path
 
 import hydra
 import mujoco
@@ -31,6 +26,7 @@ from torchrl.envs import EnvBase, GymEnv
 from torchrl.envs.utils import step_mdp
 from turns import calls_per_second
 
+import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.envs import BatchedMujocoEnv, WheelLeggedEnv
 
 AHEAD = 20  # control steps of one bare rollout

@@ -8,22 +8,14 @@ Contenders take turns, so that what else the machine does falls on all of them. 
 Compare ratios from one machine to another, not updates a second.
 """
 
-import sys
-from pathlib import Path
-
-sys.path.append(str(Path(__file__).parents[1]))  # for what the recipes share
-import quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
-
 import json
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 import h2o_plus
 import hydra
-import rlpd
-import sac
 import torch
-from compiling import compiled
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
@@ -32,7 +24,10 @@ from torch.utils.flop_counter import FlopCounterMode
 from torchrl.data import Bounded
 from turns import calls_per_second
 
+import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training.compiling import compiled
+from torchrl_h2o.training.methods import rlpd, sac
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
 
@@ -127,7 +122,7 @@ def recipe_on(cfg: DictConfig) -> DictConfig:
     torch.set_num_threads(cfg.threads)
     if cfg.device != "cpu":  # a default device slows every call down, also the CPU
         torch.set_default_device(cfg.device)
-    return OmegaConf.load(Path(__file__).parents[1] / "config" / "h2o_plus.yaml")
+    return OmegaConf.load(Path(__file__).parents[1] / "config" / "experiment.yaml")
 
 
 @hydra.main(config_path="../config", config_name="update_benchmark", version_base=None)

@@ -5,7 +5,7 @@ import torch
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
-from torchrl_h2o.data.ted import to_ted
+from torchrl_h2o.data.readers.ted import to_ted
 
 
 def make_arrays(lengths, endings, seed=0, observations=3, actions=2):

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from torchrl_h2o.data import Column, DataError, LogColumns
-from torchrl_h2o.data.units import UNITS, to_si
+from torchrl_h2o.data.readers.units import UNITS, to_si
 
 GOOD = """
 separator: ","

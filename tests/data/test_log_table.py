@@ -5,7 +5,7 @@ import gzip
 import pytest
 
 from torchrl_h2o.data import Column, DataError, LogColumns
-from torchrl_h2o.data.log_table import read_table
+from torchrl_h2o.data.readers.log_table import read_table
 
 COLUMNS = (Column("q", "observation"), Column("u", "action"))
 

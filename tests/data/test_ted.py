@@ -14,7 +14,7 @@ from torchrl.envs import GymEnv
 
 from tests.data.recordings import assert_same, make_recording, recordings
 from torchrl_h2o.data import DataError, episodes, read_ted, write_ted
-from torchrl_h2o.data.ted import require_continuous, require_ted
+from torchrl_h2o.data.readers.ted import require_continuous, require_ted
 
 
 def test_entries_have_ted_names_shapes_and_dtypes():

@@ -24,7 +24,7 @@ from torchrl_h2o.effects import (
     compile_model,
     paper_gap,
 )
-from torchrl_h2o.effects.families import families
+from torchrl_h2o.effects.catalogue.families import families
 
 FILES = {
     "HalfCheetah": ASSETS / "half_cheetah.xml",
@@ -32,7 +32,7 @@ FILES = {
     "Hopper": ASSETS / "hopper.xml",
     "Ant": ASSETS / "ant.xml",
     "InvertedPendulum": ASSETS / "inverted_pendulum.xml",
-    "wheel_legged": Path(envs.__file__).parent / "assets" / "wheel_legged.xml",
+    "wheel_legged": Path(envs.__file__).parent / "wheel_legged" / "wheel_legged.xml",
 }
 
 

@@ -13,11 +13,11 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 
 from torchrl_h2o.effects import BodyMass
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
-from torchrl_h2o.envs.balance_controller import BalanceController, noisy_balance_controller
 from torchrl_h2o.envs.recording import record
-from torchrl_h2o.envs.wheel_legged import OBSERVATIONS, WheelLeggedEnv
+from torchrl_h2o.envs.wheel_legged.balance_controller import BalanceController, noisy_balance_controller
+from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS, WheelLeggedEnv
 
-CONFIG = Path(__file__).parents[2] / "recipes" / "config" / "env" / "wheel_legged.yaml"
+CONFIG = Path(__file__).parents[2] / "torchrl_h2o" / "config" / "env" / "wheel_legged.yaml"
 TASKS = sorted(OBSERVATIONS)
 
 

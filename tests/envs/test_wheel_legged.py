@@ -9,7 +9,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_h2o.envs.wheel_legged import (
+from torchrl_h2o.envs.wheel_legged.env import (
     MAX_PITCH,
     OBSERVATIONS,
     WheelLeggedEnv,

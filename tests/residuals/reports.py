@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from torchrl_h2o.effects import ActionGain, BodyMass, Gravity, JointFrictionLoss, LinearDrag
-from torchrl_h2o.residuals.report import (
+from torchrl_h2o.residuals.report.report import (
     DataSummary,
     DimensionError,
     ErrorSummary,
@@ -17,7 +17,7 @@ from torchrl_h2o.residuals.report import (
     Report,
     TwoSample,
 )
-from torchrl_h2o.residuals.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 
 DATA = DataSummary("swing_up.csv", 5000, 1500, {"a gap in time": 12, "velocity clipped at ±10 rad/s": 3})
 

@@ -16,7 +16,8 @@ from torchrl_h2o.effects import (
     Gravity,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals import Simulation, close_the_loop, residuals, two_sample
+from torchrl_h2o.residuals import Simulation, close_the_loop, residuals
+from torchrl_h2o.residuals.judge import two_sample
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))

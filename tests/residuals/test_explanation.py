@@ -6,7 +6,7 @@ from tqdm import tqdm
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
-from torchrl_h2o.residuals.explanation import explain
+from torchrl_h2o.residuals.undeclared.explanation import explain
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))

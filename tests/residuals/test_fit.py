@@ -8,8 +8,8 @@ import pytest
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionDelay, Gravity, JointDamping, JointFrictionLoss, ObservationGain
 from torchrl_h2o.residuals import Measured
-from torchrl_h2o.residuals.fit import fit
-from torchrl_h2o.residuals.problem import Problem, losses
+from torchrl_h2o.residuals.trace.fit import fit
+from torchrl_h2o.residuals.trace.problem import Problem, losses
 
 SIMULATION = pendulum()
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity
-from torchrl_h2o.residuals.horizon import choose_horizon
+from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 
 GRAVITY = [CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))]
 

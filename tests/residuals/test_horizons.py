@@ -8,7 +8,7 @@ import pytest
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.horizons import horizon_errors, linear_floor
+from torchrl_h2o.residuals.judge.error_ahead import horizon_errors, linear_floor
 
 
 @pytest.fixture(scope="module")

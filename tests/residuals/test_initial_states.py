@@ -9,7 +9,7 @@ import torch
 from torchrl_h2o.effects import ActionDelay, JointFrictionLoss, ObservationGain
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.initial_states import estimate_states, noise_levels, smoothed_states
+from torchrl_h2o.residuals.measured.initial_states import estimate_states, noise_levels, smoothed_states
 
 NOISE = np.array([0.005, 0.05, 0.001, 0.03])  # rad, rad/s, m, m/s
 

@@ -11,8 +11,8 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionGain, ActionNoise
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.noise import derivatives, estimate_noise
-from torchrl_h2o.residuals.residual import start_states
+from torchrl_h2o.residuals.measured.residual import start_states
+from torchrl_h2o.residuals.trace.action_noise import derivatives, estimate_noise
 
 LEVEL = 0.01
 

@@ -8,7 +8,7 @@ import pytest
 
 from torchrl_h2o.effects import Gravity, JointFrictionLoss, JointRange
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.outside import outside_intervals, outside_rows
+from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 
 PENDULUM = Path(__file__).parents[2] / "recipes" / "models" / "simple_pendulum.xml"
 ROWS = 3000

@@ -7,7 +7,7 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ObservationBias, ObservationGain
-from torchrl_h2o.residuals.problem import Problem
+from torchrl_h2o.residuals.trace.problem import Problem
 
 
 @pytest.mark.parametrize("effect", [ObservationGain(1.3, (1,)), ObservationBias(0.2, (0,))], ids=["gain", "bias"])

@@ -13,7 +13,8 @@ from tests.residuals.reports import DATA, full_report, no_conclusion, nothing_mi
 from torchrl_h2o.data import DataError
 from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, ResidualForce, paper_gap
 from torchrl_h2o.envs import DynamicsGap
-from torchrl_h2o.residuals.report import (
+from torchrl_h2o.residuals.report.json_file import report_from_json, report_to_json
+from torchrl_h2o.residuals.report.report import (
     ErrorSummary,
     FoundEffect,
     IndistinguishableGroup,
@@ -21,8 +22,7 @@ from torchrl_h2o.residuals.report import (
     Report,
     TwoSample,
 )
-from torchrl_h2o.residuals.report_json import report_from_json, report_to_json
-from torchrl_h2o.residuals.report_words import effect_words, interval
+from torchrl_h2o.residuals.report.words import effect_words, interval
 
 NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])
 

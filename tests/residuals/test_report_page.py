@@ -11,9 +11,9 @@ import pytest
 
 from tests.residuals.reports import full_report, no_conclusion, nothing_missing, renamed, trace
 from torchrl_h2o.effects import Gravity
-from torchrl_h2o.residuals import report_plots
-from torchrl_h2o.residuals.report import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
-from torchrl_h2o.residuals.report_page import report_page
+from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.page import report_page
+from torchrl_h2o.residuals.report.report import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
 
 HOSTILE = "<script>alert(1)</script>\"'$x_1$&{{ 7 * 7 }}"
 
@@ -114,7 +114,7 @@ def test_hostile_texts_are_shown_and_not_obeyed():
 
 def test_a_name_in_a_picture_is_no_formula():
     made = dataclasses.replace(trace(rows=50), names=("$x_1$", "b", "c", "d"))
-    assert ">residual of $x_1$ (rad)</text>" in report_plots.residual_in_time(made, 0)
+    assert ">residual of $x_1$ (rad)</text>" in plots.residual_in_time(made, 0)
 
 
 @pytest.mark.parametrize("make", [nothing_missing, no_conclusion])
@@ -166,15 +166,15 @@ def test_each_state_is_drawn_against_the_residual_that_depends_on_it():
     made.before[:] = rng.normal(size=made.before.shape)
     made.states[:] = rng.normal(size=made.states.shape)
     made.before[:, 3] += 2.0 * made.states[:, 0] ** 2
-    assert report_plots.telling_pairs(made, pictures=4)[0] == (3, 0)
-    assert [state for _, state in report_plots.telling_pairs(made, pictures=4)] == [0, 1, 2, 3]
+    assert plots.telling_pairs(made, pictures=4)[0] == (3, 0)
+    assert [state for _, state in plots.telling_pairs(made, pictures=4)] == [0, 1, 2, 3]
 
 
 def test_what_was_set_aside_does_not_stretch_the_pictures():
     made, (pushed,) = trace(), full_report().unexplained_intervals
 
     def ticks(aside):
-        svg = report_plots.residual_in_time(made, 2, aside)
+        svg = plots.residual_in_time(made, 2, aside)
         texts = [html.unescape(text).replace("−", "-") for text in re.findall(r"<text[^>]*>([^<]*)</text>", svg)]
         return [float(text) for text in texts if re.fullmatch(r"-0\.\d+", text)]
 

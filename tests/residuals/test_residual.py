@@ -20,7 +20,7 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller
 from torchrl_h2o.envs.mujoco_model import find_simulator
 from torchrl_h2o.residuals import Measured, Simulation, residuals
-from torchrl_h2o.residuals.residual import executed_actions
+from torchrl_h2o.residuals.measured.residual import executed_actions
 
 STEPS = 60
 CONTROL_STEP = {"HalfCheetah-v5": 0.05, "Hopper-v5": 0.008}

@@ -13,8 +13,8 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals.problem import Problem
-from torchrl_h2o.residuals.screening import free_parameters, screen
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.screening import free_parameters, screen
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))

@@ -21,9 +21,9 @@ from torchrl_h2o.effects import (
     JointSpring,
 )
 from torchrl_h2o.residuals import trace_effects
-from torchrl_h2o.residuals.problem import Problem
-from torchrl_h2o.residuals.screening import screen
-from torchrl_h2o.residuals.search import Search
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.screening import screen
+from torchrl_h2o.residuals.trace.search import Search
 
 SIMULATION = pendulum()
 FACTORS = ({"scale": 0.8}, {"scale": 1.25})

@@ -4,7 +4,7 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionBias, ActionDelay, ActionGain, JointDamping, JointFrictionLoss, ObservationDelay
-from torchrl_h2o.residuals.separation import separated_by
+from torchrl_h2o.residuals.judge.separation import separated_by
 
 SIMULATION = pendulum()
 

@@ -19,7 +19,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Simulation
-from torchrl_h2o.residuals import simulation as module
+from torchrl_h2o.residuals.simulation import simulation as module
 
 PULL = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q) - 0.1 * v + np.cos(3.0 * t))
 

@@ -8,7 +8,7 @@ from torchrl.envs import GymEnv
 from torchrl_h2o.envs import WheelLeggedEnv
 from torchrl_h2o.envs.mujoco_model import find_simulator
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.state_map import StateMap, probe_gymnasium
+from torchrl_h2o.residuals.simulation.state_map import StateMap, probe_gymnasium
 
 TASKS = ["HalfCheetah-v5", "Walker2d-v5", "Hopper-v5", "InvertedPendulum-v5", "Swimmer-v5"]
 

@@ -26,8 +26,8 @@ from torchrl.data import (
     TensorStorage,
 )
 
-from torchrl_h2o.data.memory_map import load_memory_map
-from torchrl_h2o.data.whole_folder import whole_folder
+from torchrl_h2o.data.readers.memory_map import load_memory_map
+from torchrl_h2o.data.readers.whole_folder import whole_folder
 
 TRANSITION_KEYS: tuple[NestedKey, ...] = (
     "observation",

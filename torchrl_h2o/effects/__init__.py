@@ -4,13 +4,11 @@ Needs mujoco and numpy, no torch. Effects compose: the model is edited in the ef
 compiled once, actions and observations pass through their effects in order, forces are summed.
 """
 
-from torchrl_h2o.effects.action import ActionBias, ActionGain, ActionNoise
-from torchrl_h2o.effects.actuator_dynamics import ActionDelay, ActionLag
-from torchrl_h2o.effects.actuator_play import ActionBacklash, ActionDeadBand, ActionSaturation
-from torchrl_h2o.effects.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
-from torchrl_h2o.effects.catalogue import catalogue
-from torchrl_h2o.effects.catalogue_entry import CatalogueEntry
-from torchrl_h2o.effects.contact import ContactSoftness, RollingResistance
+from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation
+from torchrl_h2o.effects.action.signal import ActionBias, ActionGain, ActionNoise
+from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
+from torchrl_h2o.effects.catalogue.catalogue import catalogue
+from torchrl_h2o.effects.catalogue.entry import CatalogueEntry
 from torchrl_h2o.effects.effect import (
     ActionEffect,
     Effect,
@@ -19,25 +17,27 @@ from torchrl_h2o.effects.effect import (
     ObservationEffect,
     compile_model,
 )
-from torchrl_h2o.effects.effect_dict import effect_from_dict, effect_to_dict
-from torchrl_h2o.effects.entries import Indices
-from torchrl_h2o.effects.force import JointForce, LinearDrag, QuadraticDrag
-from torchrl_h2o.effects.geom import GeomFriction, GeomLength, GeomSize
-from torchrl_h2o.effects.gravity import Gravity, GravityTilt
-from torchrl_h2o.effects.joint import (
+from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
+from torchrl_h2o.effects.force.residual_force import ResidualForce
+from torchrl_h2o.effects.indices import Indices
+from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
+from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
+from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
+from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
+from torchrl_h2o.effects.model.joint import (
     Armature,
     JointDamping,
     JointFrictionLoss,
     JointRange,
 )
-from torchrl_h2o.effects.joint_spring import JointRest, JointSpring, JointStiffness
+from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
+from torchrl_h2o.effects.model.timestep import Timestep
 from torchrl_h2o.effects.noise_balance import balanced
-from torchrl_h2o.effects.observation import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
+from torchrl_h2o.effects.observation.sensor import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
 from torchrl_h2o.effects.parameter import Parameter, parameter
-from torchrl_h2o.effects.residual_force import ResidualForce
 from torchrl_h2o.effects.selection import Names
-from torchrl_h2o.effects.timestep import Timestep
+from torchrl_h2o.effects.serialisation import effect_from_dict, effect_to_dict
 
 __all__ = [
     "PAPER_GAPS",

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.entries import Indices, checked_indices
+from torchrl_h2o.effects.indices import Indices, checked_indices
 from torchrl_h2o.effects.parameter import Parameter
 from torchrl_h2o.effects.selection import Names, checked_names
 

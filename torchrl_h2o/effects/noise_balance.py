@@ -6,7 +6,7 @@ No process can undo what another one drew; so negative noise is never executed, 
 from collections.abc import Sequence
 from math import sqrt
 
-from torchrl_h2o.effects.action import ActionNoise
+from torchrl_h2o.effects.action.signal import ActionNoise
 from torchrl_h2o.effects.effect import Effect
 
 _TOLERANCE = 0.01  # of the variance: a fitted standard deviation may lie that little above the one it takes away

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from torchrl_h2o.effects.action import ActionNoise
+from torchrl_h2o.effects.action.signal import ActionNoise
 from torchrl_h2o.effects.effect import Effect
-from torchrl_h2o.effects.geom import GeomFriction, GeomLength, GeomSize
-from torchrl_h2o.effects.gravity import Gravity
-from torchrl_h2o.effects.joint import JointRange
-from torchrl_h2o.effects.joint_spring import JointStiffness
+from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
+from torchrl_h2o.effects.model.gravity import Gravity
+from torchrl_h2o.effects.model.joint import JointRange
+from torchrl_h2o.effects.model.spring import JointStiffness
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect, balanced, compile_model
 from torchrl_h2o.effects.effect import BatchedForce, Process
+from torchrl_h2o.envs.backends.gymnasium import GymnasiumSimulator
 from torchrl_h2o.envs.dynamics_gap import DynamicsGap, transforms_of
-from torchrl_h2o.envs.gymnasium_simulator import GymnasiumSimulator
 from torchrl_h2o.envs.mujoco_model import find_simulator
 from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, roll_out
 from torchrl_h2o.envs.task_rules import rules_of

@@ -11,9 +11,9 @@ from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform, Transf
 
 from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, balanced, paper_gap
 from torchrl_h2o.effects.effect import Process
+from torchrl_h2o.envs.backends.backend import Simulator
 from torchrl_h2o.envs.episode import Episode
 from torchrl_h2o.envs.mujoco_model import find_simulator
-from torchrl_h2o.envs.simulator import Simulator
 
 
 class DynamicsGap(Transform):

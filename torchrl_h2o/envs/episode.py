@@ -12,7 +12,7 @@ from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEf
 from torchrl_h2o.effects.effect import Force, Process
 
 if TYPE_CHECKING:
-    from torchrl_h2o.envs.simulator import Simulator
+    from torchrl_h2o.envs.backends.backend import Simulator
 
 
 class Episode(NamedTuple):

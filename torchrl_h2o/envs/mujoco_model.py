@@ -3,9 +3,9 @@
 import mujoco
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.envs.dm_control_simulator import DMControlSimulator
-from torchrl_h2o.envs.gymnasium_simulator import GymnasiumSimulator
-from torchrl_h2o.envs.simulator import Simulator, base_env
+from torchrl_h2o.envs.backends.backend import Simulator, base_env
+from torchrl_h2o.envs.backends.dm_control import DMControlSimulator
+from torchrl_h2o.envs.backends.gymnasium import GymnasiumSimulator
 
 
 def mujoco_model(env: EnvBase) -> mujoco.MjModel:

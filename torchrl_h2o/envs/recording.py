@@ -44,8 +44,8 @@ def record(
             ``observation``.
 
     Example:
-        >>> from torchrl_h2o.envs.balance_controller import BalanceController
-        >>> from torchrl_h2o.envs.wheel_legged import WheelLeggedEnv
+        >>> from torchrl_h2o.envs.wheel_legged.balance_controller import BalanceController
+        >>> from torchrl_h2o.envs.wheel_legged.env import WheelLeggedEnv
         >>> data = record(WheelLeggedEnv(), BalanceController(), 50, seed=0, progress=False)
         >>> data["next", "observation"].shape, int(data["next", "done"].sum())
         (torch.Size([50, 4]), 1)

@@ -13,7 +13,7 @@ from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
 
-from torchrl_h2o.envs.wheel_legged import MAX_PITCH, WheelLeggedMujocoEnv, reward
+from torchrl_h2o.envs.wheel_legged.env import MAX_PITCH, WheelLeggedMujocoEnv, reward
 
 if TYPE_CHECKING:
     from gymnasium.envs.mujoco import MujocoEnv

@@ -3,7 +3,7 @@
 from torchrl_h2o.objectives.bellman import EntropyBonus, MixedBellmanLoss
 from torchrl_h2o.objectives.conservative import ConservativeLoss, DynamicsDivergence
 from torchrl_h2o.objectives.h2o_plus import H2OPlusLoss
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, total_loss
 from torchrl_h2o.objectives.importance import ImportanceWeightedLoss
 from torchrl_h2o.objectives.networks import (
     make_actor,
@@ -11,7 +11,6 @@ from torchrl_h2o.objectives.networks import (
     make_qvalue,
     make_value,
 )
-from torchrl_h2o.objectives.population import Population, total_loss
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss
 from torchrl_h2o.objectives.reward_correction import DynamicsRewardCorrection
 from torchrl_h2o.objectives.value import (
@@ -35,7 +34,6 @@ __all__ = [
     "ImportanceWeightedLoss",
     "InSampleValueLoss",
     "MixedBellmanLoss",
-    "Population",
     "SparseValueLoss",
     "make_actor",
     "make_dynamics_ratio_estimator",

@@ -219,3 +219,8 @@ def normal_like(tensor: Tensor, generator: torch.Generator | None = None) -> Ten
 def like_rows(tensor: Tensor, rows: Tensor) -> Tensor:
     """``tensor`` without the trailing singleton that ``rows`` lacks: ``[*B, 1]`` becomes ``[*B]``."""
     return tensor.squeeze(-1) if tensor.ndim > rows.ndim else tensor
+
+
+def total_loss(terms: dict[str, Tensor]) -> Tensor:
+    """The sum of the terms named ``loss_*``: of one run, ``[]``, or of each member of a population, ``[N]``."""
+    return sum(term for name, term in terms.items() if name.startswith("loss_"))

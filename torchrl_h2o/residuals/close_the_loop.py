@@ -11,13 +11,13 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.residuals.explanation import explain
-from torchrl_h2o.residuals.measured import Measured
-from torchrl_h2o.residuals.outside import outside_intervals, outside_rows, still_outside
-from torchrl_h2o.residuals.report import DataSummary, Report
-from torchrl_h2o.residuals.residual import residuals
-from torchrl_h2o.residuals.simulation import Simulation
-from torchrl_h2o.residuals.summary import DISTURBED, summarise
+from torchrl_h2o.residuals.judge.summary import DISTURBED, summarise
+from torchrl_h2o.residuals.measured.measured import Measured
+from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows, still_outside
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.report.report import DataSummary, Report
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.undeclared.explanation import explain
 
 _MAY_DIVERGE = 0.1  # of the transitions: a few are measured in a fall, or wrongly
 

@@ -1,0 +1,245 @@
+"""The paper's grids: which runs they hold, and that a grid loses nothing when it is killed or when a run dies."""
+
+import signal
+import subprocess
+from collections import Counter
+from importlib.util import find_spec
+from types import SimpleNamespace
+
+import hydra
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from torchrl.checkpoint import CheckpointRotation
+
+from tests.small_runs import ROBOT, ROOT, SMALL, trained
+from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
+from torchrl_h2o.comparison.results_file import CURVE, IDENTITY, RESULT, adopt_runs, append_rows, identity, read_rows
+from torchrl_h2o.comparison.sweeper import PaperGrid
+from torchrl_h2o.data import write_ted
+from torchrl_h2o.training.loop import train
+from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.training.run_folder import load_config
+
+
+def chosen(runs, key):
+    values = [override.partition("=")[2] for run in runs for override in run if override.startswith(f"{key}=")]
+    return Counter(values)
+
+
+def paper(*overrides):
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        return hydra.compose("paper", list(overrides))
+
+
+def test_the_main_table_has_every_cell_once_and_methods_without_simulator_once_a_data_set():
+    runs = list(TABLES["returns"].runs((0, 1)))
+    assert len(runs) == 2 * (25 * 4 + 3 * 2)
+    assert chosen(runs, "method") == {"sac": 50, "darc": 50, "h2o": 50, "h2o_plus": 50, "cql": 6, "iql": 6}
+    assert len({tuple(run) for run in runs}) == len(runs)
+    walker = [run for run in runs if "env=walker2d" in run]
+    assert {"gap=long_torso", "gap=soft_feet"}.isdisjoint(override for run in walker for override in run)
+
+
+def test_the_ablations_are_the_paper_s():
+    mixing = list(TABLES["mixing"].runs((0,)))
+    assert chosen(mixing, "mixing") == {"0.0": 1, "0.1": 2, "0.2": 1, "0.5": 1, "1.0": 1}
+    assert chosen(mixing, "ratio") == {"false": 1}
+    assert chosen(TABLES["gaps"].runs((0,)), "gap_strength") == {"1.25": 2, "1.5": 2, "2.0": 2, "3.0": 2}
+    assert len(list(FIGURES["backbones"].runs((0,)))) == 8
+    assert len(list(FIGURES["wheel_legged"].runs((0,)))) == 12
+
+
+def test_any_subset_is_an_override():
+    cfg = paper("table=returns", "methods=[h2o_plus,iql]", "gaps=[gravity,friction]", "seeds=[0,1]")
+    runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))
+    assert chosen(runs, "method") == {"h2o_plus": 2 * 3 * 2, "iql": 2 * 3}
+    assert chosen(runs, "gap") == {"gravity": 6, "friction": 6, "null": 6}
+
+
+def test_data_sets_are_any_that_have_the_environment_in_their_name_and_tasks_any_environment():
+    public, hdf5 = "mujoco/walker2d/expert-v0", "files/halfcheetah_medium-v2.hdf5"
+    cfg = paper("table=returns", f"datasets=[{public},{hdf5}]", "gaps=[gravity]", "methods=[sac]")
+    runs = list(chosen_grid(cfg).runs((0,)))
+    assert [run[1:3] for run in runs] == [["env=walker2d", f"data={public}"], ["env=halfcheetah", f"data={hdf5}"]]
+    own = list(chosen_grid(paper("table=methods", "tasks=[mine]")).runs((0,)))
+    assert chosen(own, "env") == {"mine": 6}
+    assert not chosen(own, "gap")
+
+
+@pytest.mark.parametrize("overrides", [["table=main"], [], ["table=returns", "figure=backbones"]])
+def test_a_grid_that_there_is_not_is_said(overrides):
+    with pytest.raises(ValueError, match=r"choose returns, mixing, gaps|name one"):
+        chosen_grid(paper(*overrides))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["table=returns", "methods=[ppo]"], r"methods=\[ppo\]: choose sac, cql"),
+        (["table=returns", "gaps=[gravty]"], r"gaps=\[gravty\]: choose gravity"),
+        (["table=returns", "datasets=[hopper/medium-v0]"], "halfcheetah or walker2d is to stand in its name"),
+        (["table=returns", "methods=iql"], r"give a list, methods=\[iql\]"),
+        (["table=methods"], r"name tasks=\[...\]"),
+        (["figure=wheel_legged", "gaps=[gravity]"], "has no data sets that gaps would be put to"),
+    ],
+)
+def test_a_choice_that_there_is_not_is_said_before_anything_runs(overrides, said):
+    with pytest.raises(ValueError, match=said):
+        chosen_grid(paper(*overrides))
+
+
+@pytest.mark.parametrize(
+    ("grid", "override", "said"),
+    [
+        (TABLES["returns"], "gap=friction", r"set gap themselves; choose with gaps="),
+        (TABLES["returns"], "+seed=1", r"choose with seeds="),
+        (TABLES["returns"], "gap_strength=3", r"choose with strengths="),
+        (FIGURES["backbones"], "backbone=sparse", "leave it out, or take another grid"),
+    ],
+)
+def test_what_each_run_says_for_itself_is_no_override_of_all(grid, override, said):
+    runs = list(grid.runs((0,)))
+    with pytest.raises(ValueError, match=said):
+        check_overrides(["updates=10", override], runs)
+    check_overrides(["updates=10", "env.make.max_episode_steps=40", "mixing=0.3"], list(TABLES["returns"].runs((0,))))
+
+
+@pytest.mark.parametrize("grid", [TABLES["mixing"], TABLES["gaps"]])
+def test_runs_that_differ_have_different_identities(grid):
+    found = []
+    for run in grid.runs((0,)):
+        cfg = paper(*run)
+        cfg.overrides = run
+        found.append(tuple(identity(cfg).values()))
+    assert len(set(found)) == len(found)
+    assert not any("=" in value for who in found for value in who)
+
+
+def test_every_run_is_an_override_that_hydra_reads():
+    parser = OverridesParser.create()
+    for grid in (TABLES | FIGURES).values():
+        for run in grid.runs((0,)):
+            parser.parse_overrides(run)
+
+
+GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
+
+
+def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_killed(command, compose, tmp_path):
+    asked = command(*GRID, "methods=[iql,cql]", "updates=200", script="paper.py")
+    process = subprocess.Popen(**asked, text=True)
+    while not (second := checkpoint_of(tmp_path, "cql")):
+        assert process.poll() is None, process.communicate()[0]
+    process.send_signal(signal.SIGSTOP)  # as good as at work, for as long as we need
+    beside = subprocess.run(**command(*GRID, "methods=[cql]", "updates=200", "retries=0", script="paper.py"), text=True)
+    assert beside.returncode != 0
+    assert "RuntimeError: another process is at work in outputs/paper/results/cql__" in beside.stdout
+
+    process.kill()
+    process.communicate()
+    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
+
+    done = subprocess.run(**asked, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert "2 runs, 1 of them done" in done.stdout
+    assert done.stdout.count("run folder:") == 1
+    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql", "cql"]
+
+    cfg, real = compose("updates=200", "method=cql", config="train")
+    train(METHODS["cql"], cfg, real, tmp_path / "unbroken")
+    assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
+
+    one = load_config(second)
+    assert one.seeds is None  # or h2o_plus.py would go on with it as a population
+    moved = [*GRID[:-1], "results=elsewhere/results.csv", "methods=[cql]", "updates=200"]
+    done = subprocess.run(**command(*moved, script="paper.py"), text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert [row["method"] for row in read_rows(tmp_path / "elsewhere" / "results.csv")] == ["cql"]
+
+
+def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
+    asked = command(*GRID, "methods=[cql,iql]", "updates=20000", script="paper.py")
+    process = subprocess.Popen(**asked, text=True)
+    while not checkpoint_of(tmp_path, "cql"):
+        assert process.poll() is None, process.communicate()[0]
+    process.send_signal(signal.SIGINT)
+    printed, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert printed.strip().endswith("interrupted with 2 runs to go; the same command goes on with them")
+
+
+@pytest.mark.skipif(find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="an extra: .[launchers]")
+def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
+    _, real = compose()
+    write_ted(real, tmp_path / "recording")
+    launchers = {"in_turn": [], "at_once": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
+    recorded = []
+    for name, overrides in launchers.items():
+        folder = [f"results={name}.csv", f"hydra.sweep.dir=outputs/{name}", *overrides]
+        small = [*GRID[:-1], "methods=[iql,sac]", "updates=20", "data=recording", *folder]
+        done = subprocess.run(**command(*small, script="paper.py"), text=True, check=False)
+        assert done.returncode == 0, done.stdout
+        rows = sorted(read_rows(tmp_path / f"{name}.csv"), key=lambda row: row["method"])
+        recorded.append([(row["method"], row["return_mean"], row["return_std"]) for row in rows])
+    assert recorded[0] == recorded[1]
+    assert len(recorded[0]) == 2
+
+
+def test_a_run_that_died_once_is_done_by_the_second_try(tmp_path, monkeypatch):
+    """As when a worker is killed, which takes the launcher's other jobs with it."""
+    launched = []
+
+    class Launcher:
+        def launch(self, jobs, initial_job_idx):
+            launched.append(len(jobs))
+            if len(launched) == 1:
+                raise RuntimeError("a worker was killed")
+            for number, _ in enumerate(jobs):
+                who = identity_of([f"method={number}"])
+                append_rows(grid.results, (*IDENTITY, *RESULT), [dict.fromkeys(RESULT, "1") | who], who)
+            return [SimpleNamespace(return_value=None) for _ in jobs]
+
+    def identity_of(run):
+        return dict.fromkeys(IDENTITY, "") | {"method": run[0].partition("=")[2]}
+
+    runs = [["method=0"], ["method=1"]]
+    monkeypatch.setattr(
+        "torchrl_h2o.comparison.grids.chosen_grid", lambda cfg: SimpleNamespace(runs=lambda seeds: runs)
+    )
+    monkeypatch.setattr(PaperGrid, "_identity", lambda self, run: identity_of(run))
+    monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **kwargs: Launcher())
+    grid = PaperGrid()
+    cfg = paper("figure=wheel_legged", f"results={tmp_path / 'results.csv'}")
+    grid.setup(hydra_context=None, task_function=None, config=cfg)
+    grid.sweep([])
+    assert launched == [2, 2]
+
+
+def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path):
+    who = dict.fromkeys(IDENTITY, "x")
+    for name, columns in (("a.csv", (*IDENTITY, *RESULT)), ("a_curves.csv", (*IDENTITY, *CURVE))):
+        rows = [dict.fromkeys(columns, "1") | whose for whose in (who, who | {"seed": "y"})]
+        for row in rows:
+            append_rows(tmp_path / name, columns, [row], row)
+    (tmp_path / "notes.csv").write_bytes(b"anybody's\xff, x\n")
+    (tmp_path / "empty.csv").touch()
+    for _ in range(2):
+        adopt_runs(tmp_path / "b.csv", [who, who | {"seed": "z"}])
+    assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]
+    assert [row["seed"] for row in read_rows(tmp_path / "b_curves.csv")] == ["x"]
+
+
+def checkpoint_of(folder, method):
+    """The folder of that method's run, once it has a checkpoint."""
+    found = list(folder.glob(f"outputs/paper/results/{method}__*"))
+    return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
+
+
+def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):
+    grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "backbone=huber", script="paper.py")
+    done = subprocess.run(**grid, text=True, check=False)
+    assert done.returncode != 0
+    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
+    assert "these runs died:\n  method=h2o_plus" in done.stdout
+    assert "ValueError: backbone=huber: choose expectile" in done.stdout
+    assert done.stdout.count("run folder:") == 3  # it was tried again, once

@@ -1,0 +1,68 @@
+"""The robot's figures: what they show is what the run's own table and data hold, in metres and radians."""
+
+import json
+import math
+import shutil
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from torchrl_h2o.comparison.results_file import append_run, read_rows
+from torchrl_h2o.comparison.robot_figures import draw_robot, draw_trajectories
+from torchrl_h2o.comparison.robot_trajectories import EVERY, counted, kept_results, simulated_states, spread_entropy
+from torchrl_h2o.envs.wheel_legged.env import MAX_PITCH
+from torchrl_h2o.training.job import run_job
+from torchrl_h2o.training.methods import METHODS
+
+
+def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, tmp_path):
+    short = ["updates=20", "frames=2", "num_worlds=1", "env.make.max_episode_steps=300", "final_episodes=5"]
+    cfg, _ = compose("method=h2o_plus", *short, config="train")
+    folder = tmp_path / "runs" / "one"
+    folder.mkdir(parents=True)
+    run_job(cfg, folder, [METHODS["h2o_plus"]])
+    append_run(tmp_path / "wheel_legged.csv", cfg, folder)
+    rows = read_rows(tmp_path / "wheel_legged.csv")
+    kept = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
+    (run,) = {key.partition(" ")[2] for key in kept}
+    assert run.startswith("h2o_plus wheel_legged/standing_still recorded - - 0 20 expectile 0.3 True ")
+    way, states = kept[f"way {run}"], kept[f"states {run}"]
+    assert way.shape == (5, 7)  # 1.5 s
+    lasts = json.loads((folder / "summary.json").read_text())["return_real"]["mean_length"] * cfg.env.seconds_per_step
+    seen = (~np.isnan(way)).sum() / 5 * EVERY
+    assert seen <= lasts < seen + EVERY
+    assert 0.0 < abs(way[:, 0]).max() < 0.5  # m, after 0.2 s from the origin
+
+    pitch, rate = simulated_states(cfg, folder).T
+    assert len(pitch) == states.sum() == cfg.steps_per_epoch
+    assert abs(pitch[0]) <= 0.05 + 1e-3  # rad, where episodes begin at most
+    assert abs(rate[0]) <= 0.05 + 1e-3
+    assert 0.05 < abs(pitch).max() < 1.5 * MAX_PITCH  # and where they end
+
+    shutil.rmtree(folder)
+    again = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
+    np.testing.assert_equal(again, kept)
+    assert not kept_results(tmp_path / "kept.npz", tmp_path / "runs", [rows[0] | {"mixing": "0.9"}])
+    draw_robot(tmp_path, again)
+    for name in ("wheel_legged_trajectories.png", "wheel_legged_diversity.png"):
+        assert (tmp_path / name).stat().st_size > 10_000
+
+
+def test_a_panel_a_method_and_a_cross_where_it_fell(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    stands, falls = np.full((1, 150), 0.1), np.r_[np.full(20, 0.3), np.full(130, np.nan)][None]
+    ways = {("standing_still", "sac"): [falls, stands], ("moving_forward", "h2o_plus"): [stands]}
+    draw_trajectories(tmp_path / "drawn.png", ways)
+    axes = figures[0].axes
+    titles = [axis.get_title().partition(",") for axis in axes]
+    assert [title for title, *_ in titles[:2]] == [METHODS["sac"].title, METHODS["h2o_plus"].title]
+    assert [runs.split()[0] for *_, runs in titles] == ["2", "0", "0", "1"]
+    crosses = [line for axis in axes for line in axis.lines if line.get_marker() == "x"]
+    assert [(*line.get_xdata(), *line.get_ydata()) for line in crosses] == [(pytest.approx(4.0), 0.3)]
+
+
+def test_entropy_counts_the_cells_that_are_filled_evenly():
+    cells = np.stack(np.meshgrid([-0.3, 0.0, 0.3], [-1.0, 1.0]), axis=-1).reshape(-1, 2)
+    assert spread_entropy(counted(np.repeat(cells, 7, axis=0))) == pytest.approx(math.log(6))

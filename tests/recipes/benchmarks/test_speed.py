@@ -1,0 +1,75 @@
+"""The benchmarks of speed leave a table and a file, with what they compare to measured in the same run."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[3] / "recipes" / "benchmarks"
+
+
+def run(script, folder, *overrides):
+    command = [sys.executable, BENCHMARKS / script, f"hydra.run.dir={folder}", *overrides]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def test_updates_are_set_beside_a_textbook_s_and_beside_the_limit(tmp_path):
+    out = run("update.py", tmp_path, "seconds=0.1", "turns=1", "compiled=false", "transitions=1000", "threads=1")
+    result = json.loads((tmp_path / "update.json").read_text())
+    assert result["flop"] / 1e9 == pytest.approx(1.21, rel=0.05)  # of the authors' update, on HalfCheetah
+    assert result["limit"] == result["gflop_per_second"] * 1e9 / result["flop"]
+    assert {"textbook", "ours, not compiled", "SAC, TorchRL's loss", "SAC of our parts"} == set(
+        result["updates_per_second"]
+    )
+    assert 0.0 < result["updates_per_second"]["ours, not compiled"] < result["limit"]
+    assert "of the limit" in out
+
+
+def test_steps_are_set_beside_bare_rollouts(tmp_path):
+    out = run("simulator.py", tmp_path, "seconds=0.1", "turns=1", "worlds=[1,16]")
+    rates = json.loads((tmp_path / "simulator.json").read_text())["steps_per_second"]
+    assert rates["BatchedMujocoEnv, 16"] > rates["BatchedMujocoEnv, 1"]
+    assert rates["mujoco.rollout, 16"] > rates["BatchedMujocoEnv, 16"]
+    assert "of mujoco.rollout" in out
+
+
+def test_a_population_s_updates_are_set_beside_a_single_run_s(tmp_path):
+    small = ("members=[1,3]", "compiled=[]", "seconds=0.1", "turns=1", "calls=1", "transitions=600", "threads=1")
+    out = run("population.py", tmp_path, *small)
+    result = json.loads((tmp_path / "population.json").read_text())
+    assert [(line["members"], line["way"]) for line in result["lines"]] == [
+        (1, "a single run"),
+        (1, "stacked"),
+        (3, "stacked"),
+    ]
+    for line in result["lines"]:
+        assert line["run_updates_per_second"] == pytest.approx(line["members"] * line["updates_per_second"])
+    best = max(line["run_updates_per_second"] for line in result["lines"])
+    assert result["table"]["hours"] == pytest.approx(125e6 / best / 3600)
+    assert "CPU" in result["device"]
+    assert "25 tasks x 5 seeds x 1,000,000 updates" in out
+
+
+def test_costs_are_told_for_all_that_grows_and_mapped_buffers_leave_nothing(tmp_path):
+    (tmp_path / "scratch").mkdir()
+    small = ["transitions=1000", "buffer_sizes=[500,20000,1000000000000]", "batch_sizes=[8,16]", "widths=[8,512]"]
+    small.append("populations=[1,4]")
+    out = run("scaling.py", tmp_path, "seconds=0.01", "turns=1", "threads=1", f"scratch={tmp_path / 'scratch'}", *small)
+    costs = json.loads((tmp_path / "scaling.json").read_text())["costs"]
+    buffers = [(cost["size"], cost["storage"]) for cost in costs if cost["grows"] == "buffer"]
+    assert buffers == [(size, where) for size in (500, 20_000) for where in ("in memory", "memory-mapped")]
+    others = [(cost["grows"], cost["size"]) for cost in costs if cost["grows"] != "buffer"]
+    assert others == [("batch", 8), ("batch", 16), ("width", 8), ("width", 512), ("population", 1), ("population", 4)]
+    assert all(0.0 < cost["seconds_per_sample"] < cost["seconds_per_update"] for cost in costs)
+    narrow, wide = (cost["memory"] for cost in costs if cost["grows"] == "width")
+    assert wide > narrow + 10_000_000  # five networks of 0.28 million weights: gradients, and Adam's two moments
+    alone, stacked = (cost for cost in costs if cost["grows"] == "population")
+    assert stacked["memory"] > alone["memory"] + 10_000_000  # three members' gradients, moments and activations more
+    assert stacked["seconds_per_update"] > alone["seconds_per_update"]
+    assert "ms a sample" in out
+    assert (tmp_path / "scaling.png").stat().st_size > 10_000
+    assert not list((tmp_path / "scratch").iterdir())

@@ -1,0 +1,157 @@
+"""A population as its user runs it: one command line, a folder a member, and each member what a single run is."""
+
+import json
+
+import pytest
+import torch
+
+from tests.small_runs import ROBOT, SMALL, rows, run, trained
+from torchrl_h2o.training.loop import Trainee, train
+from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS, make_learner
+from torchrl_h2o.training.populations.job import run_population
+from torchrl_h2o.training.populations.learner import PopulationLearner
+from torchrl_h2o.training.populations.loop import PopulationTraining, members_of, train_population
+
+SMALLER = ["updates=30", "updates_per_epoch=10", "steps_per_epoch=20", "lr_end_factor=0.1", "keep=last"]
+
+
+@pytest.fixture
+def compose(compose):
+    return lambda *overrides: compose(*SMALLER, *overrides)
+
+
+def train_all(cfg, real, directory):
+    return train_population(make_learner, cfg, members_of(cfg), real, directory)
+
+
+def assert_same_figures(some, others, tolerance):
+    assert len(some) == len(others) > 0
+    for row, other in zip(some, others, strict=True):
+        assert row.keys() == other.keys()
+        for name in row.keys() - {"method"}:
+            assert float(row[name]) == pytest.approx(float(other[name]), rel=tolerance, abs=tolerance), name
+
+
+def test_every_combination_is_a_member_with_a_name(compose):
+    cfg, _ = compose("seeds=[0,3]", "gaps=[gravity,null]")
+    members = members_of(cfg)
+    assert list(members) == ["seed_0_gravity", "seed_0_no_gap", "seed_3_gravity", "seed_3_no_gap"]
+    assert [(own.seed, own.gap) for own in members.values()] == [(0, "gravity"), (0, None), (3, "gravity"), (3, None)]
+    assert all(members_of(own) == {} for own in members.values())
+    assert members_of(compose()[0]) == {}
+    with pytest.raises(ValueError, match="seed_1 is in the population twice"):
+        members_of(compose("seeds=[1,1]")[0])
+    for wrong in ("seeds=4", "seeds=[]"):
+        with pytest.raises(ValueError, match="give a list of at least one, such as seeds=\\[0\\]"):
+            members_of(compose(wrong)[0])
+
+
+def test_each_member_learns_what_a_single_run_learns(compose, tmp_path):
+    cfg, real = compose("seeds=[0,1]", "gaps=[null,gravity]", "mixings=[0.2]")
+    outcomes = train_all(cfg, real, tmp_path / "population")
+    figures = set()
+    for name in ("seed_0_gravity_mixing_0.2", "seed_1_no_gap_mixing_0.2"):
+        own = members_of(cfg)[name]
+        policy, training = train(H2O_PLUS, own, real, tmp_path / name)
+        assert_same_figures(outcomes[name].rows, training.rows, 1e-5)
+        assert_same_figures(rows(tmp_path / "population" / name), rows(tmp_path / name), 1e-5)
+        for mine, its in zip(outcomes[name].policy.parameters(), policy.parameters(), strict=True):
+            torch.testing.assert_close(mine, its, rtol=1e-5, atol=1e-5)
+        figures.add(training.rows[-1]["loss_qvalue"])
+    assert len(figures) == 2
+
+
+def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path, monkeypatch):
+    cfg, real = compose("seeds=[0,1]", "keep=best_in_simulator")
+    train_all(cfg, real, tmp_path / "whole")
+    log = PopulationTraining.log_member
+
+    def interrupt(self, epoch, member, **metrics):
+        if (epoch, member) == (1, "seed_1"):
+            raise KeyboardInterrupt
+        log(self, epoch, member, **metrics)
+
+    closed, close = [], Trainee.close
+    monkeypatch.setattr(
+        "torchrl_h2o.training.loop.Trainee.close", lambda self: (closed.append(self.cfg.seed), close(self))
+    )
+    monkeypatch.setattr("torchrl_h2o.training.populations.loop.PopulationTraining.log_member", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        train_all(cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    assert sorted(closed) == [0, 1]  # nobody's workers stay behind
+    assert trained(tmp_path / "parts") != trained(tmp_path / "whole")
+    train_all(cfg, real, tmp_path / "parts")
+    assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
+    for member in ("seed_0", "seed_1"):
+        assert rows(tmp_path / "parts" / member) == rows(tmp_path / "whole" / member)
+
+
+def break_seed_1(monkeypatch, at_epoch):
+    """From some epoch on, what seed 1 simulates is no finite number."""
+    begin_epoch, simulated = Trainee.begin_epoch, []
+
+    def broken(self, epoch):
+        begin_epoch(self, epoch)
+        simulated.append((self.cfg.seed, epoch))
+        if self.cfg.seed == 1 and epoch >= at_epoch:
+            self.learner.replay.sim.storage[:]["next", "reward"].fill_(float("nan"))
+
+    monkeypatch.setattr("torchrl_h2o.training.loop.Trainee.begin_epoch", broken)
+    return simulated
+
+
+def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(compose, tmp_path, monkeypatch):
+    cfg, real = compose("seeds=[0,1,2]")
+    healthy = train_all(cfg, real, tmp_path / "healthy")
+    simulated = break_seed_1(monkeypatch, at_epoch=1)
+    outcomes = train_all(cfg, real, tmp_path / "broken")
+    failed = outcomes["seed_1"]
+    assert [epoch for seed, epoch in simulated if seed == 1] == [0, 1]
+    assert failed.failure == {"updates": 10, "why": "loss_qvalue not finite"}
+    assert failed.updates == 10
+    assert len(failed.rows) == 1
+    assert all(parameter.isfinite().all() for parameter in failed.policy.parameters())
+    for name in ("seed_0", "seed_2"):
+        assert outcomes[name].failure is None
+        assert outcomes[name].rows == healthy[name].rows
+    again = train_all(cfg, real, tmp_path / "broken")  # from the last checkpoint, which remembers
+    assert again["seed_1"].failure == failed.failure
+    assert again["seed_0"].rows == healthy["seed_0"].rows
+
+
+def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(compose, tmp_path, monkeypatch, capsys):
+    cfg, _ = compose("seeds=[0,1]", "updates=10")
+    update = PopulationLearner.update
+
+    def spoiling(self):
+        terms = update(self)
+        if self.updates == 10:  # its losses were fine up to here
+            next(self.population.parameters()).data[1] = float("inf")
+        return terms
+
+    monkeypatch.setattr("torchrl_h2o.training.populations.learner.PopulationLearner.update", spoiling)
+    run_population(cfg, members_of(cfg), tmp_path)
+    failed = json.loads((tmp_path / "seed_1" / "summary.json").read_text())
+    assert (failed["failure"], failed["updates"], failed["return_real"]) == ("its parameters not finite", 10, None)
+    assert not (tmp_path / "seed_1" / "metrics.csv").exists()
+    healthy = json.loads((tmp_path / "seed_0" / "summary.json").read_text())
+    assert healthy["return_real"]["episodes"] == 1
+    table = {line.split()[0]: line.split()[1] for line in capsys.readouterr().out.splitlines() if "seed_" in line}
+    assert table["seed_1"] == "failed"
+    assert float(table["seed_0"])
+
+
+def test_one_command_leaves_a_folder_a_member_and_one_table(command, tmp_path):
+    small = [*SMALL, *ROBOT, *SMALLER, "updates=10", "hydra.run.dir=out"]
+    printed = run(command(*small, "seeds=[0,1]", "gaps=[gravity]"))
+    for name, seed in (("seed_0_gravity", 0), ("seed_1_gravity", 1)):
+        summary = json.loads((tmp_path / "out" / name / "summary.json").read_text())
+        assert (summary["seed"], summary["gap"], summary["updates"]) == (seed, "gravity", 10)
+        assert summary["return_real"].keys() >= {"mean", "std", "episodes"}
+        assert (tmp_path / "out" / name / "learning_curve.png").stat().st_size > 10_000
+        assert name in printed
+    assert "the data's behaviour" in printed
+
+    replayed = run(command("checkpoint=out/seed_1_gravity", "episodes=1", "film=null", script="evaluate.py"))
+    assert "H2O+ in reality" in replayed

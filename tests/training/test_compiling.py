@@ -1,0 +1,90 @@
+"""Compiled losses: the same numbers, where they pay and where they can be had."""
+
+import shutil
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torchrl.data import Bounded
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training.compiling import PAYS_FROM, maybe_compiled
+from torchrl_h2o.training.methods.h2o_plus import make_learner
+
+
+def learner_of(cfg, real):
+    replay = HybridReplayBuffer(real, sim_capacity=len(real), batch_size=cfg.batch_size)
+    replay.extend(real)
+    return make_learner(cfg, 4, Bounded(-1.0, 1.0, (1,)), replay)
+
+
+def updated(learner, updates=4):
+    """What some updates make of the parameters."""
+    torch.manual_seed(0)
+    for _ in range(updates):
+        learner.update()
+    return {
+        f"{part}.{name}": parameter.detach().clone()
+        for part, loss in learner.losses.items()
+        for name, parameter in loss.named_parameters()
+    }
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
+def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
+    cfg, real = compose("compiled=true")
+    expected = updated(learner_of(cfg, real))
+    learner = learner_of(cfg, real)
+    torch._dynamo.reset()
+    counters = torch._dynamo.utils.counters
+    counters.clear()
+    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-6)
+    assert counters["stats"]["unique_graphs"] == 1  # neither broken, nor compiled a second time
+    assert not counters["graph_break"]
+
+
+@pytest.fixture
+def no_compiler():
+    torch._dynamo.reset()
+    with torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",), "force_disable_caches": True}):
+        yield
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, capsys):
+    cfg, real = compose("compiled=auto", f"updates={PAYS_FROM}")
+    expected = updated(learner_of(cfg, real))
+    learner = learner_of(cfg, real)
+    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    torch.testing.assert_close(updated(learner), expected, rtol=0.0, atol=0.0)
+    assert capsys.readouterr().out.count("cannot be compiled here") == 1
+
+
+@pytest.mark.usefixtures("no_compiler")
+def test_where_compiled_losses_are_asked_for_it_is_an_error_that_there_can_be_none(compose):
+    cfg, real = compose("compiled=true")
+    learner = learner_of(cfg, real)
+    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    with pytest.raises(RuntimeError, match="compiler"):
+        learner.update()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "updates", "pays", "compiles"),
+    [
+        ("auto", PAYS_FROM, True, True),
+        ("auto", PAYS_FROM - 1, True, False),
+        ("auto", PAYS_FROM, False, False),
+        (True, 1, False, True),
+        (False, PAYS_FROM, True, False),
+        (None, PAYS_FROM, True, False),
+    ],
+)
+def test_losses_are_compiled_where_it_pays_or_is_asked_for(chosen, updates, pays, compiles):
+    cfg = OmegaConf.create({"updates": updates} | ({} if chosen is None else {"compiled": chosen}))
+
+    def losses_of(batch):
+        return batch
+
+    assert (maybe_compiled(cfg, losses_of, pays=pays) is not losses_of) == compiles

@@ -1,0 +1,80 @@
+"""What the learner sees: real data and environments show it in the same way."""
+
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+
+from torchrl_h2o.objectives import make_actor
+from torchrl_h2o.training.environments import as_observed, make_reality, measure_observation_norm
+from torchrl_h2o.training.returns import evaluate
+
+CONFIG = Path(__file__).parents[2] / "recipes" / "config"
+
+
+@pytest.fixture
+def cfg():
+    with hydra.initialize_config_dir(str(CONFIG), version_base=None):
+        return hydra.compose("h2o_plus", ["env.make.max_episode_steps=7", "frames=3"])
+
+
+def rollout(env):
+    """Twenty transitions of the same torques, over three episodes that start alike."""
+    env.set_seed(0)
+    torch.manual_seed(0)
+    data = env.rollout(20, break_when_any_done=False)
+    keys = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"))
+    return TensorDict({key: data[key] for key in keys}, data.batch_size)
+
+
+def test_real_data_are_stacked_as_the_environment_stacks(cfg):
+    raw = rollout(make_reality(cfg, raw=True))
+    assert raw["observation"].shape == (20, 4)
+    measure_observation_norm(cfg, raw)
+    seen = rollout(make_reality(cfg))
+    assert seen["observation"].shape == (20, 12)
+    torch.testing.assert_close(seen["action"], raw["action"])
+    shown = as_observed(cfg, raw)
+    for key in ("observation", ("next", "observation")):
+        torch.testing.assert_close(shown[key], seen[key], atol=1e-5, rtol=1e-4)
+    assert not torch.equal(shown["observation"][1, :4], shown["observation"][1, 8:])
+    assert torch.equal(shown["observation"][7, :4], shown["observation"][7, 8:])  # an episode's first, repeated
+    assert raw["observation"].shape == (20, 4)
+
+
+def test_without_stacking_the_latest_observation_is_shown(cfg):
+    cfg.frames = 1
+    raw = rollout(make_reality(cfg, raw=True))
+    measure_observation_norm(cfg, raw)
+    torch.testing.assert_close(
+        as_observed(cfg, raw)["observation"], rollout(make_reality(cfg))["observation"], atol=1e-5, rtol=1e-4
+    )
+
+
+@pytest.fixture
+def actor(cfg):
+    cfg.env.make.max_episode_steps = 500
+    env = make_reality(cfg)
+    torch.manual_seed(0)
+    return make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, [8])
+
+
+def test_a_world_is_evaluated_as_one_env_is(cfg, actor):
+    OmegaConf.update(cfg, "env.make.reset_noise", 0.0, force_add=True)
+    alone, batched = evaluate(make_reality(cfg), actor, episodes=1), evaluate(make_reality(cfg, 1), actor, episodes=1)
+    assert batched.lengths == alone.lengths
+    assert alone.lengths[0] < 500  # it fell over
+    assert batched.returns == pytest.approx(alone.returns, rel=1e-4)
+
+
+def test_worlds_at_once_have_episodes_of_their_own_that_count_to_their_ends(cfg, actor):
+    worlds = make_reality(cfg, 3)
+    at_once = evaluate(worlds, actor, episodes=3)
+    assert len(set(at_once.lengths)) == 3
+    first = evaluate(make_reality(cfg, 1), actor, episodes=1)
+    assert (at_once.lengths[0], at_once.returns[0]) == (first.lengths[0], pytest.approx(first.mean, rel=1e-4))
+    assert evaluate(worlds, actor, episodes=4).returns[:3] == at_once.returns
+    assert evaluate(worlds, actor, episodes=2).returns == at_once.returns[:2]

@@ -1,0 +1,169 @@
+"""Every method of the comparison: it trains through the one recipe, goes on where it stopped, and can be replayed."""
+
+import json
+import math
+import subprocess
+
+import pytest
+import torch
+
+from tests.small_runs import ROBOT, SMALL, interrupt_at, rows, run, trained
+from torchrl_h2o.commands.evaluate import load_policy
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training.environments import as_observed, make_reality
+from torchrl_h2o.training.loop import train
+from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.training.run_folder import Training
+
+methods = pytest.mark.parametrize("name", METHODS)
+OFFLINE = ("cql", "iql")
+
+
+def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):
+    printed = run(command("method=darc", *SMALL, *ROBOT, "hydra.run.dir=out", script="train.py"))
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["method"] == "DARC"
+    assert "backbone" not in summary
+    assert {row["method"] for row in rows(tmp_path / "out")} == {"DARC"}
+    assert (tmp_path / "out" / "learning_curve.png").stat().st_size > 10_000
+    assert "DARC" in printed
+    replayed = run(command("checkpoint=out", "episodes=1", "film=null", script="evaluate.py"))
+    assert "DARC in reality" in replayed
+
+
+def test_a_method_that_there_is_not_is_said(command):
+    done = subprocess.run(**command("method=ppo", script="train.py"), text=True, check=False)
+    assert done.returncode != 0
+    assert "choose sac, cql, iql" in done.stdout
+
+
+@methods
+def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(compose, tmp_path, name, monkeypatch):
+    cfg, real = compose("updates=60", "lr_end_factor=0.1", config="train")
+    method = METHODS[name]
+    policy, training = train(method, cfg, real, tmp_path / "whole")
+    assert len(training.rows) == 3
+    assert all(torch.isfinite(torch.tensor(value)) for row in training.rows for value in list(row.values())[1:])
+    first = method_policy(method, cfg, real, tmp_path / "first")
+    assert all((p != q).any() for p, q in zip(policy.parameters(), first.parameters(), strict=True))
+
+    monkeypatch.setattr("torchrl_h2o.training.run_folder.Training.log", interrupt_at(epoch=1, log=Training.log))
+    with pytest.raises(KeyboardInterrupt):
+        train(method, cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    train(method, cfg, real, tmp_path / "parts")
+    (folder,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
+    assert trained(tmp_path / "parts", folder) == trained(tmp_path / "whole", folder)
+
+
+def method_policy(method, cfg, real, directory):
+    """The policy that the method starts with."""
+    still = cfg.copy()
+    still.lr = 0.0
+    return train(method, still, real, directory)[0]
+
+
+@methods
+def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, name, monkeypatch):
+    cfg, real = compose("updates=20", config="train")
+    sizes = []
+    monkeypatch.setattr("torchrl_h2o.training.learner.Learner.update", recorded(sizes))
+    train(METHODS[name], cfg, real, tmp_path)
+    policy_s, *discriminators = sizes[0]
+    expected = {"sac": (0, 16), "darc": (0, 16), "cql": (16, 0), "iql": (16, 0)}
+    assert tuple(policy_s) == expected.get(name, (8, 8))
+    assert [tuple(size) for size in discriminators] == ([(8, 8)] if name in ("darc", "h2o", "h2o_plus", "td3") else [])
+
+
+def recorded(sizes):
+    from torchrl_h2o.training.learner import Learner
+
+    update = Learner.update
+
+    def recording(self):
+        sizes.append(list(self.batch_sizes))
+        return update(self)
+
+    return recording
+
+
+@pytest.mark.parametrize("name", OFFLINE)
+def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_path, name):
+    returns = []
+    for gap in ("gap=null", "gap=gravity"):
+        cfg, real = compose("updates=20", gap, config="train")
+        _, training = train(METHODS[name], cfg, real, tmp_path / gap)
+        returns.append(training.rows[-1]["return_real"])
+    assert returns[0] == returns[1]
+
+
+def parts(name, compose, *overrides):
+    """A method's learner and its first batches, the same at each call."""
+    cfg, real = compose(f"method={name}", *overrides, config="train")
+    torch.manual_seed(0)
+    spec = make_reality(cfg).action_spec_unbatched
+    real = as_observed(cfg, real)
+    replay = HybridReplayBuffer(real, sim_capacity=100)
+    replay.extend(real[:50])
+    learner = METHODS[name].make_learner(cfg, 4, spec, replay)
+    return learner, [replay.sample(size) for size in learner.batch_sizes]
+
+
+def test_darc_learns_from_corrected_rewards(compose):
+    learner, (batch, pairs) = parts("darc", compose)
+    task_s = batch["next", "reward"].clone()
+    learner.terms_of(batch, pairs)
+    log_ratio = learner.losses["ratio_loss"].estimator(batch.clone())["log_dynamics_ratio"]
+    scale = compose("method=darc", config="train")[0].reward_scale
+    assert scale != 1.0
+    # Δr of DARC's Eq. (1): log p_reality − log p_simulator, in the scale of the task's own reward
+    torch.testing.assert_close(batch["next", "reward"].squeeze(-1), task_s.squeeze(-1) + scale * log_ratio)
+
+
+def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):
+    learner, (batch, pairs) = parts("h2o", compose)
+    losses = learner.terms_of(batch, pairs)
+    for key in ("dynamics_ratio", "dynamics_divergence"):
+        assert (batch[key][batch["real"]] == 1.0).all()
+    assert (batch["dynamics_divergence"][~batch["real"]] != 1.0).all()
+    assert {"loss_conservative", "loss_qvalue", "loss_ratio_sa"} <= losses.keys()
+
+
+def test_h2o_s_backup_holds_no_entropy_and_its_term_alpha_c(compose):
+    found = []
+    for alpha_c, alpha in ((0.01, 1.0), (0.02, 50.0)):
+        learner, batches = parts("h2o", compose, f"h2o.alpha_c={alpha_c}")
+        learner.losses["loss"].loss.log_alpha.data.fill_(math.log(alpha))
+        torch.manual_seed(1)
+        found.append(learner.terms_of(*batches))
+    torch.testing.assert_close(found[1]["loss_conservative"], 2 * found[0]["loss_conservative"])
+    torch.testing.assert_close(found[1]["loss_qvalue"], found[0]["loss_qvalue"])
+    assert not torch.allclose(found[1]["loss_actor"], found[0]["loss_actor"])
+
+
+def test_cql_s_policy_is_not_also_told_to_copy(compose):
+    learner, batches = parts("cql", compose)
+    assert {"loss_actor", "loss_qvalue", "loss_cql", "loss_alpha"} == {
+        name for name in learner.terms_of(*batches).keys() if name.startswith("loss_")
+    }
+
+
+@pytest.mark.parametrize("name", OFFLINE)
+def test_a_method_that_learns_from_real_data_alone_has_no_simulator(compose, tmp_path, name, monkeypatch):
+    cfg, real = compose("updates=20", "keep=best_in_simulator", config="train")
+    monkeypatch.delattr(HybridReplayBuffer, "extend")
+    monkeypatch.delattr("training.make_simulator")
+    policy, training = train(METHODS[name], cfg, real, tmp_path)
+    assert "return_sim" not in training.rows[-1]
+    kept = load_policy(cfg, tmp_path, METHODS[name].title)
+    torch.testing.assert_close(kept.state_dict(), policy.state_dict())
+
+
+def test_cql_s_loss_sees_actions_in_units_of_their_bounds_and_its_policy_acts_in_the_task_s(compose):
+    learner, (batch,) = parts("cql", compose)
+    asked = batch["action"].clone()
+    learner.terms_of(batch)
+    torch.testing.assert_close(batch["action"], asked / 3.0)  # 3 N·m
+    with torch.no_grad():
+        learner.actor.module[0].module[0][-1].bias[0] = 100.0
+    assert learner.actor(batch)["action"].min() > 2.99

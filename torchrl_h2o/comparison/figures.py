@@ -1,0 +1,114 @@
+"""Pictures of a group of runs: learning curves with bands, and the scores over all tasks with their intervals."""
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from torchrl_h2o.comparison.aggregates import Interval
+from torchrl_h2o.comparison.scores import Row, Task, task_of
+from torchrl_h2o.training.learning_curve import COLOURS
+
+
+def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> None:
+    """Returns over the updates, an axis a task: the seeds' mean, and a band from the lowest to the highest.
+
+    Args:
+        path: of the PNG.
+        rows: of a group's curves, one an evaluation, where they are to be read.
+        titles: of the methods, in the order of the legend.
+    """
+    curves = _curves(rows)
+    tasks = sorted({task for task, _ in curves})
+    columns = min(4, len(tasks))
+    figure, axes = plt.subplots(
+        math.ceil(len(tasks) / columns),
+        columns,
+        figsize=(4.2 * columns, 3.2 * math.ceil(len(tasks) / columns)),
+        layout="constrained",
+        squeeze=False,
+    )
+    for axis, task in zip(axes.flat, tasks, strict=False):
+        for name in titles:
+            if (task, name) in curves:
+                _draw_band(axis, curves[task, name], titles[name])
+        axis.set_title(" ".join(part for part in task if part), fontsize=8)
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    for axis in axes.flat[len(tasks) :]:
+        axis.set_visible(False)
+    for axis in axes[-1]:
+        axis.set_xlabel("updates")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("return in reality")
+    handles = {label: handle for a in axes.flat for handle, label in zip(*a.get_legend_handles_labels(), strict=True)}
+    labels = [title for title in titles.values() if title in handles]
+    beside = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
+    figure.legend([handles[label] for label in labels], labels, **beside)
+    said = "The policy in training, at each evaluation;\nbands from the lowest seed to the highest"
+    figure.suptitle(said, fontsize=8)
+    _save(figure, path)
+
+
+def _curves(rows: Sequence[Row]) -> dict[tuple[Task, str], dict[int, list[float]]]:
+    """By task and method: after so many updates, the returns of all seeds."""
+    curves: dict[tuple[Task, str], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        curves[task_of(row), row["method"]][int(row["at"])].append(float(row["return_mean"]))
+    return curves
+
+
+def _draw_band(axis: plt.Axes, curve: Mapping[int, list[float]], title: str) -> None:
+    at = sorted(curve)
+    colour = COLOURS.get(title)
+    axis.plot(at, [np.mean(curve[x]) for x in at], color=colour, label=title, lw=1.5)
+    axis.fill_between(at, [min(curve[x]) for x in at], [max(curve[x]) for x in at], color=colour, alpha=0.2, lw=0)
+
+
+def draw_aggregates(
+    path: Path,
+    means: Mapping[str, Interval],
+    better: Mapping[str, Interval],
+    titles: Mapping[str, str],
+    note: str,
+) -> None:
+    """Interquartile means, and the probability that H2O+ does better, each with its 95 % interval.
+
+    Args:
+        path: of the PNG.
+        means: by method.
+        better: by the other method.
+        titles: of the methods, from the top.
+        note: what tasks and seeds these are.
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 0.45 * len(means) + 1.6), layout="constrained")
+    _draw_intervals(left, means, titles)
+    left.set(xlabel="interquartile mean of the normalised score", xlim=(min(0.0, left.get_xlim()[0]), None))
+    _draw_intervals(right, better, titles)
+    right.axvline(0.5, color="0.6", ls="--", lw=1)
+    right.set(xlabel="P(H2O+ does better)", xlim=(-0.02, 1.02))
+    figure.suptitle(note, fontsize=9)
+    _save(figure, path)
+
+
+def _draw_intervals(axis: plt.Axes, intervals: Mapping[str, Interval], titles: Mapping[str, str]) -> None:
+    names = [name for name in titles if name in intervals][::-1]
+    for height, name in enumerate(names):
+        interval, colour = intervals[name], COLOURS.get(titles[name])
+        axis.barh(height, interval.high - interval.low, left=interval.low, height=0.5, color=colour, alpha=0.4)
+        axis.plot([interval.value] * 2, [height - 0.25, height + 0.25], color=colour, lw=2)
+    axis.set_yticks(range(len(names)), [titles[name] for name in names])
+    axis.grid(axis="x", alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

@@ -1,0 +1,106 @@
+"""The paper's Figures 3 and 4: how the wheel-legged robot moves in reality, and where it was in the simulator."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from torchrl_h2o.comparison.robot_trajectories import BINS, COMPARED, EVERY, SHOWN, spread_entropy
+from torchrl_h2o.envs.wheel_legged.env import TARGET_VELOCITY
+from torchrl_h2o.training.learning_curve import COLOURS
+from torchrl_h2o.training.methods import METHODS
+
+LIMITS = {"standing_still": (-1.0, 1.0), "moving_forward": (-0.5, 1.0)}
+LABELS = {"standing_still": "displacement (m)", "moving_forward": "velocity (m/s)"}
+
+
+def draw_robot(to: Path, kept: Mapping[str, np.ndarray]) -> None:
+    """Draws wheel_legged_trajectories.png and wheel_legged_diversity.png.
+
+    Args:
+        to: where the pictures go.
+        kept: what :func:`robot_results.kept_results` gave.
+    """
+    by_kind: dict[str, dict[tuple[str, str], list[np.ndarray]]] = {"way": {}, "states": {}}
+    for key, array in sorted(kept.items()):
+        kind, method, env, *_ = key.split(" ")
+        by_kind[kind].setdefault((env.rpartition("/")[2], method), []).append(array)
+    if by_kind["way"]:
+        draw_trajectories(to / "wheel_legged_trajectories.png", by_kind["way"])
+    if by_kind["states"]:
+        draw_diversity(to / "wheel_legged_diversity.png", by_kind["states"])
+
+
+def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray]]) -> None:
+    """Figure 3: displacement standing still and velocity moving forward; a line an episode, a cross where it fell.
+
+    Args:
+        path: of the PNG.
+        ways: of each run, ``[episodes, T]``, by task and method.
+    """
+    tasks = [task for task in SHOWN if any(key[0] == task for key in ways)]
+    methods = [name for name in METHODS if any(key[1] == name for key in ways)]
+    size = {"figsize": (2.6 * len(methods) + 0.8, 2.8 * len(tasks) + 0.3), "layout": "constrained", "squeeze": False}
+    figure, axes = plt.subplots(len(tasks), len(methods), sharex=True, sharey="row", **size)
+    for row, task in zip(axes, tasks, strict=True):
+        for axis, method in zip(row, methods, strict=True):
+            runs = ways.get((task, method), [])
+            for run in runs:
+                for value in run:
+                    _draw_episode(axis, value, LIMITS[task], COLOURS.get(METHODS[method].title))
+            aim = TARGET_VELOCITY if task == "moving_forward" else 0.0
+            axis.axhline(aim, color="0.4", ls="--", lw=1, zorder=1)
+            axis.set(xlim=(0, 30), ylim=LIMITS[task])
+            axis.set_title(f"{METHODS[method].title}, {len(runs)} run{'s' * (len(runs) != 1)}", fontsize=9)
+            axis.grid(alpha=0.3)
+            axis.spines[["top", "right"]].set_visible(False)
+        row[0].set_ylabel(f"{task.replace('_', ' ')}\n{LABELS[task]}")
+    for axis in axes[-1]:
+        axis.set_xlabel("time (s)")
+    figure.suptitle("In reality: a line an episode, × where the robot fell, dashed where it should be", fontsize=9)
+    _save(figure, path)
+
+
+def _draw_episode(axis: plt.Axes, value: np.ndarray, limits: tuple[float, float], colour: str | None) -> None:
+    t = EVERY * np.arange(1, len(value) + 1)
+    axis.plot(t, value, color=colour, lw=1.0, alpha=0.6)
+    stands = np.flatnonzero(~np.isnan(value))
+    if len(stands) < len(value) and len(stands):
+        axis.plot(t[stands[-1]], np.clip(value[stands[-1]], *limits), "x", color=colour, ms=5, clip_on=False)
+
+
+def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]]) -> None:
+    """Figure 4: where in pitch and pitch rate the simulated data lie, and over how many nats they spread.
+
+    Args:
+        path: of the PNG.
+        states: of each run, counts by cell, by task and method.
+    """
+    tasks = [task for task in SHOWN if any(key[0] == task for key in states)]
+    size = {"figsize": (9, 3.6 * len(tasks)), "layout": "constrained", "squeeze": False}
+    figure, axes = plt.subplots(len(tasks), len(COMPARED), sharex=True, sharey=True, **size)
+    most = max(sum(runs).max() for runs in states.values())
+    for row, task in zip(axes, tasks, strict=True):
+        for axis, method in zip(row, COMPARED, strict=True):
+            runs = states.get((task, method), [])
+            if not runs:
+                axis.set_visible(False)
+                continue
+            seen = np.ma.masked_equal(sum(runs), 0).T
+            drawn = axis.pcolormesh(*BINS, seen, norm="log", vmin=1, vmax=most, cmap="viridis")
+            entropies = ", ".join(f"{spread_entropy(run):.2f}" for run in runs)
+            title = f"{METHODS[method].title}, {task.replace('_', ' ')}: entropy {entropies} nats"
+            axis.set_title(title, fontsize=9)
+            axis.set(xlabel="pitch (rad)", ylabel="pitch rate (rad/s)")
+    figure.colorbar(drawn, ax=axes, label="simulated transitions, all runs")
+    _save(figure, path)
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

@@ -1,0 +1,106 @@
+"""What the paper's Figures 3 and 4 are drawn of: the robot's way in reality, and where it was in the simulator.
+
+Kept beside the results, in wheel_legged_figures.npz, as runs' folders do not last: for each run, by its identity in
+the CSV with ``-`` for what is empty, ``way <run>``, ``[episodes, T]``, every 0.2 s, NaN once it fell, and
+``states <run>``, ``[pitch, pitch rate]``, counts.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_h2o.commands.evaluate import load_policy
+from torchrl_h2o.comparison.results_file import IDENTITY, identity
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
+from torchrl_h2o.training.environments import as_observed, make_reality
+from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.training.real_data import read_real_data
+from torchrl_h2o.training.returns import SEED
+from torchrl_h2o.training.run_folder import checkpoint_folder, load_config
+
+SHOWN = {"standing_still": "x", "moving_forward": "v"}
+EVERY = 0.2  # s
+EPISODES = 5  # the first of the run's own table
+COMPARED = ("h2o", "h2o_plus")  # whose simulated data the paper compares
+BINS = (np.linspace(-0.55, 0.55, 56), np.linspace(-8.0, 8.0, 65))  # of pitch (rad) and pitch rate (rad/s)
+
+
+def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> dict[str, np.ndarray]:
+    """What the file holds of some runs, after what their folders hold has been added to it.
+
+    Args:
+        path: of the NPZ.
+        runs: the folder of the group's runs.
+        told: the rows of the results that are asked for; folders of other runs are left alone.
+
+    Returns:
+        The arrays by ``way`` or ``states`` and the run's identity.
+    """
+    asked = {tuple(row[key] for key in IDENTITY): _name(row) for row in told}
+    arrays = dict(np.load(path)) if path.exists() else {}
+    for summary in sorted(runs.glob("*/summary.json")):
+        cfg = load_config(summary.parent)
+        name = asked.get(tuple(identity(cfg).values()))
+        if name is not None and f"way {name}" not in arrays:
+            arrays[f"way {name}"] = ways(cfg, summary.parent)
+            if cfg.method in COMPARED:
+                arrays[f"states {name}"] = counted(simulated_states(cfg, summary.parent))
+    if arrays:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(path, **arrays)
+    return {key: array for key, array in arrays.items() if key.partition(" ")[2] in asked.values()}
+
+
+def _name(row: Mapping[str, str]) -> str:
+    return " ".join(row[key] or "-" for key in IDENTITY)
+
+
+def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
+    """What the policy does in the first episodes of its table, ``[episodes, T]``: metres, or metres a second."""
+    env = make_reality(cfg, EPISODES)
+    with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.manual_seed(SEED)
+        env.set_seed(SEED)
+        policy = load_policy(cfg, folder, METHODS[cfg.method].title)
+        steps = env.rollout(cfg.env.make.max_episode_steps, policy, break_when_any_done=False)
+    done = steps["next", "done"].squeeze(-1).long()
+    first = done.cumsum(1) - done == 0  # up to the first end, with it
+    value = _in_units(cfg, steps["next", "observation"], (SHOWN[cfg.env.make.task],)).squeeze(-1)
+    every = round(EVERY / cfg.env.seconds_per_step)
+    return torch.where(first, value, torch.nan)[:, every - 1 :: every].float().numpy()
+
+
+def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
+    """Pitch (rad) and pitch rate (rad/s) of the simulated transitions that the run ended with, ``[N, 2]``."""
+    real = as_observed(cfg, read_real_data(cfg))
+    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    title = METHODS[cfg.method].title
+    Checkpoint(replay=replay).load(CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest())
+    return _in_units(cfg, replay.sim[:]["observation"], ("theta", "theta_dot")).numpy()
+
+
+def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str]) -> torch.Tensor:
+    """Some dimensions of what a learner observed ``[*B, n]``, of the last of its frames and in their own units."""
+    names = OBSERVATIONS[cfg.env.make.task]
+    last = observation[..., -len(names) :].double()
+    if cfg.observation_norm is not None:
+        last = last * torch.tensor(list(cfg.observation_norm.scale)) + torch.tensor(list(cfg.observation_norm.loc))
+    return last[..., [names.index(name) for name in wanted]]
+
+
+def counted(states: np.ndarray) -> np.ndarray:
+    """How many of the states ``[N, 2]`` are in each cell of :data:`BINS`."""
+    counts, *_ = np.histogram2d(states[:, 0], states[:, 1], bins=BINS)
+    return counts.astype(np.int32)
+
+
+def spread_entropy(counts: np.ndarray) -> float:
+    """Entropy (nats) of counted states: the logarithm of how many cells they fill evenly."""
+    share = counts[counts > 0] / counts.sum()
+    return float(-(share * np.log(share)).sum())

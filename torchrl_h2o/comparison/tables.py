@@ -1,0 +1,108 @@
+"""A group's tables, learning curves and aggregates, ours beside the paper's."""
+
+from pathlib import Path
+
+from torchrl_h2o.comparison.aggregates import BASE, Scores, common_scores, improvements, interquartile_means
+from torchrl_h2o.comparison.figures import draw_aggregates, draw_curves
+from torchrl_h2o.comparison.results_file import curves_of, read_rows
+from torchrl_h2o.comparison.scores import (
+    VARIANTS,
+    MixedRunsError,
+    Reference,
+    Row,
+    Task,
+    cells,
+    markdown,
+    placed,
+)
+from torchrl_h2o.training.methods import METHODS
+
+TITLES = {name: method.title for name, method in METHODS.items()}
+SCORES = (
+    "Scores are returns on a scale from D4RL's random policy, 0, to its expert, 100; the robot's from nothing to 30 s "
+    "without a fault, a scale of ours."
+)
+ABLATIONS = ("mixing", "backbones")  # one method, whose variants are compared
+
+
+def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:
+    """The runs of one number of updates, so that none is set beside one that learnt for longer.
+
+    Raises:
+        MixedRunsError: if there are several numbers and none is asked for.
+    """
+    budgets = sorted({int(row["updates"]) for row in rows})
+    if updates is None and len(budgets) > 1:
+        raise MixedRunsError(f"{group}.csv holds runs of {budgets} updates: choose one with updates=...")
+    return [row for row in rows if updates is None or int(row["updates"]) == updates]
+
+
+def report(group: str, rows: list[Row], results: Path, to: Path, references: dict[str, Reference], reps: int) -> None:
+    """Writes a group's table, learning curves and aggregates, and prints the table.
+
+    Raises:
+        MixedRunsError: if a method has two runs of a seed in a task.
+    """
+    variants = group in ABLATIONS
+    table = cells(placed(rows, variants))
+    theirs = paper_cells(read_rows(results / "paper.csv"), group, table)
+    lines = [markdown(table, TITLES, theirs, references), ""]
+    lines.append(
+        "Returns in reality: mean ± standard deviation over the seeds (how many); of one seed, over its episodes."
+    )
+    kept = "" if any("keep=" in row["others"] for row in rows) else ", by the last policy"
+    lines.append(f"After {int(rows[0]['updates']):,} updates{kept}.")
+    if theirs:
+        lines.append("The paper's: five seeds, 1,000,000 updates, D4RL's data.")
+    lines.append(SCORES)
+    (to / f"{group}_aggregates.png").unlink(missing_ok=True)  # of other runs, perhaps
+    if unknown := sorted({task[0] for task in table} - references.keys()):
+        lines.append(f"No scores without returns that count as 0 and 100: +references.{unknown[0]}=[...,...].")
+    elif len({name for methods in table.values() for name in methods}) > 1:
+        lines += ["", *aggregate_lines(group, common_scores(table, references), len(table), to, reps)]
+    text = "\n".join(lines) + "\n"
+    to.mkdir(parents=True, exist_ok=True)
+    (to / f"{group}.md").write_text(text)
+    print(f"\n{group}\n\n{text}")
+    budget = {row["updates"] for row in rows}
+    curves = [row for row in read_rows(curves_of(results / f"{group}.csv")) if row["updates"] in budget]
+    if curves:
+        draw_curves(to / f"{group}_curves.png", placed(curves, variants), TITLES)
+
+
+def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:
+    """What the methods come to over all tasks, drawn too; of one seed, whose intervals would have no width, nothing."""
+    if not scores.tasks:
+        return ["Interquartile means take a task that every method has done."]
+    if len(scores.seeds) < 2:
+        return ["Interquartile means and their intervals take two seeds of every method, or more."]
+    means = interquartile_means(scores, reps)
+    better = improvements(scores, reps) if BASE in scores.runs else {}
+    number = f"{len(scores.tasks)} of {num_tasks} tasks" if len(scores.tasks) < num_tasks else f"{num_tasks} tasks"
+    note = f"{number}, seeds {', '.join(map(str, scores.seeds))}; 95 % bootstrap intervals"
+    draw_aggregates(to / f"{group}_aggregates.png", means, better, TITLES, note)
+    return [aggregate_table(means, better), "", f"{note}."]
+
+
+def aggregate_table(means: dict, better: dict) -> str:
+    """Interquartile means and probabilities of improvement, a line a method."""
+    lines = ["| method | interquartile mean of the normalised score | P(H2O+ does better) |", "| --- | --- | --- |"]
+    for name in (name for name in TITLES if name in means):
+        chance = better[name].text() if name in better else ""
+        lines.append(f"| {TITLES[name]} | {means[name].text()} | {chance} |")
+    return "\n".join(lines)
+
+
+def paper_cells(rows: list[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
+    """The paper's figures for the tasks of a table."""
+    cells: dict[Task, dict[str, str]] = {}
+    for row in rows:
+        if row["group"] != group:
+            continue
+        asked = (row["env"], row["data"], f"{row['gap']} {float(row['strength']):g}")
+        variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
+        for task in table:
+            if task[:3] == asked and all(part in task[3:] for part in variant):
+                text = f"{float(row['return_mean']):,.0f} ± {float(row['return_std']):,.0f}"
+                cells.setdefault(task, {})[row["method"]] = text
+    return cells

@@ -1,0 +1,1 @@
+"""Hydra configuration that the console commands and the recipes share."""

@@ -1,0 +1,131 @@
+"""Read a log's layout from a small YAML, and name the entry that is wrong.
+
+YAML 1.1 has traps: ``on`` is true, ``5e-3`` is a text, and of two equal keys the last one wins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.log_columns import Column, LogColumns
+
+
+def read_columns(source: str | Path) -> LogColumns:
+    """Read a layout; see :meth:`LogColumns.load`.
+
+    Args:
+        source: a YAML file, or the name of one in the package.
+
+    Raises:
+        DataError: no such file, no YAML, an unknown, doubled or wrong entry, a contradiction.
+
+    Example:
+        >>> from torchrl_h2o.data.readers.columns_file import read_columns
+        >>> read_columns("simple_pendulum").action
+        ('torque',)
+    """
+    path = _find(source)
+    try:
+        entries = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except yaml.constructor.ConstructorError as error:
+        line = error.problem_mark.line + 1
+        raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"no YAML: {error}", "correct it", source=source) from error
+    known = _known_entries(LogColumns, entries, source)
+    if not isinstance(known.get("columns"), list) or not known["columns"]:
+        raise DataError("'columns' is no list", "list the file's columns", source=source)
+    columns = tuple(
+        _build(Column, {"name": f"column {number}", **_known_entries(Column, entry, source)}, source)
+        for number, entry in enumerate(known["columns"], start=1)
+    )
+    return _build(LogColumns, {**known, "columns": columns}, source)
+
+
+class _Loader(yaml.SafeLoader):
+    """yaml's safe loader, but two equal keys are an error and not one forgotten value."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                problem = f"the entry {key.value!r} stands there twice"
+                raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def _find(source: str | Path) -> Path:
+    path = Path(source).expanduser()
+    if path.is_file():
+        return path
+    shipped = Path(str(resources.files("torchrl_h2o.data.readers") / "logs"))
+    names = sorted(file.stem for file in shipped.glob("*.yaml"))
+    if str(source) in names:
+        return shipped / f"{source}.yaml"
+    raise DataError(
+        "there is no such column description",
+        f"give a YAML file or one of {', '.join(names)}",
+        source=source,
+    )
+
+
+def _known_entries(kind: type, entries: Any, source: str | Path) -> dict[str, Any]:
+    known = [field.name for field in fields(kind)]
+    if not isinstance(entries, dict):
+        raise DataError(f"{entries!r} is no mapping", f"give {', '.join(known)}", source=source)
+    for name in entries:
+        if name not in known:
+            raise DataError(f"unknown entry {name!r}", f"known are {', '.join(known)}", source=source)
+    return entries
+
+
+def _build(kind: type, entries: dict[str, Any], source: str | Path) -> Any:
+    convert = {
+        "dt": lambda name, value: None if value is None else _number(name, value),
+        "scale": _number,
+        "time_tolerance": _number,
+        "bounds": _pair,
+        "observation": _names,
+        "action": _names,
+    }
+    column = str(entries["name"]) if kind is Column else None
+    try:
+        values = {name: convert[name](name, value) if name in convert else value for name, value in entries.items()}
+        return kind(**values)
+    except (ValueError, TypeError) as error:
+        raise DataError(str(error), "correct the column description", source=source, column=column) from error
+
+
+def _number(name: str, value: Any) -> float:
+    # YAML 1.1 takes 5e-3 for a text, and on for true, which Python takes for 1
+    if isinstance(value, int | float | str) and not isinstance(value, bool):
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    raise ValueError(f"{name}: {value!r} is no number; units stand in an entry of their own, and dt is in s")
+
+
+def _pair(name: str, value: Any) -> tuple[float, float] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"{name}: {value!r} must be [lowest, highest]")
+    return _number(name, value[0]), _number(name, value[1])
+
+
+def _names(name: str, value: Any) -> tuple[str, ...]:
+    if value is None:
+        return ()
+    if not isinstance(value, list) or not all(isinstance(entry, str) for entry in value):
+        raise ValueError(f"{name}: {value!r} must be a list of column names; put on, off and numbers in quotes")
+    return tuple(value)

@@ -1,0 +1,169 @@
+"""Read a D4RL HDF5 file (``halfcheetah_medium-v2.hdf5`` and the like) into TED."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from tensordict import TensorDict
+from torchrl import torchrl_logger
+
+from torchrl_h2o.data.readers.error import DataError, require_finite
+from torchrl_h2o.data.readers.file_kind import require_file
+from torchrl_h2o.data.readers.ted import to_ted
+
+_REQUIRED = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "timeouts": 1}
+
+
+def read_d4rl(path: str | Path) -> TensorDict:
+    """Read a D4RL file.
+
+    With ``next_observations`` every row is a transition; a row that does not lead to the row after
+    it, though neither flag is set, is marked truncated, and the number of those is logged.
+
+    Without it the next observation is the row after; the last row of an episode then has none and
+    is dropped (the row before it becomes the truncated end), because the row after belongs to
+    another episode. The number of dropped rows is logged. A terminal row dropped so takes its
+    reward with it: prefer files with ``next_observations`` (D4RL's MuJoCo files from v1 on have
+    it) for tasks that terminate.
+
+    Args:
+        path: an HDF5 file with observations, actions, rewards, terminals and timeouts; the last
+            three of shape (N,) or (N, 1).
+
+    Returns:
+        TensorDict of batch size [T] in TED.
+
+    Raises:
+        DataError: a file that is missing, empty, cut off or a pickle; a missing array, arrays of
+            different lengths, NaN or infinity, a flag other than 0 and 1. Rows are counted from 1.
+
+    Example:
+        >>> import h5py, numpy as np, tempfile
+        >>> from torchrl_h2o.data import read_d4rl
+        >>> path = tempfile.mkdtemp() + "/task.hdf5"
+        >>> with h5py.File(path, "w") as file:
+        ...     for name in ("observations", "next_observations", "actions"):
+        ...         file[name] = np.zeros((4, 2), np.float32)
+        ...     for name in ("rewards", "terminals", "timeouts"):
+        ...         file[name] = np.zeros(4)
+        >>> read_d4rl(path).batch_size
+        torch.Size([4])
+
+    Source: Fu et al., "D4RL: Datasets for Deep Data-Driven Reinforcement Learning", 2020.
+    """
+    path = require_file(path)
+    arrays = _read_arrays(path)
+    steps = len(arrays["observations"])
+    for name, values in arrays.items():
+        if len(values) != steps or not steps:
+            raise DataError(
+                f"it has {len(values)} rows, observations has {steps}",
+                "the file is empty or cut off: copy or download it again",
+                source=path,
+                column=name,
+            )
+        columns = values.reshape(steps, -1)
+        names = [name] if values.ndim == 1 else [f"{name}[{i}]" for i in range(columns.shape[1])]
+        require_finite(columns, names, source=path)
+    for name in ("terminals", "timeouts"):
+        arrays[name] = _flags(arrays[name], name, path)
+    if "next_observations" in arrays:
+        rows, following = slice(None), arrays["next_observations"]
+        if following.shape != arrays["observations"].shape:
+            raise DataError(
+                f"the shape is {list(following.shape)}, observations has {list(arrays['observations'].shape)}",
+                "they must be of one kind",
+                source=path,
+                column="next_observations",
+            )
+        terminated, truncated = arrays["terminals"], _truncated_at_jumps(arrays, path)
+    else:
+        rows, following, terminated, truncated = _link_rows(arrays, path)
+    return to_ted(
+        observation=arrays["observations"][rows],
+        action=arrays["actions"][rows],
+        reward=arrays["rewards"][rows],
+        next_observation=following,
+        terminated=terminated,
+        truncated=truncated,
+    )
+
+
+def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+    import h5py  # here: the replay buffer of this package does without
+
+    try:
+        with h5py.File(path, "r") as file:
+            missing = [name for name in _REQUIRED if name not in file]
+            if missing:
+                raise DataError(
+                    f"the file has no {', '.join(missing)}; it has {', '.join(file)}",
+                    f"a D4RL file holds {', '.join(_REQUIRED)}",
+                    source=path,
+                    column=missing[0],
+                )
+            names = [*_REQUIRED, *(["next_observations"] if "next_observations" in file else [])]
+            arrays = {name: np.asarray(file[name]) for name in names}
+    except (OSError, RuntimeError, TypeError) as error:
+        raise DataError(
+            f"this cannot be read as HDF5: {error}",
+            "the file is cut off or of another kind: copy or download it again",
+            source=path,
+        ) from error
+    for name, values in arrays.items():
+        if _REQUIRED.get(name) == 1 and values.ndim == 2 and values.shape[1] == 1:
+            arrays[name] = values = values[:, 0]
+        if values.ndim != _REQUIRED.get(name, 2) or values.dtype.kind not in "fiub":
+            raise DataError(
+                f"it has {values.ndim} dimensions of {values.dtype}",
+                f"expected {_REQUIRED.get(name, 2)} dimensions of real numbers",
+                source=path,
+                column=name,
+            )
+    return arrays
+
+
+def _flags(values: np.ndarray, name: str, path: Path) -> np.ndarray:
+    wrong = np.flatnonzero((values != 0) & (values != 1))
+    if len(wrong):
+        raise DataError(
+            f"the flag is {values[wrong[0]]}",
+            "it must be 0 or 1",
+            source=path,
+            column=name,
+            row=int(wrong[0]) + 1,
+        )
+    return values.astype(bool)
+
+
+def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
+    """The timeouts, and where the next row begins elsewhere: another episode, or rows were left out."""
+    led, found = (
+        arrays[name][rows].astype(np.float32)
+        for name, rows in (("next_observations", slice(-1)), ("observations", slice(1, None)))
+    )
+    jumps = np.append((led != found).any(1), False) & ~arrays["terminals"] & ~arrays["timeouts"]
+    if jumps.any():
+        torchrl_logger.warning(
+            f"{path}: {jumps.sum()} of {len(jumps)} rows are marked truncated, as the row after "
+            "them does not begin where they led to"
+        )
+    return arrays["timeouts"] | jumps
+
+
+def _link_rows(arrays: dict[str, np.ndarray], path: Path) -> tuple:
+    """The rows whose next observation is known, that observation, and both flags."""
+    ends = arrays["terminals"] | arrays["timeouts"]
+    ends[-1] = True
+    rows = np.flatnonzero(~ends)
+    if not len(rows):
+        raise DataError(
+            "no row has a successor in its own episode",
+            "a file without next_observations needs episodes of at least two rows",
+            source=path,
+            column="observations",
+        )
+    torchrl_logger.info(f"{path}: {ends.sum()} of {len(ends)} rows dropped, last of their episode")
+    # the row before a dropped end becomes its episode's last one
+    return rows, arrays["observations"][rows + 1], np.zeros(len(rows), bool), ends[rows + 1]

@@ -1,0 +1,90 @@
+"""The one exception of this folder, and the check that most readers share.
+
+A reader either returns the whole data set or raises :class:`DataError`, which says where the bad
+value stands (file, column, row) and what to do about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+
+class DataError(ValueError):
+    """Data that cannot be used, with the place and the remedy.
+
+    Args:
+        problem: what is wrong, with the bad value.
+        remedy: what the reader of the message can do.
+        source: the file, folder or dataset name; also kept as an attribute.
+        column: the column's name, or the path inside a file; also kept as an attribute.
+        row: the row, counted from 1 (for text: the line number that an editor shows); also kept as
+            an attribute.
+
+    Example:
+        >>> from torchrl_h2o.data import DataError
+        >>> print(DataError("not a number: 'x'", "correct it", source="a.csv", column="v", row=3))
+        a.csv, column 'v', row 3: not a number: 'x'; correct it
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        remedy: str,
+        *,
+        source: str | Path | None = None,
+        column: str | None = None,
+        row: int | None = None,
+    ):
+        self.source = None if source is None else str(source)
+        self.column = column
+        self.row = row
+        place = [
+            self.source,
+            None if column is None else f"column {column!r}",
+            None if row is None else f"row {row}",
+        ]
+        where = ", ".join(part for part in place if part)
+        super().__init__(f"{where + ': ' if where else ''}{problem}; {remedy}")
+
+
+def require_finite(
+    values: np.ndarray,
+    columns: Sequence[str],
+    *,
+    source: str | Path,
+    row_of: Callable[[int], int] = lambda index: index + 1,
+) -> None:
+    """Raise at the first value (row by row) that float32 holds as NaN or infinity.
+
+    Args:
+        values: shape (rows, columns).
+        columns: one name for each column.
+        source: the file that the values come from.
+        row_of: turns an index into the row to report.
+
+    Raises:
+        DataError: naming file, column and row.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_h2o.data.readers.error import require_finite
+        >>> require_finite(np.array([[0.0, np.nan]]), ["x", "v"], source="a.csv")
+        Traceback (most recent call last):
+        ...
+        torchrl_h2o.data.readers.error.DataError: a.csv, column 'v', row 1: the value is nan; ...
+    """
+    with np.errstate(over="ignore"):  # 1e300 is finite in the file and infinite in float32
+        bad = ~np.isfinite(values.astype(np.float32))
+    if not bad.any():
+        return
+    index, position = np.argwhere(bad)[0]
+    raise DataError(
+        f"the value is {values[index, position]}",
+        "every value must be finite in float32: remove the row and what depends on it, or mark the column as ignored",
+        source=source,
+        column=columns[position],
+        row=row_of(int(index)),
+    )

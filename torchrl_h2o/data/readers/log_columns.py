@@ -1,0 +1,182 @@
+"""What the columns of a robot log mean: names, roles, units and timing."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from torchrl_h2o.data.readers.units import to_si
+
+ROLES = ("observation", "action", "reward", "done", "time", "ignore")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a log.
+
+    Args:
+        name: its name; with a header, the one that stands there.
+        role: one of observation, action, reward, done, time, ignore. ``done`` is 1 in the rows in
+            which the task has ended. ``reward`` in a row is what that row's action earned.
+        unit: the unit of the file, turned into SI; see :data:`~torchrl_h2o.data.units.UNITS`.
+        scale: a factor beside the unit (a gear ratio, a sign).
+        bounds: lowest and highest value in SI, for actions.
+
+    Example:
+        >>> from torchrl_h2o.data import Column
+        >>> Column("pitch", "observation", unit="deg").factor
+        0.017453292519943295
+    """
+
+    name: str
+    role: Literal["observation", "action", "reward", "done", "time", "ignore"]
+    unit: str = "1"
+    scale: float = 1.0
+    bounds: tuple[float, float] | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.name, str):
+            raise ValueError(f"name {self.name!r} is no text: put it in quotes (YAML reads on, off, yes, no as flags)")
+        if self.role not in ROLES:
+            raise ValueError(f"unknown role {self.role!r}; known are {', '.join(ROLES)}")
+        try:
+            si_unit, _ = to_si(self.unit)
+        except KeyError as error:
+            raise ValueError(error.args[0]) from None
+        if self.role == "time" and si_unit != "s":
+            raise ValueError(f"the unit {self.unit!r} is none of time; take s, ms or us")
+        if not math.isfinite(self.scale) or self.scale == 0:
+            raise ValueError(f"scale {self.scale} must be finite and not zero")
+        if self.bounds is not None:
+            if self.role != "action":
+                raise ValueError("bounds are for actions only")
+            if not self.bounds[0] < self.bounds[1]:
+                raise ValueError(f"bounds {list(self.bounds)} must be [lowest, highest]")
+
+    @property
+    def factor(self) -> float:
+        """What the file's value is multiplied by to have it in SI."""
+        return to_si(self.unit)[1] * self.scale
+
+
+@dataclass(frozen=True)
+class LogColumns:
+    """The layout of a log file. Whatever leaves rows out has to be asked for by name.
+
+    Args:
+        columns: the columns; without a header in the file's order.
+        dt: seconds between two rows; ``None`` takes the median of the time column.
+        separator: ``"whitespace"`` or one character; with a character, cells may stand in "".
+        header: whether the first row holds the names.
+        comment: a character; lines that begin with it are skipped, before the header too.
+        decimal: what stands before the fraction, ``"."`` or ``","``.
+        other_columns: columns of the header that are not described are an ``"error"``, or
+            ``"ignore"`` them.
+        observation: names in the order of the observation vector; the file's order by default.
+        action: the same for the action vector.
+        outside_bounds: an action outside its bounds is an ``"error"``, or ``"clip"`` it.
+        time_tolerance: how far a time step may be from dt, as a share of dt.
+        on_time_jump: a time step outside of that is an ``"error"``, or ``"split"`` the run there.
+            Time that runs backwards is always an error.
+        after_done: rows with done = 0 behind a row with done = 1 are an ``"error"``; or ``"drop"``
+            the rest of the file, or begin a ``"new_episode"`` with them.
+        drop_trailing_zero_rows: leave out rows at the end of the file that are zero throughout.
+
+    Raises:
+        ValueError: a contradiction, with what is allowed.
+
+    Example:
+        >>> from torchrl_h2o.data import Column, LogColumns
+        >>> log = LogColumns((Column("v", "observation"), Column("tau", "action")), dt=0.005)
+        >>> log.observation
+        ('v',)
+    """
+
+    columns: tuple[Column, ...]
+    dt: float | None = None
+    separator: str = "whitespace"
+    header: bool = False
+    comment: str | None = None
+    decimal: Literal[".", ","] = "."
+    other_columns: Literal["error", "ignore"] = "error"
+    observation: tuple[str, ...] = ()
+    action: tuple[str, ...] = ()
+    outside_bounds: Literal["error", "clip"] = "error"
+    time_tolerance: float = 0.5
+    on_time_jump: Literal["error", "split"] = "error"
+    after_done: Literal["error", "drop", "new_episode"] = "error"
+    drop_trailing_zero_rows: bool = False
+
+    def __post_init__(self):
+        for name, count in Counter(column.name for column in self.columns).items():
+            if count > 1:
+                raise ValueError(f"the column name {name!r} stands there {count} times")
+        for role in ("observation", "action"):
+            names = self._names(role)
+            if not names:
+                raise ValueError(f"there is no column with the role {role!r}")
+            order = getattr(self, role) or names
+            if sorted(order) != sorted(names):
+                raise ValueError(f"{role}: {list(order)} must name each of {list(names)} once")
+            object.__setattr__(self, role, tuple(order))
+        for role in ("reward", "done", "time"):
+            if len(self._names(role)) > 1:
+                raise ValueError(f"several columns have the role {role!r}; one can")
+        if self.dt is None and not self._names("time"):
+            raise ValueError("dt is missing, and so is a time column to take it from")
+        if self.dt is not None and not 0 < self.dt < math.inf:
+            raise ValueError(f"dt {self.dt} must be a positive number of seconds")
+        if not isinstance(self.separator, str) or (self.separator != "whitespace" and len(self.separator) != 1):
+            raise ValueError(f"separator {self.separator!r} must be 'whitespace' or one character")
+        if self.separator in ('"', "\n", "\r"):
+            raise ValueError(f"separator {self.separator!r} cannot stand between cells; take another")
+        if self.comment is not None and not (isinstance(self.comment, str) and len(self.comment.strip()) == 1):
+            raise ValueError(f"comment {self.comment!r} must be one character (in quotes: YAML's own comment is #)")
+        if self.decimal == self.separator:
+            raise ValueError(f"decimal and separator are both {self.decimal!r}; one of them is another")
+        if self.other_columns == "ignore" and not self.header:
+            raise ValueError("other_columns: ignore needs a header; without one, describe all with role: ignore")
+        if not 0 < self.time_tolerance < math.inf:
+            raise ValueError(f"time_tolerance {self.time_tolerance} must be positive")
+        for name, allowed in (
+            ("outside_bounds", ("error", "clip")),
+            ("on_time_jump", ("error", "split")),
+            ("after_done", ("error", "drop", "new_episode")),
+            ("header", (True, False)),
+            ("decimal", (".", ",")),
+            ("other_columns", ("error", "ignore")),
+            ("drop_trailing_zero_rows", (True, False)),
+        ):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} {getattr(self, name)!r} must be one of {allowed}")
+
+    def named(self, role: str) -> Column | None:
+        """The column with a role of which there is at most one."""
+        return next((column for column in self.columns if column.role == role), None)
+
+    def _names(self, role: str) -> tuple[str, ...]:
+        return tuple(column.name for column in self.columns if column.role == role)
+
+    @classmethod
+    def load(cls, source: str | Path) -> LogColumns:
+        """Read the layout from a YAML file, or one that comes with the package by its name.
+
+        Args:
+            source: a path, or ``"wheel_legged_standing_still"``, ``"wheel_legged_moving_forward"``
+                or ``"simple_pendulum"``.
+
+        Raises:
+            DataError: no such file, no YAML, an unknown, doubled or wrong entry, a contradiction.
+
+        Example:
+            >>> from torchrl_h2o.data import LogColumns
+            >>> LogColumns.load("wheel_legged_standing_still").observation
+            ('theta', 'theta_dot', 'x', 'v')
+        """
+        # here: that file imports this one, and yaml, which a layout in code does without
+        from torchrl_h2o.data.readers.columns_file import read_columns
+
+        return read_columns(source)

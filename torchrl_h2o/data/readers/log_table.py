@@ -1,0 +1,182 @@
+"""Turn the text of a log into numbers in SI, or say in which line and column it is not one."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_h2o.data.readers.error import DataError, require_finite
+from torchrl_h2o.data.readers.file_kind import require_file
+from torchrl_h2o.data.readers.log_columns import LogColumns
+
+
+@dataclass(frozen=True)
+class LogTable:
+    """The numbers of a log.
+
+    Args:
+        source: the file.
+        names: the columns that are read, in the file's order.
+        values: shape (rows, columns), float64, in SI.
+        rows: shape (rows,), the line number of each row, counted from 1.
+        zero_rows: how many rows of zeros were left out at the end.
+    """
+
+    source: str
+    names: tuple[str, ...]
+    values: np.ndarray
+    rows: np.ndarray
+    zero_rows: int
+
+    def columns(self, names: Sequence[str]) -> np.ndarray:
+        """The named columns in that order, shape (rows, len(names))."""
+        return self.values[:, [self.names.index(name) for name in names]]
+
+
+def read_table(path: str, layout: LogColumns) -> LogTable:
+    """Read a log's numbers and check every one of them.
+
+    Args:
+        path: the log.
+        layout: what its columns are.
+
+    Returns:
+        the table, converted to SI; columns that are ignored are not looked at.
+
+    Raises:
+        DataError: no file, no text, an empty or cut-off file, missing or extra columns, what is
+            no number, NaN or infinity.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from torchrl_h2o.data import Column, LogColumns
+        >>> from torchrl_h2o.data.readers.log_table import read_table
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+        >>> _ = path.write_text("torque,speed\\n1,60\\n2,120\\n")
+        >>> layout = LogColumns(
+        ...     (Column("speed", "observation", "rpm"), Column("torque", "action", "mN·m")),
+        ...     dt=0.01, separator=",", header=True)
+        >>> read_table(path, layout).columns(["torque"]).tolist()
+        [[0.001], [0.002]]
+    """
+    path = require_file(path)
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except UnicodeDecodeError as error:
+        raise DataError(f"this is no text: {error}", "give a text or CSV file", source=path) from error
+    # blank lines and comments are skipped and still counted, as in an editor
+    rows = [
+        (number, _cells(line, layout.separator, path, number))
+        for number, line in enumerate(lines, start=1)
+        if line.strip() and not (layout.comment and line.lstrip().startswith(layout.comment))
+    ]
+    names = [column.name for column in layout.columns]
+    if layout.header and rows:
+        names = _require_names(rows.pop(0), names, path, layout.other_columns == "ignore")
+    if len(rows) < 2:
+        raise DataError(
+            f"there are {len(rows)} rows of data",
+            "two make a transition: the file is empty or cut off",
+            source=path,
+        )
+    _require_width(rows, names, path)
+    by_name = {column.name: column for column in layout.columns}
+    kept = [i for i, name in enumerate(names) if name in by_name and by_name[name].role != "ignore"]
+    names = [names[i] for i in kept]
+    values = _numbers([[cells[i] for i in kept] for _, cells in rows], names, rows, layout.decimal, path)
+    numbers = np.array([number for number, _ in rows])
+    zero_rows = 0
+    if layout.drop_trailing_zero_rows:
+        filled = np.flatnonzero((values != 0).any(1))
+        zero_rows = len(values) - (filled[-1] + 1 if len(filled) else 0)
+        values, numbers = values[: len(values) - zero_rows], numbers[: len(values) - zero_rows]
+    if len(values) < 2:
+        raise DataError("only rows of zeros are left", "record it again", source=path)
+    values = values * np.array([by_name[name].factor for name in names])
+    require_finite(values, names, source=path, row_of=lambda index: int(numbers[index]))
+    return LogTable(str(path), tuple(names), values, numbers, int(zero_rows))
+
+
+def _cells(line: str, separator: str, path, number: int) -> list[str]:
+    if separator == "whitespace":
+        return line.split()
+    try:
+        # skipinitialspace: a quote behind a space is a quote still
+        skip = separator != " "
+        (cells,) = csv.reader([line.rstrip("\r")], delimiter=separator, skipinitialspace=skip, strict=True)
+    except csv.Error as error:
+        raise DataError(
+            f"the line cannot be cut into cells: {error}",
+            "correct its quotes; a cell ends on its own line",
+            source=path,
+            row=number,
+        ) from error
+    return [cell.strip() for cell in cells]
+
+
+def _require_names(header: tuple[int, list[str]], expected: list[str], path, ignore_others: bool) -> list[str]:
+    number, cells = header
+    names = [cell.strip("\"'") for cell in cells]
+    remedy = f"the header is {', '.join(names)}; correct the file or its column description"
+    for name in names:
+        if ignore_others and name not in expected:
+            continue
+        if names.count(name) > 1:
+            problem = "two columns have this name"
+        elif name not in expected:
+            problem = "the column is not described (role: ignore leaves it out, other_columns: ignore all such)"
+        else:
+            continue
+        raise DataError(problem, remedy, source=path, column=name, row=number)
+    for name in expected:
+        if name not in names:
+            raise DataError("the column is missing", remedy, source=path, column=name, row=number)
+    return names
+
+
+def _require_width(rows: list[tuple[int, list[str]]], names: list[str], path) -> None:
+    for number, cells in rows:
+        if len(cells) == len(names):
+            continue
+        place = {"source": path, "row": number}
+        found = f"the row has {len(cells)} columns, {len(names)} are expected"
+        if len(cells) > len(names):
+            raise DataError(
+                f"{found}; extra: {', '.join(cells[len(names) :])}",
+                "describe them (the role ignore leaves them out), or check the separator",
+                column=f"column {len(names) + 1}",
+                **place,
+            )
+        place["column"] = names[len(cells)]
+        if number == rows[-1][0] and len(rows) > 1:
+            raise DataError(f"{found}, and it is the last", "the file is cut off", **place)
+        raise DataError(f"{found}; missing", "correct the row, or check the separator", **place)
+
+
+def _numbers(
+    cells: list[list[str]], names: list[str], rows: list[tuple[int, list[str]]], decimal: str, path
+) -> np.ndarray:
+    values = np.empty((len(cells), len(names)))
+    for index, row in enumerate(cells):
+        for position, cell in enumerate(row):
+            try:
+                values[index, position] = _number(cell, decimal)
+            except ValueError:
+                raise DataError(
+                    f"{cell!r} is no number",
+                    f"correct it, or check separator, header and decimal ({decimal!r})",
+                    source=path,
+                    column=names[position],
+                    row=rows[index][0],
+                ) from None
+    return values
+
+
+def _number(cell: str, decimal: str) -> float:
+    # float takes 1_5 for 15; and with a decimal comma, a point stands between thousands
+    if "_" in cell or (decimal == "," and "." in cell):
+        raise ValueError
+    return float(cell.replace(",", ".") if decimal == "," else cell)

@@ -1,0 +1,166 @@
+"""Write a TED TensorDict as a memory map, and open one only after its files have been looked at.
+
+torch maps a file that is too short by growing it with zeros: the source would change, and nobody
+would be told. And tensordict keeps what is not a tensor in a pickle.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.file_kind import is_pickle
+from torchrl_h2o.data.readers.ted import entry_name, require_ted
+from torchrl_h2o.data.readers.whole_folder import whole_folder
+
+_FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
+
+
+def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
+    """Write a flat TED TensorDict as a memory map: one file an entry, no pickle, all or nothing.
+
+    Args:
+        td: batch size [T]; tensors only.
+        folder: a folder that does not exist yet.
+
+    Returns:
+        the folder.
+
+    Raises:
+        DataError: the folder exists, or the TensorDict is not what :func:`read_ted` would take.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data import read_ted, write_ted
+        >>> recorded = GymEnv("Pendulum-v1").rollout(10)
+        >>> folder = write_ted(recorded, tempfile.mkdtemp() + "/pendulum")
+        >>> td = read_ted(folder)
+        >>> bool((td["observation"] == recorded["observation"]).all())
+        True
+    """
+    require_ted(td, source=folder)
+    for key in td.keys(True, True, is_leaf=lambda kind: not issubclass(kind, TensorDictBase)):
+        if not isinstance(td.get(key), torch.Tensor):
+            raise DataError(
+                "the entry is not a tensor and would be pickled",
+                "drop it with td.exclude(...)",
+                source=folder,
+                column=entry_name(key),
+            )
+    with whole_folder(folder) as partial:
+        td.detach().contiguous().memmap(partial)
+    return Path(folder)
+
+
+def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
+    """Read a flat TED TensorDict that :func:`write_ted` or ``TensorDict.memmap`` has written.
+
+    Args:
+        folder: the folder that holds ``meta.json``.
+        in_memory: copy the data, and turn observation, action and reward to float32 (our own
+            simulators record float64). Without it the tensors stay mapped to the files, for data
+            larger than the memory, and must be float32 there; writing to them changes the files.
+
+    Returns:
+        TensorDict of batch size [T], with every entry that was written. A last episode without an
+        end is marked truncated.
+
+    Raises:
+        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity, another
+            dtype than float32 that is to stay mapped.
+    """
+    td = load_memory_map(folder)
+    require_ted(td, source=folder)
+    td = _as_float32(td.clone(recurse=in_memory), in_memory, folder)
+    ends = td["next", "done"].clone()
+    ends[-1] = True
+    td["next", "done"] = ends
+    td["next", "truncated"] = ends & ~td["next", "terminated"]
+    return td
+
+
+def load_memory_map(folder: str | Path) -> TensorDict:
+    """Map what ``TensorDict.memmap`` has written; writing to the result changes the files.
+
+    Args:
+        folder: the folder that holds ``meta.json``.
+
+    Raises:
+        DataError: no such folder, a pickle in it, a missing or cut-off file.
+
+    Example:
+        >>> import tempfile, torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_h2o.data.readers.memory_map import load_memory_map
+        >>> folder = tempfile.mkdtemp()
+        >>> _ = TensorDict({"a": torch.arange(3)}, [3]).memmap(folder)
+        >>> load_memory_map(folder)["a"].tolist()
+        [0, 1, 2]
+    """
+    folder = Path(folder).expanduser()
+    if not (folder / "meta.json").is_file():
+        raise DataError("there is no meta.json here", "give a folder written by write_ted", source=folder)
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.suffix != ".memmap" and is_pickle(path):
+            raise DataError(
+                "this is a pickle, and reading it could run any code",
+                "write the data again with write_ted, which keeps tensors only",
+                source=path,
+            )
+    _require_whole_files(folder)
+    try:
+        return TensorDict.load_memmap(folder, allow_pickle=False)
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise DataError(f"unreadable: {error}", "write it again", source=folder) from error
+
+
+def _require_whole_files(folder: Path) -> None:
+    try:
+        meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+        sizes = {
+            folder / f"{key}.memmap": int(np.prod(entry["shape"], dtype=np.int64))
+            * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+            for key, entry in meta.items()
+            if isinstance(entry, dict) and "dtype" in entry
+        }
+        inner = [key for key, entry in meta.items() if isinstance(entry, dict) and "type" in entry]
+    except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
+        raise DataError(
+            f"the description cannot be read: {error}",
+            "copy or write the folder again",
+            source=folder / "meta.json",
+        ) from error
+    for path, size in sizes.items():
+        found = path.stat().st_size if path.is_file() else 0
+        if found != size:
+            raise DataError(
+                f"the file has {found} bytes, meta.json promises {size}",
+                "it is cut off or not its own: copy or write the folder again",
+                source=path,
+            )
+    for key in inner:
+        _require_whole_files(folder / key)
+
+
+def _as_float32(td: TensorDict, in_memory: bool, folder: str | Path) -> TensorDict:
+    for key in _FLOATS:
+        values = td.get(key, None)
+        # actions may be integers: those of a discrete task
+        discrete = key == "action" and not values.is_floating_point()
+        if values is None or values.dtype == torch.float32 or discrete:
+            continue
+        if not in_memory:
+            raise DataError(
+                f"the dtype is {values.dtype}, and mapped data are taken as they are: torch.float32",
+                "read with in_memory=True, or write the data again as float32",
+                source=folder,
+                column=entry_name(key),
+            )
+        td[key] = values.float()
+    return td

@@ -1,0 +1,262 @@
+"""Read Minari datasets into TED, and write our own recordings of real data as Minari datasets.
+
+Everything is read through ``minari`` itself: torchrl 0.14.1's ``MinariExperienceReplay(...,
+load_from_local_minari=True)`` returns zeros for these files without an error.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_h2o.data.readers.error import DataError, require_finite
+from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
+from torchrl_h2o.data.readers.ted import episodes, require_continuous, require_ted, to_ted
+from torchrl_h2o.data.readers.whole_folder import whole_folder
+
+if TYPE_CHECKING:  # minari and gymnasium are imported where they are used: the buffer needs neither
+    from gymnasium.envs.registration import EnvSpec
+    from minari import MinariDataset
+    from torchrl.envs import EnvBase
+
+_FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
+
+
+def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
+    """Read a Minari dataset by its folder or by its name.
+
+    A name such as ``"halfcheetah/medium-v0"`` is looked up in ``MINARI_DATASETS_PATH``, then
+    downloaded. A folder is only read.
+
+    Args:
+        source: a dataset's folder (it holds ``data/``), or its name.
+        task: a Gymnasium id: refuse data of another task (of another version of it they may be).
+            Data that do not name theirs are taken with a warning in the log.
+
+    Returns:
+        TensorDict of batch size [T] in TED.
+
+    Raises:
+        DataError: an unknown name, cut-off files, an episode whose parts do not fit together, NaN
+            or infinity (the column is the path inside the HDF5 file, the row is counted from 1 in
+            its episode), spaces other than flat boxes.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data import read_minari, write_minari
+        >>> recorded = GymEnv("Pendulum-v1").rollout(200)
+        >>> folder = write_minari(recorded, "pendulum/random-v0", root=tempfile.mkdtemp())
+        >>> read_minari(folder)["action"].shape
+        torch.Size([200, 1])
+    """
+    dataset = _open(source)
+    _require_task(dataset, task, source)
+    parts = _read_episodes(dataset, source)
+    lengths = [len(rewards) for rewards in parts["rewards"]]
+    if sum(lengths) != dataset.total_steps or not lengths:
+        raise DataError(
+            f"the metadata promise {dataset.total_steps} steps, the file holds {sum(lengths)}",
+            "the dataset is empty or cut off: copy or download it again",
+            source=source,
+        )
+    for field in ("observations", "actions", "rewards"):
+        for number, values in enumerate(parts[field]):
+            values = values.reshape(len(values), -1)
+            path = f"episode_{number}/{field}"
+            names = [f"{path}[{i}]" for i in range(values.shape[1])]
+            require_finite(values, names, source=source)
+    truncated = np.concatenate(parts["truncations"]).astype(bool)
+    terminated = np.concatenate(parts["terminations"]).astype(bool)
+    # Minari lets an episode stop without either flag: the recording was cut there
+    last = np.cumsum(lengths) - 1
+    truncated[last] |= ~terminated[last]
+    return to_ted(
+        observation=np.concatenate([values[:-1] for values in parts["observations"]]),
+        next_observation=np.concatenate([values[1:] for values in parts["observations"]]),
+        action=np.concatenate(parts["actions"]),
+        reward=np.concatenate(parts["rewards"]),
+        terminated=terminated,
+        truncated=truncated,
+    )
+
+
+def write_minari(
+    td: TensorDictBase,
+    dataset_id: str,
+    *,
+    root: str | Path | None = None,
+    env: EnvBase | None = None,
+    env_spec: EnvSpec | None = None,
+    author: str | None = None,
+    algorithm_name: str | None = None,
+    description: str | None = None,
+) -> Path:
+    """Write a recording as a Minari dataset, all or nothing.
+
+    Args:
+        td: flat TED transitions of batch size [T] with a reward, cut at ("next", "done").
+        dataset_id: ``"(namespace/)name-v0"``.
+        root: the folder of datasets; by default Minari's own (``MINARI_DATASETS_PATH``).
+        env: gives the bounds of the action space; the data are checked against it. Without it
+            the spaces are unbounded.
+        env_spec: Gymnasium's spec of the task, so that ``recover_environment`` works.
+        author, algorithm_name, description: Minari's metadata.
+
+    Returns:
+        the dataset's folder.
+
+    Raises:
+        DataError: the dataset exists, the name is not Minari's, or an observation inside an
+            episode is not the one that the step before it led to.
+
+    Example:
+        see :func:`read_minari`.
+    """
+    from minari import __version__
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_dataset import parse_dataset_id
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.storage import get_dataset_path
+
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError) as error:  # without a version minari takes int(None)
+        raise DataError(
+            "this is not a name that Minari takes",
+            "take name-v0 or namespace/name-v0, of letters, digits, _ and -, two at least each",
+            source=dataset_id,
+        ) from error
+    folder = (get_dataset_path() if root is None else Path(root)) / dataset_id
+    _require_recordable(td, source=dataset_id)
+    if env is not None:
+        check_specs(td, env, source=dataset_id)
+    buffers = [
+        EpisodeBuffer(
+            observations=np.concatenate([_array(episode["observation"]), _array(episode["next", "observation"][-1:])]),
+            actions=_array(episode["action"]),
+            rewards=_array(episode["next", "reward"]).flatten(),
+            terminations=_array(episode["next", "terminated"]).flatten(),
+            truncations=_truncations(episode),
+        )
+        for episode in episodes(td)
+    ]
+    metadata = {
+        "dataset_id": dataset_id,
+        "minari_version": __version__,
+        "algorithm_name": algorithm_name,
+        "description": description,
+        "author": None if author is None else {author},
+    }
+    observation_space, action_space = _spaces(td, env)
+    with whole_folder(folder) as partial:
+        storage = MinariStorage.new(
+            partial / "data",
+            observation_space=observation_space,
+            action_space=action_space,
+            env_spec=env_spec,
+        )
+        storage.update_metadata({key: value for key, value in metadata.items() if value})
+        storage.update_episodes(buffers)
+    return folder
+
+
+def _open(source: str | Path) -> MinariDataset:
+    import minari
+
+    folder = Path(source).expanduser()
+    data = folder if (folder / "metadata.json").is_file() else folder / "data"
+    try:
+        if data.is_dir():
+            return minari.MinariDataset(data)
+        return minari.load_dataset(str(source), download=True)
+    except Exception as error:  # every hosting service has its own network errors
+        raise DataError(
+            f"no Minari dataset can be opened: {error}",
+            "give the folder that holds data/metadata.json, or a name that is in "
+            "MINARI_DATASETS_PATH or can be downloaded",
+            source=source,
+        ) from error
+
+
+def _require_task(dataset: MinariDataset, task: str | None, source: str | Path) -> None:
+    # Dimensions do not tell: HalfCheetah and Walker2d both have 17 and 6.
+    spec = dataset.spec.env_spec
+    if spec is None:
+        warn_of_unknown_task(task, source)
+    elif task is not None and spec.id.rpartition("-v")[0] != task.rpartition("-v")[0]:
+        raise DataError(f"it was recorded in {spec.id}, not in {task}", "choose data of the same task", source=source)
+
+
+def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list[np.ndarray]]:
+    from gymnasium.spaces import Box
+    from tqdm import tqdm
+
+    for name, space in (("observations", dataset.observation_space), ("actions", dataset.action_space)):
+        if not isinstance(space, Box) or len(space.shape) != 1:
+            raise DataError(
+                f"the space is {space}",
+                "only flat vectors of real numbers are read: flatten and write the dataset again",
+                source=source,
+                column=name,
+            )
+    parts = {field: [] for field in _FIELDS}
+    sizes = {"observations": dataset.observation_space.shape, "actions": dataset.action_space.shape}
+    bar = tqdm(dataset.iterate_episodes(), total=dataset.total_episodes, desc=str(source), delay=5)
+    try:
+        for number, episode in enumerate(bar):
+            steps = len(episode.rewards)
+            for field in _FIELDS:
+                values = getattr(episode, field)
+                shape = (steps + (field == "observations"), *sizes.get(field, ()))
+                if values.shape != shape:
+                    raise DataError(
+                        f"the shape is {list(values.shape)}, expected {list(shape)}",
+                        "the episode is cut off or not its space's: write it again",
+                        source=source,
+                        column=f"episode_{number}/{field}",
+                    )
+                parts[field].append(values)
+    except (OSError, KeyError, RuntimeError, AssertionError) as error:
+        raise DataError(
+            f"episode {len(parts['truncations'])} cannot be read: {error}",
+            "the file is cut off: copy or download it again",
+            source=source,
+        ) from error
+    return parts
+
+
+def _require_recordable(td: TensorDictBase, source: str) -> None:
+    require_ted(td, source=source)
+    if ("next", "reward") not in td.keys(True):
+        raise DataError("the entry is missing", "Minari needs it", source=source, column="next.reward")
+    # an episode is stored as one array of observations: a jump inside it would be lost
+    require_continuous(td, source=source)
+
+
+def _truncations(episode: TensorDictBase) -> np.ndarray:
+    truncated = _array(episode["next", "done"] & ~episode["next", "terminated"]).flatten()
+    if ("next", "truncated") in episode.keys(True):
+        truncated = _array(episode["next", "truncated"]).flatten()
+    truncated[-1] |= not bool(episode["next", "terminated"][-1])
+    return truncated
+
+
+def _spaces(td: TensorDictBase, env: EnvBase | None) -> tuple:
+    from gymnasium.spaces import Box
+
+    low, high = -np.inf, np.inf
+    if env is not None:
+        space = env.action_spec_unbatched.space
+        low, high = _array(space.low).astype(np.float32), _array(space.high).astype(np.float32)
+    return (
+        Box(-np.inf, np.inf, td["observation"].shape[1:], np.float32),
+        Box(low, high, td["action"].shape[1:], np.float32),
+    )
+
+
+def _array(tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().copy()

@@ -1,0 +1,106 @@
+"""Compare recorded transitions with an environment before anything is trained on them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from torchrl import torchrl_logger
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.ted import require_ted
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+_ROUNDING = 1e-6  # of the bound: float32 keeps 1 + 1e-7 of a recording in float64
+
+
+def check_specs(td: TensorDictBase, env: EnvBase, *, source: str | Path = "transitions") -> None:
+    """Check that transitions could have come from an environment.
+
+    Args:
+        td: flat TED transitions, batch size [T].
+        env: a TorchRL environment with the entries ``observation`` and ``action``.
+        source: what to call the data in errors.
+
+    Raises:
+        DataError: another number of dimensions, another kind of number, an action outside the
+            environment's bounds; with the column and the row, counted from 1.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.data import check_specs
+        >>> env = GymEnv("Pendulum-v1")
+        >>> td = env.rollout(3)
+        >>> check_specs(td, env)
+        >>> td["action"][1] = 7.0
+        >>> check_specs(td, env)
+        Traceback (most recent call last):
+        ...
+        torchrl_h2o.data.readers.error.DataError: transitions, column 'action[0]', row 2: 7.0 lies outside
+        the environment's bounds [-2.0, 2.0]; ...
+    """
+    require_ted(td, source=source)
+    specs = {
+        "observation": env.observation_spec_unbatched,
+        "action": env.full_action_spec_unbatched,
+    }
+    for key, composite in specs.items():
+        names = list(composite.keys())
+        if key not in names:
+            raise DataError(
+                f"the environment has no entry {key!r}, it has {names}",
+                "wrap it in TransformedEnv with CatTensors or RenameTransform",
+                source=source,
+                column=key,
+            )
+        spec, values = composite[key], td[key]
+        if values.shape[1:] != spec.shape:
+            raise DataError(
+                f"the data have {list(values.shape[1:])} dimensions, the environment has {list(spec.shape)}",
+                "choose the environment that was recorded, or other columns",
+                source=source,
+                column=key,
+            )
+        if values.is_floating_point() != spec.dtype.is_floating_point:
+            raise DataError(
+                f"the data are {values.dtype}, the environment takes {spec.dtype}",
+                "choose the environment that was recorded",
+                source=source,
+                column=key,
+            )
+    _require_bounds(td["action"], specs["action"]["action"], source)
+
+
+def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
+    """Log a warning that data which name no task could not be checked to be of the one asked for.
+
+    Args:
+        task: what was asked for; without one there is nothing to warn of.
+        source: what to call the data.
+    """
+    if task is not None:
+        torchrl_logger.warning(f"{source} does not say which task it was recorded in: not checked to be {task}")
+
+
+def _require_bounds(action: torch.Tensor, spec, source: str | Path) -> None:
+    low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
+    if low is None or high is None:  # unbounded or discrete
+        return
+    low, high = low.to(action.dtype), high.to(action.dtype)
+    outside = (action < low - _ROUNDING * low.abs()) | (action > high + _ROUNDING * high.abs())
+    if not outside.any():
+        return
+    row, *position = outside.nonzero()[0].tolist()
+    place = tuple(position)
+    raise DataError(
+        f"{action[(row, *place)].item()} lies outside the environment's bounds "
+        f"[{low[place].item()}, {high[place].item()}]",
+        "scale or clip the actions, or choose the environment that was recorded",
+        source=source,
+        column="action" + "".join(f"[{i}]" for i in place),
+        row=row + 1,
+    )

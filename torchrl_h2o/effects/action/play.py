@@ -1,0 +1,101 @@
+"""Effects on what an actuator follows of its command: dead band, saturation, backlash."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from torchrl_h2o.effects.effect import ActionEffect, Process
+from torchrl_h2o.effects.indices import Indices, entry_mask
+from torchrl_h2o.effects.parameter import parameter
+
+
+@dataclass(frozen=True)
+class ActionDeadBand(ActionEffect):
+    """Commands that are too small do nothing, larger ones lose as much.
+
+    Args:
+        width: the size below which a command does nothing, to either side, in units of the action.
+        actuators: indices of the entries of the action that have a dead band, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> command = np.array([-1.0, 0.1, 0.5])
+        >>> ActionDeadBand(0.2).process(0.05, np.random.default_rng(0))(command)
+        array([-0.8,  0. ,  0.3])
+    """
+
+    wording: ClassVar[str] = "dead band of {width} on {actuators}"
+    memoryless: ClassVar[bool] = True
+    width: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        def followed(action: np.ndarray) -> np.ndarray:
+            beyond = np.sign(action) * np.maximum(np.abs(action) - self.width, 0.0)
+            return np.where(entry_mask(action, self.actuators), beyond, action)
+
+        return followed
+
+
+@dataclass(frozen=True)
+class ActionSaturation(ActionEffect):
+    """Commands that are too large are cut off.
+
+    Args:
+        limit: the largest size of a command that is followed, in units of the action.
+        actuators: indices of the entries of the action that are cut off, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> ActionSaturation(0.6).process(0.05, np.random.default_rng(0))(np.array([-1.0, 0.1]))
+        array([-0.6,  0.1])
+        >>> ActionSaturation().is_neutral
+        True
+    """
+
+    wording: ClassVar[str] = "saturation at {limit} of {actuators}"
+    memoryless: ClassVar[bool] = True
+    limit: float = parameter(unit="1", bounds=(0.0, math.inf), neutral=math.inf)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        def cut(action: np.ndarray) -> np.ndarray:
+            within = np.clip(action, -self.limit, self.limit)
+            return np.where(entry_mask(action, self.actuators), within, action)
+
+        return cut
+
+
+@dataclass(frozen=True)
+class ActionBacklash(ActionEffect):
+    """Play between command and actuator, as of worn gears: on reversal nothing moves at first.
+
+    The executed action follows only when the command pushes it from one side, half a width away (the
+    play operator). It starts at zero.
+
+    Args:
+        width: the whole play, in units of the action.
+        actuators: indices of the entries of the action that have play, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> loose = ActionBacklash(0.5).process(dt=0.05, rng=np.random.default_rng(0))
+        >>> [float(loose(np.array([command]))[0]) for command in (0.25, 1.0, 0.5, 0.0)]
+        [0.0, 0.75, 0.75, 0.25]
+    """
+
+    wording: ClassVar[str] = "backlash of {width} on {actuators}"
+    width: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        half, last = 0.5 * self.width, np.zeros(())
+
+        def pushed(action: np.ndarray) -> np.ndarray:
+            nonlocal last
+            last = np.minimum(np.maximum(last, action - half), action + half)
+            return np.where(entry_mask(action, self.actuators), last, action)
+
+        return pushed

@@ -1,0 +1,97 @@
+"""Effects on when an actuator follows its command: late, or gradually."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from torchrl_h2o.effects.delay_line import delay_line, delayed
+from torchrl_h2o.effects.effect import ActionEffect, Process
+from torchrl_h2o.effects.indices import Indices, entry_mask
+from torchrl_h2o.effects.parameter import parameter
+
+
+@dataclass(frozen=True)
+class ActionDelay(ActionEffect):
+    """Actuation that is late, by any time, also a fraction of a control step.
+
+    With a delay of k + f control steps the drive still follows the command before last for the
+    first f of a step. A control step executes one action, so it is given the mean of the two,
+    (1 - f) · a(t - k) + f · a(t - k - 1), which has the same impulse. Before the first command the
+    delay line holds zeros.
+
+    Args:
+        delay: the delay, in s.
+        actuators: indices of the late entries of the action, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> late = ActionDelay(0.015).process(dt=0.01, rng=np.random.default_rng(0))
+        >>> [float(late(np.array([command]))[0]) for command in (1.0, 1.0, 1.0, 1.0)]
+        [0.0, 0.5, 1.0, 1.0]
+    """
+
+    wording: ClassVar[str] = "{actuators} late by {delay}"
+    delay: float = parameter(unit="s", bounds=(0.0, 1.0), neutral=0.0)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        late = delay_line(self.delay / dt, before=np.zeros_like)
+        return lambda action: np.where(entry_mask(action, self.actuators), late(action), action)
+
+    def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
+        late = delayed(actions, self.delay / dt, before=np.zeros(actions.shape[1:]))
+        return np.where(entry_mask(actions, self.actuators), late, actions)
+
+
+@dataclass(frozen=True)
+class ActionLag(ActionEffect):
+    """Actuation that follows gradually, as a first-order lag.
+
+    The drive obeys ẏ = (a - y) / T and starts at rest, y = 0. Within a control step the command a
+    stands, so that y is known exactly; the step executes its mean, which has the same impulse.
+
+    Args:
+        time_constant: T, in s, after which 63 % of a step of the command are followed.
+        actuators: indices of the lagging entries of the action, all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> lagging = ActionLag(0.01).process(dt=0.01, rng=np.random.default_rng(0))
+        >>> [round(float(lagging(np.array([command]))[0]), 3) for command in (1.0, 1.0, 1.0, 0.0)]
+        [0.368, 0.767, 0.914, 0.601]
+    """
+
+    wording: ClassVar[str] = "{actuators} follow with a time constant of {time_constant}"
+    time_constant: float = parameter(unit="s", bounds=(0.0, 10.0), neutral=0.0)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        left, mean_left = self._left_after(dt)
+        drive = np.zeros(())
+
+        def lagging(action: np.ndarray) -> np.ndarray:
+            nonlocal drive
+            behind = drive - action
+            drive = action + left * behind
+            return np.where(entry_mask(action, self.actuators), action + mean_left * behind, action)
+
+        return lagging
+
+    def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
+        left, mean_left = self._left_after(dt)
+        drive = (1.0 - left) * actions
+        steps, weight = 1, left  # y(t) = Σ (1 - left) · leftⁱ · a(t - i), of 1, 2, 4, ... terms
+        while steps < len(actions) and weight > 0.0:
+            drive[steps:] = drive[steps:] + weight * drive[:-steps]
+            steps, weight = 2 * steps, weight * weight
+        behind = np.concatenate([np.zeros_like(drive[:1]), drive[:-1]]) - actions
+        return np.where(entry_mask(actions, self.actuators), actions + mean_left * behind, actions)
+
+    def _left_after(self, dt: float) -> tuple[float, float]:
+        """What a control step leaves of the way to the command: at its end, and in its mean."""
+        if self.time_constant == 0.0:
+            return 0.0, 0.0
+        ratio = dt / self.time_constant
+        return math.exp(-ratio), -math.expm1(-ratio) / ratio

@@ -1,0 +1,136 @@
+"""Generates the catalogue of a model: every effect that its simulator could lack.
+
+An effect is tried on single elements, on those whose names share a word and on all together, wherever
+it can change something. Its trials are sized by the model's own masses, torques and control step.
+"""
+
+from collections.abc import Callable, Iterator
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation
+from torchrl_h2o.effects.action.signal import ActionBias, ActionGain, ActionNoise
+from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
+from torchrl_h2o.effects.catalogue.choices import indexed_choices
+from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
+from torchrl_h2o.effects.catalogue.mechanism import Mechanism
+from torchrl_h2o.effects.catalogue.model_entries import (
+    FACTORS,
+    body_entries,
+    force_entries,
+    geom_entries,
+    joint_entries,
+)
+from torchrl_h2o.effects.effect import ModelEffect, compile_model
+from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
+from torchrl_h2o.effects.model.timestep import Timestep
+from torchrl_h2o.effects.observation.sensor import (
+    ObservationBias,
+    ObservationDelay,
+    ObservationGain,
+    ObservationNoise,
+)
+
+
+def catalogue(spec: mujoco.MjSpec, *, num_observations: int, dt: float) -> tuple[CatalogueEntry, ...]:
+    """The effects that a simulator of a model could lack, with values to start their fits from.
+
+    Args:
+        spec: the model's specification, which is left as it is.
+        num_observations: how many entries an observation has, 0 to leave the sensors out.
+        dt: the control step, in s.
+
+    Returns:
+        The entries; no two of them have the same effect.
+
+    Raises:
+        ValueError: if the control step is not positive, or there are fewer than no observations.
+
+    Examples:
+        >>> pole = '''<mujoco><worldbody><body name="pole"><joint name="hinge" axis="0 1 0"/>
+        ...   <geom type="capsule" fromto="0 0 0 0 0 -1" size=".02"/></body></worldbody></mujoco>'''
+        >>> entries = catalogue(mujoco.MjSpec.from_string(pole), num_observations=2, dt=0.02)
+        >>> [entry.name for entry in entries][:5]
+        ['Gravity', 'GravityTilt', 'Timestep', 'BodyMass pole', 'BodyInertia pole']
+    """
+    if not dt > 0.0:
+        raise ValueError(f"the control step dt = {dt} is not positive; give the time between two actions in s")
+    if num_observations < 0:
+        raise ValueError(f"num_observations = {num_observations} is negative; give 0 to leave the sensors out")
+    model = compile_model(spec.copy())
+    mechanism = Mechanism(model)
+    entries = [
+        *_world_entries(mechanism),
+        *body_entries(mechanism),
+        *joint_entries(mechanism),
+        *geom_entries(mechanism, spec),
+        *force_entries(mechanism),
+        *_action_entries(mechanism, dt),
+        *_observation_entries(num_observations, dt),
+    ]
+    unchanged = _bytes(model)
+    return tuple(entry for entry in entries if _changes_something(entry, spec, unchanged))
+
+
+def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
+    model = mechanism.model
+    if mechanism.weight:
+        yield CatalogueEntry(Gravity(), each("scale", *FACTORS))
+        planar = all(mechanism.planar(body) for body in range(1, model.nbody))
+        spatial = tuple({"pitch": pitch, "roll": roll} for pitch in (0.1, -0.1) for roll in (0.1, -0.1))
+        yield CatalogueEntry(GravityTilt(), each("pitch", 0.1, -0.1) if planar else spatial)
+    yield CatalogueEntry(Timestep(), each("scale", 0.8, 1.25))
+
+
+def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]:
+    labels = [mechanism.actuator_label(i) for i in range(mechanism.model.nu)]
+
+    def shares(parameter: str, *values: float) -> Callable[[tuple[int, ...]], Trials]:
+        def of(actuators: tuple[int, ...]) -> Trials:
+            control = float(np.median([mechanism.control(i) for i in actuators]))
+            return each(parameter, *(value * control for value in values))
+
+        return of
+
+    def times(parameter: str) -> Callable[[tuple[int, ...]], Trials]:
+        return lambda actuators: each(parameter, 0.3 * dt, dt, 2.0 * dt)
+
+    single_and_all = indexed_choices(labels)
+    singles = {chosen: indices for chosen, indices in single_and_all.items() if len(indices) == 1}
+    yield from entries_of(
+        ActionGain, "actuators", indexed_choices(labels, groups=True), lambda _: each("scale", *FACTORS)
+    )
+    yield from entries_of(ActionBias, "actuators", singles, shares("bias", 0.1, -0.1))
+    yield from entries_of(ActionDeadBand, "actuators", single_and_all, shares("width", 0.03, 0.15))
+    yield from entries_of(ActionSaturation, "actuators", single_and_all, shares("limit", 0.4, 0.8))
+    yield from entries_of(ActionBacklash, "actuators", single_and_all, shares("width", 0.1, 0.4))
+    yield from entries_of(ActionLag, "actuators", single_and_all, times("time_constant"))
+    yield from entries_of(ActionDelay, "actuators", single_and_all, times("delay"))
+    yield from entries_of(ActionNoise, "actuators", indexed_choices(labels, singles=False), shares("std", 0.1, 0.5))
+
+
+def _observation_entries(num: int, dt: float) -> Iterator[CatalogueEntry]:
+    together = indexed_choices([""] * num, singles=False)
+    single = {chosen: entries for chosen, entries in indexed_choices([""] * num).items() if len(entries) == 1}
+    yield from entries_of(ObservationGain, "entries", single, lambda _: each("scale", 0.8, 1.25))
+    yield from entries_of(ObservationBias, "entries", single, lambda _: each("bias", 0.1, -0.1))
+    yield from entries_of(ObservationDelay, "entries", together, lambda _: each("delay", 0.3 * dt, dt, 2.0 * dt))
+    yield from entries_of(ObservationNoise, "entries", together, lambda _: each("std", 0.01, 0.1))
+
+
+def _changes_something(entry: CatalogueEntry, spec: mujoco.MjSpec, unchanged: bytes) -> bool:
+    """Whether the first trial compiles, to another model; what is no model effect may stay."""
+    first = entry.starts[0]
+    if not isinstance(first, ModelEffect):
+        return True
+    try:
+        return _bytes(compile_model(spec.copy(), [first])) != unchanged
+    except ValueError:
+        return False
+
+
+def _bytes(model: mujoco.MjModel) -> bytes:
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()

@@ -1,0 +1,99 @@
+"""An entry of a catalogue: an effect that a simulator may lack, and where to start looking."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+from torchrl_h2o.effects.effect import Effect
+from torchrl_h2o.effects.indices import Indices
+from torchrl_h2o.effects.selection import Names
+
+Trials = tuple[dict[str, float], ...]
+
+
+@dataclass(frozen=True)
+class CatalogueEntry:
+    """A candidate: an effect at its neutral value, and the values from which its fit starts.
+
+    Args:
+        effect: the effect, neutral, with what it acts on filled in.
+        trials: values of parameters by name, the same parameters in each: those to fit. All others
+            keep their neutral values.
+
+    Raises:
+        ValueError: if the effect is not neutral, or the trials are none or not of the same parameters.
+
+    Examples:
+        >>> from torchrl_h2o.effects import BodyMass
+        >>> entry = CatalogueEntry(BodyMass(bodies="torso"), trials=({"scale": 0.5}, {"scale": 2.0}))
+        >>> entry.name, [effect.describe() for effect in entry.starts]
+        ('BodyMass torso', ['mass of bodies torso × 0.5', 'mass of bodies torso × 2'])
+    """
+
+    effect: Effect
+    trials: Trials
+
+    def __post_init__(self):
+        if not self.effect.is_neutral:
+            raise ValueError(f"an entry starts from the neutral effect, not from {self.effect!r}")
+        if len({frozenset(trial) for trial in self.trials}) != 1 or not self.fitted:
+            raise ValueError(f"{self.name}: the trials {self.trials} must name the same parameters, at least one")
+        for trial in self.trials:
+            if not trial.keys() <= self.effect.parameters.keys():
+                raise ValueError(f"{self.name} has the parameters {list(self.effect.parameters)}, not all of {trial}")
+
+    @property
+    def name(self) -> str:
+        """The class of the effect and what it acts on: ``BodyMass torso``, ``ActionGain 3``, ``Gravity``."""
+        fields = [f.name for f in dataclasses.fields(self.effect) if f.name not in self.effect.parameters]
+        return " ".join([type(self.effect).__name__, *(_label(getattr(self.effect, field)) for field in fields)])
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        """The names of the parameters to fit."""
+        return tuple(self.trials[0])
+
+    @property
+    def starts(self) -> tuple[Effect, ...]:
+        """The effect at each of the trials."""
+        return tuple(self.effect.with_parameters(trial) for trial in self.trials)
+
+
+def entries_of(
+    effect: type[Effect],
+    field: str,
+    choices: Mapping[Names | Indices, tuple[int, ...]],
+    trials: Callable[[tuple[int, ...]], Trials],
+) -> Iterator[CatalogueEntry]:
+    """An entry for each of the choices of what an effect acts on.
+
+    Args:
+        effect: the class of the effect.
+        field: its field that says what it acts on.
+        choices: the indices that are selected, by the selection.
+        trials: from the indices that are selected to the trials, which are cut off at the bounds of
+            the effect. Without trials there is no entry.
+
+    Yields:
+        The entries.
+    """
+    for chosen, indices in choices.items():
+        neutral = effect(**{field: chosen})
+        bounds = {name: parameter.bounds for name, parameter in neutral.parameters.items()}
+        within = tuple(
+            {name: min(max(float(value), bounds[name][0]), bounds[name][1]) for name, value in trial.items()}
+            for trial in trials(indices)
+        )
+        if within:
+            yield CatalogueEntry(neutral, within)
+
+
+def each(parameter: str, *values: float) -> Trials:
+    """Trials of one parameter."""
+    return tuple({parameter: value} for value in values)
+
+
+def _label(selected: str | tuple | None) -> str:
+    if selected is None or selected == "*":
+        return "all"
+    return selected if isinstance(selected, str) else ", ".join(map(str, selected))

@@ -1,0 +1,204 @@
+"""The entries of a catalogue for the bodies, joints and geoms of a model, and for forces on them.
+
+Values to start from are sized by the model: inertias and torques at the joints, masses of the bodies.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects.catalogue.choices import named_choices
+from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
+from torchrl_h2o.effects.catalogue.mechanism import Mechanism
+from torchrl_h2o.effects.effect import compile_model
+from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
+from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
+from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
+from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
+from torchrl_h2o.effects.model.joint import Armature, JointDamping, JointFrictionLoss, JointRange
+from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
+from torchrl_h2o.effects.selection import Names
+
+FACTORS = (0.5, 0.8, 1.25, 2.0)
+
+Choices = dict[Names, tuple[int, ...]]
+
+
+def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
+    """Mass, inertia, centre of mass and payload of the bodies that have a mass."""
+    model = mechanism.model
+    heavy = [b for b in range(1, model.nbody) if model.body_weldid[b] and model.body_mass[b] > mujoco.mjMINVAL]
+    paths = _body_paths(model)
+    # indices without the world, as the patterns for bodies count
+    eligible, massless = [b - 1 for b in heavy], set(range(model.nbody - 1)) - {b - 1 for b in heavy}
+    yield from _factors(BodyMass, "bodies", named_choices(paths, eligible, passed_over=massless))
+    singles = named_choices(paths, eligible, groups=False)
+    yield from _factors(BodyInertia, "bodies", singles)
+    yield from entries_of(BodyCentreOfMass, "bodies", singles, lambda chosen: _shifts(mechanism, chosen[0] + 1))
+    # what carries something is a trunk or the end of a limb
+    carrying = {
+        name: (index,)
+        for name, (index,) in singles.items()
+        if model.body_parentid[index + 1] == 0 or index + 1 not in model.body_parentid
+    }
+    yield from entries_of(Payload, "bodies", carrying, lambda chosen: _loads(mechanism, chosen[0] + 1))
+
+
+def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
+    """Range, springs, damping, friction and armature of the joints, but of those that let a root float."""
+    model = mechanism.model
+    bearings = [j for j in mechanism.single_joints if not mechanism.floating(j)]
+    limited = [j for j in bearings if model.jnt_limited[j]]
+    sprung = [j for j in bearings if model.jnt_stiffness[j] > 0.0]
+    loose = [j for j in bearings if model.jnt_stiffness[j] == 0.0]
+
+    def chosen(joints: Sequence[int], passed_over: Collection[int] = (), groups: bool = True) -> Choices:
+        return named_choices(_joint_paths(model), joints, passed_over=passed_over, groups=groups)
+
+    everything = set(range(model.njnt))
+    yield from _factors(JointRange, "joints", chosen(limited, everything - set(limited)))
+    yield from _factors(JointStiffness, "joints", chosen(sprung, everything - set(sprung)))
+    yield from entries_of(JointRest, "joints", chosen(sprung, groups=False), lambda _: each("angle", 0.1, -0.1))
+    yield from entries_of(JointSpring, "joints", chosen(loose), _added(mechanism.torque, "stiffness", (0.1, 1.0)))
+    dampings = _added(lambda j: mechanism.inertia(j) / 0.1, "damping", (0.1, 1.0), _own(model, "dof_damping"))
+    yield from entries_of(JointDamping, "joints", chosen(bearings), dampings)
+    frictions = _added(mechanism.torque, "torque", (0.01, 0.1), _own(model, "dof_frictionloss"))
+    yield from entries_of(JointFrictionLoss, "joints", chosen(bearings), frictions)
+    inertias = _added(mechanism.inertia, "inertia", (0.1, 1.0), _own(model, "dof_armature"))
+    yield from entries_of(Armature, "joints", chosen(bearings), inertias)
+
+
+def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
+    """Size, length, friction, softness and rolling of the geoms that weigh or touch something."""
+    model, pairs = mechanism.model, mechanism.touching()
+    everything, touching = set(range(model.ngeom)), sorted({geom for pair in pairs for geom in pair})
+    moving = [g for g in everything if model.body_weldid[model.geom_bodyid[g]]]
+    planes = {g for g in everything if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE}
+    weighing = _weighing(model, spec, [g for g in moving if g not in touching])
+
+    def chosen(geoms: Collection[int], passed_over: Collection[int] = (), groups: bool = True) -> Choices:
+        return named_choices(_geom_paths(model), sorted(geoms), passed_over=passed_over, groups=groups)
+
+    shaped = [g for g in moving if g in touching or g in weighing]
+    hidden = everything - set(touching) - weighing
+    yield from _factors(GeomSize, "geoms", chosen(shaped, hidden | planes))
+    spanned = {geom.name for geom in spec.geoms if not np.isnan(geom.fromto[0])}
+    lengthy = {g for g in shaped if model.geom(g).name in spanned}
+    yield from _factors(GeomLength, "geoms", chosen(lengthy, everything - lengthy))
+    rubbing = chosen(touching, everything - set(touching))
+    own = {names: geoms for names, geoms in rubbing.items() if len(geoms) > 1 or geoms[0] in moving}
+    yield from entries_of(
+        GeomFriction,
+        "geoms",
+        own,
+        lambda geoms: each("scale", *(factor for factor in FACTORS if _rubs_otherwise(model, pairs, geoms, factor))),
+    )
+    together = {names: geoms for names, geoms in rubbing.items() if len(geoms) > 1}
+    yield from _factors(ContactSoftness, "geoms", together)
+    rolling = [g for g in touching if mechanism.wheel(g)]
+    yield from entries_of(
+        RollingResistance,
+        "geoms",
+        chosen(rolling),
+        lambda geoms: each("coefficient", *(share * float(model.geom_size[geoms[0], 0]) for share in (0.01, 0.1))),
+    )
+
+
+def force_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
+    """Constant forces on joints, and drag on the bodies that stand on the world or on all together."""
+    model = mechanism.model
+    pushed = [j for j in mechanism.single_joints if mechanism.slides(j) or not mechanism.floating(j)]
+    forces = _signed(mechanism.torque, "torque", 0.05)
+    yield from entries_of(JointForce, "joints", named_choices(_joint_paths(model), pushed, groups=False), forces)
+    roots = [b - 1 for b in range(1, model.nbody) if model.body_weldid[b] == b and model.body_parentid[b] == 0]
+    dragged = named_choices(_body_paths(model), roots, groups=False)
+    if list(dragged.values()) != [tuple(range(model.nbody - 1))]:
+        dragged["*"] = tuple(range(model.nbody - 1))
+    for drag in (LinearDrag, QuadraticDrag):
+        yield from entries_of(
+            drag,
+            "bodies",
+            dragged,
+            lambda bodies: each("coefficient", *(rate * mechanism.mass / len(bodies) for rate in (0.1, 1.0))),
+        )
+
+
+def _factors(effect: type, field: str, choices: Choices) -> Iterator[CatalogueEntry]:
+    return entries_of(effect, field, choices, lambda _: each("scale", *FACTORS))
+
+
+def _shifts(mechanism: Mechanism, body: int) -> Trials:
+    """Along every axis that counts, to both sides."""
+    far, axes = 0.5 * mechanism.radius_of_gyration(body), mechanism.axes(body)
+    return tuple({**dict.fromkeys(axes, 0.0), axis: sign * far} for axis in axes for sign in (1.0, -1.0))
+
+
+def _loads(mechanism: Mechanism, body: int) -> Trials:
+    """A light and a heavy payload at the centre of mass."""
+    model = mechanism.model
+    centre = dict(zip("xyz", model.body_ipos[body], strict=True))
+    place = {axis: centre[axis] for axis in mechanism.axes(body)}
+    return tuple({"mass": share * model.body_mass[body], **place} for share in (0.1, 0.5))
+
+
+def _added(
+    size: Callable[[int], float], parameter: str, shares: Sequence[float], own: Callable[[int], float] | None = None
+) -> Callable[[tuple[int, ...]], Trials]:
+    """Trials that add shares of the joints' median size, and one that takes half of what all have."""
+
+    def trials(joints: tuple[int, ...]) -> Trials:
+        typical = float(np.median([size(j) for j in joints]))
+        least = min(own(j) for j in joints) if own else 0.0
+        taken = (-0.5 * least,) if least > 0.0 else ()
+        return each(parameter, *(share * typical for share in shares), *taken)
+
+    return trials
+
+
+def _signed(size: Callable[[int], float], parameter: str, share: float) -> Callable[[tuple[int, ...]], Trials]:
+    return lambda joints: each(parameter, *(sign * share * size(joints[0]) for sign in (1.0, -1.0)))
+
+
+def _own(model: mujoco.MjModel, field: str) -> Callable[[int], float]:
+    return lambda joint: float(np.ravel(getattr(model, field)[model.jnt_dofadr[joint]])[0])
+
+
+def _weighing(model: mujoco.MjModel, spec: mujoco.MjSpec, geoms: Sequence[int]) -> set[int]:
+    """Of the geoms, those whose size the inertia of a body follows from."""
+    found = set()
+    for geom in geoms:
+        if not model.geom(geom).name:
+            continue
+        larger = compile_model(spec.copy(), [GeomSize(1.5, geoms=model.geom(geom).name)])
+        if not np.allclose(larger.body_inertia, model.body_inertia, rtol=1e-9, atol=0.0):
+            found.add(geom)
+    return found
+
+
+def _rubs_otherwise(
+    model: mujoco.MjModel, pairs: Sequence[tuple[int, int]], geoms: Sequence[int], factor: float
+) -> bool:
+    """Whether any contact has another friction once that of the geoms is scaled: the larger counts."""
+    before = model.geom_friction[:, 0]
+    after = before.copy()
+    after[list(geoms)] *= factor
+    priority = model.geom_priority
+    for a, b in pairs:
+        counting = [a, b] if priority[a] == priority[b] else [max(a, b, key=lambda g: priority[g])]
+        if before[counting].max() != after[counting].max():
+            return True
+    return False
+
+
+def _body_paths(model: mujoco.MjModel) -> list[tuple[str, str]]:
+    bodies = [model.body(b) for b in range(1, model.nbody)]
+    return [(model.body(body.parentid[0]).name, body.name) for body in bodies]
+
+
+def _joint_paths(model: mujoco.MjModel) -> list[tuple[str, str]]:
+    return [(model.body(model.jnt_bodyid[j]).name, model.joint(j).name) for j in range(model.njnt)]
+
+
+def _geom_paths(model: mujoco.MjModel) -> list[tuple[str, str]]:
+    return [(model.body(model.geom_bodyid[g]).name, model.geom(g).name) for g in range(model.ngeom)]

@@ -1,0 +1,1 @@
+"""Effects that are generalised forces, applied at every physics step."""

@@ -1,0 +1,1 @@
+"""Effects on the MuJoCo model: masses, geometry, joints, contacts, gravity, timestep."""

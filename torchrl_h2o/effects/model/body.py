@@ -1,0 +1,149 @@
+"""Effects on bodies: how heavy they are, and where their mass lies."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects import selection
+from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.model.inertial import Inertial, compile_unscaled, edit_inertials
+from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.selection import Names
+
+
+@dataclass(frozen=True)
+class BodyMass(ModelEffect):
+    """Mass and inertia of bodies, scaled together: the same shape of another density.
+
+    The other bodies keep their masses, also in a model that fixes its total (``settotalmass``).
+
+    Args:
+        scale: factor on mass and inertia.
+        bodies: name patterns of the bodies.
+
+    Raises:
+        ValueError: when put into a model that has no such body.
+
+    Examples:
+        >>> BodyMass(1.2, bodies="torso").describe()
+        'mass of bodies torso × 1.2'
+    """
+
+    wording: ClassVar[str] = "mass of {bodies} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.01, 100.0), neutral=1.0)
+    bodies: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        before = compile_unscaled(spec).body_mass.sum()
+        for body in selection.bodies(spec, self.bodies):
+            # Given explicitly or derived from the geoms: the compiler reads one of the two.
+            body.mass *= self.scale
+            body.inertia *= self.scale
+            body.fullinertia *= self.scale
+            for geom in body.geoms:
+                geom.density *= self.scale
+                geom.mass *= self.scale
+        if spec.compiler.settotalmass > 0.0:
+            # The compiler scales all bodies to the total, so that has to change with the chosen.
+            spec.compiler.settotalmass *= compile_unscaled(spec).body_mass.sum() / before
+
+
+@dataclass(frozen=True)
+class BodyInertia(ModelEffect):
+    """Rotational inertia of bodies, scaled at the same mass: mass nearer to the centre or further out.
+
+    The bodies' masses and inertias no longer follow from their geoms: put effects on the geoms first.
+
+    Args:
+        scale: factor on the inertia about the centre of mass.
+        bodies: name patterns of the bodies.
+
+    Raises:
+        ValueError: when put into a model that has no such body.
+
+    Examples:
+        >>> BodyInertia(0.8, bodies="torso").describe()
+        'inertia of bodies torso × 0.8'
+    """
+
+    wording: ClassVar[str] = "inertia of {bodies} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.01, 100.0), neutral=1.0)
+    bodies: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        bodies = selection.bodies(spec, self.bodies)
+        if not self.is_neutral:
+            edit_inertials(spec, bodies, lambda old: replace(old, inertia=self.scale * old.inertia))
+
+
+@dataclass(frozen=True)
+class BodyCentreOfMass(ModelEffect):
+    """The centre of mass of bodies, shifted; mass, and inertia about the centre, stay.
+
+    The bodies' masses and inertias no longer follow from their geoms: put effects on the geoms first.
+
+    Args:
+        x: shift along the x axis of the body's frame, in m.
+        z: shift along the z axis of the body's frame, in m.
+        y: shift along the y axis of the body's frame, in m.
+        bodies: name patterns of the bodies.
+
+    Raises:
+        ValueError: when put into a model that has no such body.
+
+    Examples:
+        >>> BodyCentreOfMass(x=0.01, bodies="torso").describe()
+        'centre of mass of bodies torso shifted by x 0.01 m, y 0 m, z 0 m'
+    """
+
+    wording: ClassVar[str] = "centre of mass of {bodies} shifted by x {x}, y {y}, z {z}"
+    x: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    z: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    y: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    bodies: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        bodies = selection.bodies(spec, self.bodies)
+        if not self.is_neutral:
+            shift = np.array([self.x, self.y, self.z])
+            edit_inertials(spec, bodies, lambda old: replace(old, centre=old.centre + shift))
+
+
+@dataclass(frozen=True)
+class Payload(ModelEffect):
+    """A point mass fixed to bodies: a battery, a camera, what the robot carries.
+
+    The bodies' masses and inertias no longer follow from their geoms: put effects on the geoms first.
+    Without a mass, the position changes nothing.
+
+    Args:
+        mass: of the payload on every body, in kg.
+        x: where it is on the x axis of the body's frame, in m.
+        z: where it is on the z axis of the body's frame, in m.
+        y: where it is on the y axis of the body's frame, in m.
+        bodies: name patterns of the bodies.
+
+    Raises:
+        ValueError: when put into a model that has no such body.
+
+    Examples:
+        >>> Payload(1.5, z=0.1, bodies="torso").describe()
+        'payload of 1.5 kg at x 0 m, y 0 m, z 0.1 m on bodies torso'
+    """
+
+    wording: ClassVar[str] = "payload of {mass} at x {x}, y {y}, z {z} on {bodies}"
+    mass: float = parameter(unit="kg", bounds=(0.0, 1000.0), neutral=0.0)
+    x: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    z: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    y: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    bodies: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        bodies = selection.bodies(spec, self.bodies)
+        if self.mass:
+            edit_inertials(spec, bodies, self._loaded)
+
+    def _loaded(self, body: Inertial) -> Inertial:
+        return body.with_point_mass(self.mass, np.array([self.x, self.y, self.z]))

@@ -1,0 +1,69 @@
+"""The simulation inside a Gymnasium MuJoCo task, wrapped by TorchRL's GymEnv or GymWrapper."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from torchrl.envs import EnvBase, GymWrapper
+
+from torchrl_h2o.envs.backends.backend import Simulator
+
+if TYPE_CHECKING:
+    from gymnasium.envs.mujoco import MujocoEnv
+
+
+class GymnasiumSimulator(Simulator):
+    """A :class:`gymnasium.envs.mujoco.MujocoEnv`, whose model comes from the file ``fullpath``."""
+
+    owner: MujocoEnv
+
+    @classmethod
+    def inside(cls, env: EnvBase) -> GymnasiumSimulator | None:
+        """The simulation inside an env without transforms, None if there is none of this kind."""
+        if not isinstance(env, GymWrapper):
+            return None
+        from gymnasium.envs.mujoco import MujocoEnv
+
+        task = getattr(env._env, "unwrapped", None)
+        return cls(task, env) if isinstance(task, MujocoEnv) else None
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self.owner.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        return self.owner.data
+
+    @property
+    def control_step(self) -> float:
+        return self.owner.dt * self.env.wrapper_frame_skip
+
+    def spec(self) -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_file(self.owner.fullpath)
+
+    @property
+    def source(self) -> str:
+        return self.owner.fullpath
+
+    def load(self, model: mujoco.MjModel) -> None:
+        task, old = self.owner, self.owner.model
+        task.model, task.data = model, mujoco.MjData(model)
+        # A task may start from a pose of its own; where it starts from the model's, follow that.
+        task.init_qpos = np.where(task.init_qpos == old.qpos0, model.qpos0, task.init_qpos)
+        renderer = task.mujoco_renderer
+        renderer.close()  # its contexts hold the old model's geometry
+        renderer._viewers.clear()
+        renderer.viewer = None
+        renderer.model, renderer.data = task.model, task.data
+
+    def push(self) -> None:
+        # a method and no lambda, because a copy of the task must step itself and not this one
+        self.owner._step_mujoco_simulation = self._step
+
+    def _step(self, ctrl: np.ndarray, n_frames: int) -> None:
+        step = type(self.owner)._step_mujoco_simulation
+        self.data.ctrl[:] = ctrl  # forces are computed before the step that would write it
+        self._pushed_steps(lambda: step(self.owner, ctrl, 1), n_frames)

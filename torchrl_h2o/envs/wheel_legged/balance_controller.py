@@ -1,0 +1,145 @@
+"""A hand-made balancing controller for the wheel-legged robot: a policy that imitates the human
+operator who recorded the real robot's data. It keeps the robot up, but wanders as it does so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.data import Bounded
+from torchrl.modules import OrnsteinUhlenbeckProcessModule
+
+from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS, TARGET_VELOCITY
+
+#: N·m per rad, rad/s, m and m/s; see :class:`BalanceController` for where they come from
+DEFAULT_GAINS = {
+    "standing_still": {"theta": 9.0, "theta_dot": 0.9, "x": 0.4, "v": 1.3},
+    "moving_forward": {"v": 1.3, "theta": 9.0, "theta_dot": 0.9},
+}
+MAX_TORQUE = 3.0  # N·m
+CONTROL_PERIOD = 0.005  # s
+
+
+class StateFeedback(nn.Module):
+    """``torque = gains · (observation - target)``, clipped to the bounds of the action.
+
+    Args:
+        gains: ``(n,)``, N·m per unit of each observed quantity.
+        target: ``(n,)``, in the units of the observation.
+        max_torque: bound of the torque, N·m.
+    """
+
+    def __init__(self, gains: torch.Tensor, target: torch.Tensor, max_torque: float) -> None:
+        super().__init__()
+        self.register_buffer("gains", gains)
+        self.register_buffer("target", target)
+        self.max_torque = max_torque
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        torque = ((observation - self.target) * self.gains).sum(-1, keepdim=True)
+        return torque.clamp(-self.max_torque, self.max_torque)
+
+
+class BalanceController(TensorDictModule):
+    """Balances the wheel-legged robot by state feedback; reads observation, writes action.
+
+    All gains are positive: to get the wheels back under a body that leans forward, or that must
+    first lean back to slow down, is the same forward torque. The default gains are below those of
+    a linear-quadratic regulator in the angle and near them in the velocity, and together with the
+    default noise of :func:`noisy_balance_controller` they make the robot wander about as widely
+    as in the real log.
+
+    Args:
+        task: ``"standing_still"``, about x = 0, or ``"moving_forward"``, at 0.2 m/s.
+        gains: N·m per rad, rad/s, m and m/s, by the names of
+            :data:`~torchrl_h2o.envs.wheel_legged.OBSERVATIONS`; those left out keep their default.
+        max_torque: bound of the torque, N·m.
+
+    Raises:
+        ValueError: for a task that there is not, or a gain of a quantity not observed in it.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> controller = BalanceController(gains={"theta": 10.0})
+        >>> leaning = TensorDict({"observation": torch.tensor([0.1, 0.0, 0.0, 0.0])})
+        >>> controller(leaning)["action"]
+        tensor([1.])
+    """
+
+    def __init__(
+        self,
+        task: str = "standing_still",
+        gains: Mapping[str, float] | None = None,
+        max_torque: float = MAX_TORQUE,
+    ) -> None:
+        if task not in OBSERVATIONS:
+            raise ValueError(f"no balance controller for the task {task!r}; take one of {', '.join(OBSERVATIONS)}")
+        names = OBSERVATIONS[task]
+        if unknown := sorted(set(gains or {}) - set(names)):
+            raise ValueError(f"gains has {', '.join(unknown)}, but {task} observes only {', '.join(names)}")
+        merged = DEFAULT_GAINS[task] | dict(gains or {})
+        target = {"v": TARGET_VELOCITY if task == "moving_forward" else 0.0}
+        super().__init__(
+            StateFeedback(
+                torch.tensor([float(merged[name]) for name in names]),
+                torch.tensor([target.get(name, 0.0) for name in names]),
+                max_torque,
+            ),
+            in_keys=["observation"],
+            out_keys=["action"],
+        )
+
+
+def noisy_balance_controller(
+    task: str = "standing_still",
+    gains: Mapping[str, float] | None = None,
+    *,
+    noise_std: float = 0.5,
+    noise_time: float = 0.06,
+    max_torque: float = MAX_TORQUE,
+) -> TensorDictSequential:
+    """:class:`BalanceController` with the unsteady hand of an operator.
+
+    The noise on the torque is TorchRL's Ornstein-Uhlenbeck process, so it is added only under
+    ``set_exploration_type(ExplorationType.RANDOM)``, and it starts anew where ``is_init`` says
+    that an episode does (:class:`torchrl.envs.InitTracker`; :func:`~torchrl_h2o.envs.record`
+    sees to both).
+
+    Args:
+        task: see :class:`BalanceController`.
+        gains: see :class:`BalanceController`.
+        noise_std: standard deviation of the noise once it has settled, N·m.
+        noise_time: time in which its autocorrelation falls to 1/e, s; more than a control step.
+        max_torque: bound of the torque with its noise, N·m.
+
+    Returns:
+        A policy that reads ``observation`` and ``is_init`` and writes ``action``.
+
+    Raises:
+        ValueError: for a negative ``noise_std``, or a ``noise_time`` of less than a control step.
+
+    Example:
+        >>> from torchrl_h2o.envs.recording import record
+        >>> from torchrl_h2o.envs.wheel_legged.env import WheelLeggedEnv
+        >>> record(WheelLeggedEnv(), noisy_balance_controller(), 100, seed=0).shape
+        torch.Size([100])
+    """
+    if noise_std < 0.0:
+        raise ValueError(f"noise_std is {noise_std} N·m; it must not be negative")
+    if noise_time < CONTROL_PERIOD:
+        raise ValueError(f"noise_time is {noise_time} s; it must be at least the control period, {CONTROL_PERIOD} s")
+    # TorchRL's process is n' = (1 - theta dt) n + sigma sqrt(dt) w, whose variance settles at
+    # sigma^2 dt / (1 - (1 - theta dt)^2)
+    decay = 1.0 - CONTROL_PERIOD / noise_time
+    noise = OrnsteinUhlenbeckProcessModule(
+        spec=Bounded(-max_torque, max_torque, (1,)),
+        theta=1.0 / noise_time,
+        sigma=noise_std * math.sqrt((1.0 - decay**2) / CONTROL_PERIOD),
+        dt=CONTROL_PERIOD,
+    )
+    return TensorDictSequential(BalanceController(task, gains, max_torque), noise)

@@ -1,0 +1,90 @@
+"""The gap as a classifier sees it, with no model of its cause: held-out AUC, measured against simulated transitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from sklearn.metrics import roc_auc_score
+from tensordict import TensorDict
+
+from torchrl_h2o.objectives import DynamicsRatioLoss, make_dynamics_ratio_estimator
+from torchrl_h2o.residuals.measured.measured import Measured
+from torchrl_h2o.residuals.measured.residual import residuals, start_states
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+_UPDATES, _BATCH, _CELLS = 600, 256, (64, 64)
+
+
+def two_sample_auc(
+    simulation: Simulation, measured: Measured, *, sensor_std: np.ndarray | None = None, seed: int = 0
+) -> float:
+    """How well real and simulated outcomes of the same state and action can be told apart.
+
+    The discriminators of Eq. (9) learn on the fit part and are judged on the held-out part by their log dynamics ratio.
+    They see what a transition changed, each dimension over its spread.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        sensor_std: (n), noise of the readings, which simulated outcomes then have too, as do the states that they
+            start from.
+        seed: of the networks and the batches.
+
+    Returns:
+        The area under the ROC curve: 0.5 where no gap can be seen, 1 where every outcome gives itself away.
+
+    Source: H2O+ (arXiv 2309.12716), Eq. (9).
+    """
+    fitted, judged = measured.fitted(), measured.judged()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        train = _real_and_simulated(simulation, measured, fitted, fitted, sensor_std)
+        test = _real_and_simulated(simulation, measured, judged, fitted, sensor_std)
+        estimator = make_dynamics_ratio_estimator(
+            measured.observation.shape[1], measured.action.shape[1], _CELLS, logit_bound=None, clamp=None
+        )
+        loss = DynamicsRatioLoss(estimator)
+        optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2)
+        for _ in range(_UPDATES):
+            losses = loss(train[torch.randint(len(train), (_BATCH,))])
+            optimiser.zero_grad()
+            (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
+            optimiser.step()
+        with torch.no_grad():
+            score = estimator.eval()(test)["log_dynamics_ratio"]
+    return float(roc_auc_score(test["real"].numpy(), score.numpy()))
+
+
+def _real_and_simulated(
+    simulation: Simulation, measured: Measured, rows: np.ndarray, like: np.ndarray, sensor_std: np.ndarray | None
+) -> TensorDict:
+    """Measured transitions and, from the same states and actions, simulated ones: standardised as those of ``like``."""
+    rng, states = np.random.default_rng(len(rows)), start_states(simulation, measured, rows)
+    noise = np.zeros((2, *measured.observation.shape))
+    if sensor_std is not None:
+        noise = sensor_std * rng.standard_normal(noise.shape)
+        states = states + noise[0] @ simulation.state_map.restore.T
+    missed = residuals(simulation, measured, rows, states=states, rng=rng)[:, 0] - noise[1][rows]
+    whole = np.isfinite(missed).all(1)
+    rows, missed = rows[whole], missed[whole]
+    change = measured.following - measured.observation
+
+    def standardised(values: np.ndarray, all_values: np.ndarray) -> torch.Tensor:
+        mean, std = all_values[like].mean(0), all_values[like].std(0)
+        return torch.from_numpy((values - mean) / np.maximum(std, 1e-9)).float()
+
+    observation = standardised(measured.observation[rows], measured.observation)
+    action = standardised(measured.action[rows], measured.action)
+    parts = [
+        TensorDict(
+            {
+                "observation": observation,
+                "action": action,
+                "next": {"observation": standardised(outcome, change)},
+                "real": torch.full((len(rows),), real),
+            },
+            batch_size=[len(rows)],
+        )
+        for outcome, real in ((change[rows], True), (change[rows] - missed, False))
+    ]
+    return torch.cat(parts)

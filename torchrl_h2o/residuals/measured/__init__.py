@@ -1,0 +1,1 @@
+"""Measured transitions, their residuals, their noise, and the intervals disturbed from outside."""

@@ -1,0 +1,214 @@
+"""Writes and reads ``report.json``: strict JSON, in which a number that is not finite is null."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
+from torchrl_h2o.residuals.report.report import (
+    DataSummary,
+    DimensionError,
+    ErrorSummary,
+    FoundEffect,
+    HorizonError,
+    IndistinguishableGroup,
+    Interval,
+    RejectedEffect,
+    Report,
+    TwoSample,
+)
+from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.words import effect_name
+
+FILE = "report.json"
+_ARRAYS = ("before", "after", "states")
+
+
+def write_report(report: Report, folder: str | Path) -> Path:
+    """Writes ``report.json`` into a folder, which is made where it does not exist; returns its path."""
+    path = Path(folder) / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(report_to_json(report), ensure_ascii=False, allow_nan=False, indent=1)
+    path.write_text(text + "\n", encoding="utf-8")
+    return path
+
+
+def read_report(path: str | Path) -> Report:
+    """Reads a report from its file, or from the folder that holds it.
+
+    Raises:
+        DataError: if there is no such file, or it is no report.
+    """
+    path = Path(path)
+    path = path / FILE if path.is_dir() else path
+    remedy = "give the report.json that Report.save wrote, or its folder"
+    try:
+        return report_from_json(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise DataError(f"cannot be read ({error.strerror})", remedy, source=path) from error
+    except KeyError as error:
+        raise DataError(f"is no report: it has no {error}", remedy, source=path) from error
+    except (TypeError, ValueError, AttributeError, IndexError) as error:
+        raise DataError(f"is no report: {error}", remedy, source=path) from error
+
+
+def report_to_json(report: Report) -> dict[str, Any]:
+    """The report as what the file holds; see :meth:`Report.to_json`."""
+    return _plain(
+        {
+            "sentence": report.sentence(),
+            "simulator": report.simulator,
+            "effects": [_effect_to_json(found.effect, found) for found in report.found],
+            "rejected": [_effect_to_json(rejected.effect, rejected) for rejected in report.rejected],
+            "indistinguishable": [
+                {
+                    "effects": [
+                        {"name": effect_name(effect), "words": words, "error": error, "effect": effect_to_dict(effect)}
+                        for effect, error, words in zip(group.effects, group.errors, group.words, strict=True)
+                    ],
+                    "separated_by": group.separated_by,
+                }
+                for group in report.indistinguishable
+            ],
+            "error": None if report.error is None else dataclasses.asdict(report.error),
+            "two_sample": dataclasses.asdict(report.two_sample),
+            "unexplained_intervals": [dataclasses.asdict(interval) for interval in report.unexplained_intervals],
+            "data": dataclasses.asdict(report.data),
+            "stop_test": report.stop_test,
+            "conclusion": report.conclusion,
+            "wall_s": report.wall_s,
+            "trace": None if report.trace is None else _trace_to_json(report.trace),
+        }
+    )
+
+
+def report_from_json(entries: Mapping[str, Any]) -> Report:
+    """The report that :func:`report_to_json` was given.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError, IndexError: if it was given none.
+    """
+    return Report(
+        simulator=entries["simulator"],
+        found=tuple(_found(entry) for entry in entries["effects"]),
+        rejected=tuple(
+            _read(RejectedEffect, entry, effect=effect_from_dict(entry["effect"])) for entry in entries["rejected"]
+        ),
+        indistinguishable=tuple(_group(entry) for entry in entries["indistinguishable"]),
+        error=None if entries["error"] is None else _error(entries["error"]),
+        two_sample=_read(TwoSample, entries["two_sample"]),
+        unexplained_intervals=tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
+        data=_read(DataSummary, entries["data"]),
+        stop_test=entries["stop_test"],
+        conclusion=entries["conclusion"],
+        wall_s=entries["wall_s"],
+        trace=None if entries["trace"] is None else _trace(entries["trace"]),
+    )
+
+
+def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict[str, Any]:
+    """What was tried, with the effect itself in words, in numbers and as what rebuilds it."""
+    rest = {field.name: getattr(tried, field.name) for field in dataclasses.fields(tried)}
+    ci95 = rest.pop("ci95", {})
+    return {
+        "name": effect_name(effect),
+        "parameters": {
+            name: {"value": parameter.value, "unit": parameter.unit, "ci95": ci95.get(name)}
+            for name, parameter in effect.parameters.items()
+        },
+        **rest,
+        "effect": effect_to_dict(effect),
+    }
+
+
+def _trace_to_json(trace: ResidualTrace) -> dict[str, Any]:
+    """The trace, thinned, to six digits: it is there to be looked at."""
+    trace = trace.thinned()
+    arrays = {name: [_rounded(row) for row in getattr(trace, name)] for name in _ARRAYS}
+    return {
+        "time": _rounded(trace.time),
+        "names": trace.names,
+        "units": trace.units,
+        **arrays,
+        "held_out": trace.held_out,
+    }
+
+
+def _rounded(row: np.ndarray) -> list[float]:
+    return [float(f"{value:.6g}") for value in row]
+
+
+def _plain(value: Any) -> Any:
+    """What JSON knows: arrays become lists, NumPy's numbers Python's, what is not finite None."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _float(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _floats(entries: Mapping[str, float | None]) -> dict[str, float]:
+    return {name: _float(value) for name, value in entries.items()}
+
+
+def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
+    """An instance of a dataclass: what was read already, and the rest as it stands in the entry.
+
+    An earlier version's entry may lack what has a default.
+    """
+    there = {**entry, **read}
+    values = {}
+    for field in dataclasses.fields(cls):
+        if field.name in there or field.default is dataclasses.MISSING:
+            values[field.name] = there[field.name]
+    floats = {field.name for field in dataclasses.fields(cls) if field.type is float}
+    return cls(**{name: _float(value) if name in floats else value for name, value in values.items()})
+
+
+def _found(entry: Mapping[str, Any]) -> FoundEffect:
+    effect = effect_from_dict(entry["effect"])
+    intervals = {name: parameter["ci95"] for name, parameter in entry["parameters"].items()}
+    ci95 = {name: (_float(ends[0]), _float(ends[1])) for name, ends in intervals.items() if ends is not None}
+    return _read(FoundEffect, entry, effect=effect, ci95=ci95)
+
+
+def _group(entry: Mapping[str, Any]) -> IndistinguishableGroup:
+    members = entry["effects"]
+    return IndistinguishableGroup(
+        effects=tuple(effect_from_dict(member["effect"]) for member in members),
+        errors=tuple(_float(member["error"]) for member in members),
+        separated_by=entry["separated_by"],
+        words=tuple(member["words"] for member in members if "words" in member),
+    )
+
+
+def _error(entry: Mapping[str, Any]) -> ErrorSummary:
+    horizons = tuple(
+        _read(HorizonError, horizon, before=_floats(horizon["before"]), after=_floats(horizon["after"]))
+        for horizon in entry["horizons"]
+    )
+    per_dimension = tuple(_read(DimensionError, dimension) for dimension in entry["per_dimension"])
+    return _read(ErrorSummary, entry, per_dimension=per_dimension, horizons=horizons)
+
+
+def _trace(entry: Mapping[str, Any]) -> ResidualTrace:
+    arrays = {name: np.array(entry[name], dtype=float).reshape(-1, len(entry["names"])) for name in _ARRAYS}
+    return ResidualTrace(
+        time=np.array(entry["time"], dtype=float),
+        names=tuple(entry["names"]),
+        units=tuple(entry["units"]),
+        held_out=np.array(entry["held_out"], dtype=bool),
+        **arrays,
+    )

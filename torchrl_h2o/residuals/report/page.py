@@ -1,0 +1,114 @@
+"""Writes ``report.html``: one file that a browser opens without a network."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.report import FoundEffect, Report
+from torchrl_h2o.residuals.report.words import (
+    change,
+    interval,
+    interval_digits,
+    number,
+    quantity,
+)
+
+FILE = "report.html"
+_TEMPLATE = "report.html.jinja"
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A line of the ranking."""
+
+    words: str
+    error: float
+    p_value: float | None
+    verdict: str
+    found: bool
+
+
+def write_page(report: Report, folder: str | Path) -> Path:
+    """Writes ``report.html`` into a folder, which is made where it does not exist; returns its path."""
+    path = Path(folder) / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(report_page(report), encoding="utf-8")
+    return path
+
+
+def report_page(report: Report) -> str:
+    """The report as a page.
+
+    Args:
+        report: the report; what it does not hold, the page leaves out.
+
+    Returns:
+        HTML with its style and its pictures in it. It asks for nothing from outside.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "quantity": quantity}
+    return environment.get_template(_TEMPLATE).render(
+        report=report,
+        change=change,
+        parameters=_parameters,
+        ranking=_ranking(report),
+        pictures=_pictures(report),
+        colours={"before": plots.BEFORE, "after": plots.AFTER},
+    )
+
+
+def _parameters(found: FoundEffect) -> list[tuple[str, str, str]]:
+    """Name, value with unit and interval of each parameter of an effect."""
+    rows = []
+    for name, parameter in found.effect.parameters.items():
+        low, high = found.ci95.get(name, (float("nan"), float("nan")))
+        value = quantity(parameter.value, parameter.unit, interval_digits(low, high))
+        rows.append((name, value, interval(low, high, parameter.unit)))
+    return rows
+
+
+def _ranking(report: Report) -> list[_Tried]:
+    """Everything that was tried: what was put in, in order, then the rest from the best to the worst."""
+    found = [
+        _Tried(f.words, f.error_after, None, "put in" if k == 0 else "put in, with those above", True)
+        for k, f in enumerate(report.found)
+    ]
+    rejected = [_Tried(r.words, r.error_after, r.p_value, r.reason, False) for r in report.rejected]
+    # a NaN, of what diverged, has no place of its own in an order
+    return found + sorted(rejected, key=lambda tried: (number(tried.error) == "–", tried.error))
+
+
+def _pictures(report: Report) -> Mapping[str, list[str]]:
+    """The pictures, as SVG, by the section that they stand in."""
+    pictures: dict[str, Any] = {"dimensions": [], "horizons": [], "time": [], "states": []}
+    if report.error is not None:
+        by_unit = sorted(report.error.per_dimension, key=lambda dimension: dimension.unit)
+        pictures["dimensions"] = [
+            plots.error_bars(list(dimensions)) for _, dimensions in groupby(by_unit, lambda d: d.unit)
+        ]
+        if report.error.horizons:
+            pictures["horizons"] = [
+                plots.horizon_lines(report.error.horizons, dimension) for dimension in report.error.per_dimension
+            ]
+    if report.trace is not None:
+        trace = report.trace.thinned()
+        pictures["time"] = [
+            plots.residual_in_time(trace, dimension, report.unexplained_intervals)
+            for dimension in range(len(trace.names))
+        ]
+        pictures["states"] = [
+            plots.residual_against_state(trace, dimension, state, report.unexplained_intervals)
+            for dimension, state in plots.telling_pairs(trace)
+        ]
+    return pictures

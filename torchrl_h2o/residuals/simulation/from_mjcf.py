@@ -1,0 +1,98 @@
+"""An MJCF file as a simulation that tracing can step: its file, its control step, and the names of what is observed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+import mujoco
+
+from torchrl_h2o.effects import Effect, compile_model
+from torchrl_h2o.residuals.simulation.observability import with_hidden_states
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.simulation.state_map import StateMap, coordinate_names
+
+_CLOCK = 0.01  # of the control step: what clocks may be off
+
+
+def simulation_of(
+    path: Path,
+    state_map: StateMap | Mapping[str, str] | Sequence[str],
+    control_step: float,
+    effects: Sequence[Effect] = (),
+    cls: type[Simulation] = Simulation,
+) -> Simulation:
+    """The simulation of an MJCF file; see :meth:`Simulation.from_mjcf`.
+
+    Args:
+        path: of the file.
+        state_map: a map; or the coordinates that are observed, in the order of the data; or, for data whose columns
+            have names of their own, the coordinate of each column: ``{"theta": "pitch", "theta_dot":
+            "pitch_velocity"}``.
+        control_step: the time between two rows of the data, in s.
+        effects: put into it.
+        cls: the class of what is returned.
+
+    Raises:
+        ValueError: for a file that is no model, names that it does not have, or a control step that is no multiple of
+            its timestep.
+    """
+    path = Path(path)
+
+    def spec() -> mujoco.MjSpec:
+        return mujoco.MjSpec.from_file(str(path))
+
+    model = _compiled(path, spec)
+    if not isinstance(state_map, StateMap):
+        state_map = _map_of(state_map, model, path)
+    elif state_map.observe.shape[1] != model.nq + model.nv:
+        raise ValueError(
+            f"the state map is for {state_map.observe.shape[1]} coordinates, {path} has {model.nq} positions and "
+            f"{model.nv} velocities"
+        )
+    frame_skip = _frame_skip(control_step, model.opt.timestep, path)
+    return with_hidden_states(cls(spec, frame_skip, state_map, tuple(effects), name=path.stem))
+
+
+def _compiled(path: Path, spec) -> mujoco.MjModel:
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}; give the path of an MJCF file")
+    try:
+        return compile_model(spec())
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot make a model of {path}: {error}") from error
+
+
+def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjModel, path: Path) -> StateMap:
+    """The map of observed coordinates; what is not observed stands as in the model's own pose."""
+    columns = list(coordinates)
+    chosen = [coordinates[column] for column in columns] if isinstance(coordinates, Mapping) else columns
+    names, units = coordinate_names(model)
+    for coordinate in chosen:
+        if coordinate not in names:
+            close = get_close_matches(str(coordinate), names, 1)
+            raise ValueError(
+                f"{path} has no coordinate {coordinate!r}{f', but {close[0]!r}' if close else ''}: it has "
+                f"{', '.join(names)}. Where a column of the data has another name, say which it is: "
+                "{'theta': 'pitch'}"
+            )
+    twice = {coordinate for coordinate in chosen if chosen.count(coordinate) > 1}
+    if twice:
+        raise ValueError(f"{', '.join(sorted(twice))} is named twice; name each coordinate once")
+    indices = [names.index(coordinate) for coordinate in chosen]
+    found = StateMap.of_coordinates(columns, [units[i] for i in indices], indices, len(names))
+    found.offset[: model.nq] = model.qpos0
+    found.offset[indices] = 0.0
+    return found
+
+
+def _frame_skip(control_step: float, timestep: float, path: Path) -> int:
+    frame_skip = round(control_step / timestep) if control_step > 0.0 else 0
+    if frame_skip < 1 or abs(frame_skip * timestep - control_step) > _CLOCK * control_step:
+        fitting = control_step / max(1, -(-control_step // timestep)) if control_step > 0.0 else None
+        advice = f"set timestep={fitting:.6g} in the file's <option>" if fitting else "give the time between two rows"
+        raise ValueError(
+            f"a control step of {control_step:g} s is no multiple of the timestep of {path}, {timestep:g} s; {advice}"
+        )
+    return frame_skip

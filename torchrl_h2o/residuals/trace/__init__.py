@@ -1,0 +1,1 @@
+"""From a residual to the effects of a catalogue that cause it."""

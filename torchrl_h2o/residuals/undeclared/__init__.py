@@ -1,0 +1,1 @@
+"""Forces that no catalogue holds, found in the residual by sparse regression."""

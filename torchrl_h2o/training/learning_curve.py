@@ -1,0 +1,93 @@
+"""The picture of a run: returns in reality over the updates, and what the discriminators see."""
+
+from pathlib import Path
+from typing import Protocol
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from omegaconf import DictConfig
+
+from torchrl_h2o.training.returns import Evaluation
+
+COLOURS = {
+    "H2O+": "#0b6e4f",
+    "H2O": "#5aa9a3",
+    "SAC in the simulator": "#c8553d",
+    "DARC": "#e0a458",
+    "IQL": "#3d5a98",
+    "CQL": "#8a6fae",
+    "RLPD": "#7a7a7a",
+    "weighted TD3": "#a3a3a3",
+}
+
+
+BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13), "ncols": 2, "fontsize": 8}
+
+
+class Trained(Protocol):
+    """What is told of a training when it is over."""
+
+    rows: list[dict]
+    updates: int
+    updates_per_second: float
+
+
+def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Evaluation, cfg: DictConfig) -> None:
+    """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained", width_ratios=(3, 2))
+    for name, training in trainings.items():
+        updates, mean, std = (
+            [row[key] for row in training.rows] for key in ("updates", "return_real", "return_real_std")
+        )
+        colour = COLOURS.get(name)
+        left.plot(updates, mean, "o-", ms=3, color=colour, label=name)
+        left.fill_between(
+            updates,
+            *([m + s * d for m, d in zip(mean, std, strict=True)] for s in (-1, 1)),
+            color=colour,
+            alpha=0.2,
+            lw=0,
+        )
+    top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour.mean])
+    if left.get_ylim()[0] < -abs(top):  # a robot that runs away loses without bound and would flatten all else
+        left.set_ylim(-0.25 * abs(top), 1.1 * top)
+        left.text(0.01, 0.01, "returns below are cut off", transform=left.transAxes, fontsize=8, color="0.4")
+    left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=_label_of(behaviour, cfg))
+    gap = f", simulator with {cfg.gap}" if cfg.gap else ""
+    left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
+    left.legend(**BELOW)
+
+    _draw_discriminators(right, next(iter(trainings.values())).rows)
+    for axis in (left, right):
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def _label_of(behaviour: Evaluation, cfg: DictConfig) -> str:
+    """Says how long the data's episodes are, where those of a policy end sooner and so can return less."""
+    longest = cfg.env.make.get("max_episode_steps")
+    if longest is None or behaviour.mean_length <= longest:
+        return "the data's behaviour"
+    return f"the data's behaviour (episodes of {behaviour.mean_length * cfg.env.seconds_per_step:.0f} s)"
+
+
+def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
+    """How well the discriminators tell the streams apart; nothing for a method that has none."""
+    updates = [row["updates"] for row in rows]
+    lines = [
+        ("accuracy_sa", "o-", None, "accuracy on (s, a)"),
+        ("accuracy", "o-", None, "accuracy on (s, a, s')"),
+        ("ratio_of_sim", "s--", "0.4", "mean ratio of simulated rows"),
+    ]
+    lines = [line for line in lines if line[0] in rows[0]]
+    if not lines:
+        axis.set_visible(False)
+        return
+    for key, style, colour, label in lines:
+        axis.plot(updates, [row[key] for row in rows], style, ms=3, color=colour, label=label)
+    axis.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (0.5: cannot be told)")
+    axis.legend(**BELOW)

@@ -1,0 +1,33 @@
+"""Every system of the paper's comparison, and two more, by name."""
+
+from torchrl_h2o.training.loop import Method
+from torchrl_h2o.training.methods.cql import CQL
+from torchrl_h2o.training.methods.darc import DARC
+from torchrl_h2o.training.methods.h2o import H2O
+from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
+from torchrl_h2o.training.methods.iql import IQL
+from torchrl_h2o.training.methods.rlpd import RLPD
+from torchrl_h2o.training.methods.sac import SAC
+from torchrl_h2o.training.methods.weighted_td3 import WEIGHTED_TD3
+
+METHODS = {
+    "sac": SAC,  # the simulator alone
+    "cql": CQL,  # the real data alone
+    "iql": IQL,
+    "darc": DARC,  # the simulator; the real data tell how real it is
+    "h2o": H2O,  # both
+    "h2o_plus": H2O_PLUS,
+    "rlpd": RLPD,  # both; not in the paper
+    "td3": WEIGHTED_TD3,
+}
+
+
+def method_named(name: str) -> Method:
+    """One of :data:`METHODS`.
+
+    Raises:
+        ValueError: if there is none of that name.
+    """
+    if name not in METHODS:
+        raise ValueError(f"method={name}: choose {', '.join(METHODS)}")
+    return METHODS[name]

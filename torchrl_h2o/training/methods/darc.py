@@ -1,0 +1,33 @@
+"""DARC: SAC in the simulator, where a step is paid less the less likely it is in reality."""
+
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.data import TensorSpec
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import DynamicsRatioLoss, DynamicsRewardCorrection, make_dynamics_ratio_estimator
+from torchrl_h2o.training.learner import Learner, adam, make_networks
+from torchrl_h2o.training.loop import Method
+
+
+def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
+    """TorchRL's SAC on simulated rows with corrected rewards; the real data train the discriminators alone."""
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
+    corrected = DynamicsRewardCorrection(estimator, scale=cfg.reward_scale)  # of the task's own reward
+    loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
+    loss.make_value_estimator(gamma=cfg.gamma)
+    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+
+    def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict:
+        ratio_losses = ratio_loss(pairs)
+        return {**loss(corrected(batch)), **ratio_losses}
+
+    losses, sizes = {"loss": loss, "ratio_loss": ratio_loss}, [(0, sum(cfg.batch_size)), cfg.discriminator_batch_size]
+    return Learner(
+        actor, losses, adam(loss, ratio_loss, lr=cfg.lr), SoftUpdate(loss, tau=cfg.tau), replay, sizes, terms_of
+    )
+
+
+DARC = Method("DARC", make_learner)

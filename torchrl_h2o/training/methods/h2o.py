@@ -1,0 +1,51 @@
+"""H2O, the predecessor: SAC on both streams, the simulator's weighed by the ratio, and Q held down where it is off."""
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch.nn.functional import pad
+from torchrl.data import TensorSpec
+from torchrl.objectives import SoftUpdate
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import (
+    ConservativeLoss,
+    DynamicsDivergence,
+    DynamicsRatioLoss,
+    H2OPlusLoss,
+    make_dynamics_ratio_estimator,
+)
+from torchrl_h2o.training.learner import Learner, adam, make_networks
+from torchrl_h2o.training.loop import Method
+
+
+def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
+    """Eq. (1): a conservative term around SAC on both streams."""
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
+    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    num_real, _ = cfg.batch_size
+    spread = replay.real[:]["observation"].std(0)
+    divergence = DynamicsDivergence(estimator, noise=spread, num_samples=cfg.h2o.num_samples)
+
+    # The authors' backup holds no entropy.
+    no_bonus = TensorDictModule(torch.zeros_like, in_keys=["_log_prob"], out_keys=["exploration_bonus"])
+    both = H2OPlusLoss(actor, qvalues, None, mixing=0.0, exploration=no_bonus, target_entropy=cfg.target_entropy)
+    loss = ConservativeLoss(both, alpha_c=cfg.h2o.alpha_c)
+    loss.make_value_estimator(gamma=cfg.gamma)
+
+    def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
+        ratio_losses = ratio_loss(pairs)
+        simulated = divergence(estimator(batch[num_real:]))  # Eq. (9), and ω before it is normalised
+        for key in ("dynamics_ratio", "dynamics_divergence"):
+            batch[key] = pad(simulated[key], (num_real, 0), value=1.0)
+        return {**loss(batch), **ratio_losses}
+
+    losses, sizes = {"loss": loss, "ratio_loss": ratio_loss}, [cfg.batch_size, cfg.discriminator_batch_size]
+    return Learner(
+        actor, losses, adam(loss, ratio_loss, lr=cfg.lr), SoftUpdate(loss, tau=cfg.tau), replay, sizes, terms_of
+    )
+
+
+H2O = Method("H2O", make_learner)

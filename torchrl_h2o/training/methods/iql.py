@@ -1,0 +1,23 @@
+"""IQL on the real data alone: TorchRL's own loss. No simulator, so no gap touches it."""
+
+from omegaconf import DictConfig
+from torchrl.data import TensorSpec
+from torchrl.objectives import IQLLoss, SoftUpdate
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import make_value
+from torchrl_h2o.training.learner import Learner, adam, make_networks
+from torchrl_h2o.training.loop import Method
+
+
+def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
+    """TorchRL's loss, on real rows alone."""
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    value = make_value(observation_dim, cfg.num_cells)
+    loss = IQLLoss(actor, qvalues, value, loss_function="l2", **cfg.iql)
+    loss.make_value_estimator(gamma=cfg.gamma)
+    targets = SoftUpdate(loss, tau=cfg.tau)
+    return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [(sum(cfg.batch_size), 0)], loss)
+
+
+IQL = Method("IQL", make_learner)

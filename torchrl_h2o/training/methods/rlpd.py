@@ -1,0 +1,22 @@
+"""RLPD-style: SAC on real and simulated rows half and half, neither weighed. H2O+ without V and without the ratio."""
+
+from omegaconf import DictConfig
+from torchrl.data import TensorSpec
+from torchrl.objectives import SoftUpdate
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import H2OPlusLoss
+from torchrl_h2o.training.learner import Learner, adam, make_networks
+from torchrl_h2o.training.loop import Method
+
+
+def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
+    """SAC's target on both streams, Eq. (6)."""
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    loss = H2OPlusLoss(actor, qvalues, None, mixing=0.0, target_entropy=cfg.target_entropy)
+    loss.make_value_estimator(gamma=cfg.gamma)
+    targets = SoftUpdate(loss, tau=cfg.tau)
+    return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [cfg.batch_size], loss)
+
+
+RLPD = Method("RLPD", make_learner)

@@ -1,0 +1,37 @@
+"""TD3 on real and simulated rows, the simulated ones weighed by the dynamics ratio: TorchRL's loss, weighted by ours.
+
+The Bellman error alone is weighed. The policy is the other methods': TD3 reads its mean, and explores in the simulator
+with the spread it starts with. It is updated at every step, not at every second one.
+"""
+
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from torchrl.data import TensorSpec
+from torchrl.objectives import SoftUpdate, TD3Loss
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import DynamicsRatioLoss, ImportanceWeightedLoss, make_dynamics_ratio_estimator
+from torchrl_h2o.training.learner import Learner, adam, make_networks
+from torchrl_h2o.training.loop import Method
+
+
+def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
+    """TorchRL's TD3 with the discriminators' weights."""
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
+    td3 = TD3Loss(actor, qvalues, action_spec=action_spec, loss_function="l2", reduction="none")
+    td3.make_value_estimator(gamma=cfg.gamma)
+    loss = ImportanceWeightedLoss(td3, terms=["loss_qvalue"])
+    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+
+    def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict:
+        ratio_losses = ratio_loss(pairs)
+        return {**loss(estimator(batch)), **ratio_losses}
+
+    losses, sizes = {"loss": loss, "ratio_loss": ratio_loss}, [cfg.batch_size, cfg.discriminator_batch_size]
+    return Learner(
+        actor, losses, adam(loss, ratio_loss, lr=cfg.lr), SoftUpdate(loss, tau=cfg.tau), replay, sizes, terms_of
+    )
+
+
+WEIGHTED_TD3 = Method("weighted TD3", make_learner)

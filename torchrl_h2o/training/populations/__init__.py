@@ -1,0 +1,6 @@
+"""Many runs in one process: their networks stacked, their losses taken in one call."""
+
+from torchrl_h2o.training.populations.population import Population
+from torchrl_h2o.training.populations.replay import PopulationReplay
+
+__all__ = ["Population", "PopulationReplay"]

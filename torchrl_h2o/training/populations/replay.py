@@ -1,0 +1,120 @@
+"""The replay buffers of many runs on the same real data, sampled in one go.
+
+Each run has a ``HybridReplayBuffer`` of its own. The simulated rows of all of them lie in one piece of memory, so that
+the batches of all runs are gathered by one index, however many runs there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+
+from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS, HybridReplayBuffer
+
+
+class PopulationReplay:
+    """N replay buffers that share their real data.
+
+    Args:
+        real: flat TED transitions, batch size [T], of all runs.
+        sim_capacity: how many simulated transitions each run keeps.
+        batch_size: (real, simulated) rows of a run's batch.
+        num_members: N.
+        keys: the entries of a batch, as in :class:`HybridReplayBuffer`.
+        device: where the data are kept and the batches are made.
+
+    Attributes:
+        buffers: the members' own, to be extended, saved and sampled one by one.
+
+    Example:
+        >>> import torch
+        >>> from torchrl.envs import GymEnv
+        >>> from torchrl_h2o.training.populations import PopulationReplay
+        >>> env = GymEnv("Pendulum-v1")
+        >>> replay = PopulationReplay(env.rollout(50), sim_capacity=1000, batch_size=(4, 4), num_members=3)
+        >>> for buffer in replay.buffers:
+        ...     buffer.extend(env.rollout(20))
+        >>> replay.sample()["next", "reward"].shape
+        torch.Size([3, 8, 1])
+        >>> streams = [torch.Generator().manual_seed(seed) for seed in range(3)]
+        >>> batch = replay.sample(generators=streams)  # each member's row is what its own buffer would have sampled
+    """
+
+    def __init__(
+        self,
+        real: TensorDictBase,
+        sim_capacity: int,
+        batch_size: tuple[int, int],
+        num_members: int,
+        *,
+        keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        real = real.select(*keys).to(device)
+        memory = real[:1].expand(num_members, sim_capacity).apply(lambda rows: rows.new_empty(rows.shape))
+        self.buffers = [
+            HybridReplayBuffer(real, sim_capacity, batch_size, keys=keys, device=device, sim_memory=memory[member])
+            for member in range(num_members)
+        ]
+        self.batch_size, self.device = tuple(batch_size), torch.device(device)
+        self._real = {key: real.get(key) for key in self.buffers[0].keys}
+        self._sim = {key: memory.get(key).flatten(0, 1) for key in self.buffers[0].keys}
+        self._first_sim = sim_capacity * torch.arange(num_members, device=device)[:, None]
+        self._lengths = torch.zeros(2, num_members, 1, dtype=torch.long, device=device)  # of both streams
+        self._known_lengths: tuple[list[int], list[int]] = ([], [])
+
+    def sample(
+        self, batch_size: tuple[int, int] | None = None, generators: Sequence[torch.Generator] | None = None
+    ) -> TensorDict:
+        """Draw a batch for every member.
+
+        Args:
+            batch_size: (real, simulated) rows of a member's batch, instead of the buffers' own.
+            generators: one a member, which then gets what its own buffer draws with it. Without them all members draw
+                from torch's global generator, in one call.
+
+        Returns:
+            TensorDict of batch size [N, real + simulated]: the buffers' entries, and ``real``, bool; the real rows
+            come first.
+        """
+        n_real, n_sim = self.batch_size if batch_size is None else batch_size
+        self._find_lengths(n_sim)
+        index_real = self._draw(0, n_real, generators)
+        index_sim = self._draw(1, n_sim, generators) + self._first_sim
+        batch = {
+            key: torch.cat([_gather(self._real[key], index_real), _gather(self._sim[key], index_sim)], 1)
+            for key in self._real
+        }
+        size = [len(self.buffers), n_real + n_sim]
+        batch["real"] = (torch.arange(size[1], device=self.device) < n_real).expand(size)
+        return TensorDict(batch, batch_size=size, device=self.device)
+
+    def _find_lengths(self, n_sim: int) -> None:
+        """Keeps the buffers' lengths on the device: a copy for every batch would wait for it."""
+        lengths = [len(buffer.real) for buffer in self.buffers], [len(buffer.sim) for buffer in self.buffers]
+        if n_sim and not all(lengths[1]):
+            raise RuntimeError(
+                f"member {lengths[1].index(0)} has no simulated transitions yet; extend() its buffer first, or "
+                "sample((n, 0)) for real rows alone"
+            )
+        if lengths != self._known_lengths:
+            self._known_lengths = lengths
+            self._lengths.copy_(torch.tensor(lengths)[..., None])
+
+    def _draw(self, stream: int, count: int, generators: Sequence[torch.Generator] | None) -> torch.Tensor:
+        """Row numbers below each member's length, ``[N, count]``."""
+        if generators is None:
+            uniform = torch.rand(len(self.buffers), count, device=self.device, dtype=torch.double)
+            return (uniform * self._lengths[stream]).long()
+        rows = [
+            torch.randint(length, (count,), device=self.device, generator=generator)
+            for length, generator in zip(self._known_lengths[stream], generators, strict=True)
+            if count
+        ]
+        return torch.stack(rows) if count else self._first_sim[:, :0]
+
+
+def _gather(rows: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    return rows.index_select(0, index.flatten()).unflatten(0, index.shape)
