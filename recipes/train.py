@@ -13,12 +13,12 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from torchrl_h2o.training.job import resumable, run_job
+from torchrl_h2o.training.job import run_job
 from torchrl_h2o.training.methods import method_named
 from omegaconf import DictConfig, OmegaConf
 from torchrl_h2o.training.populations.loop import members_of
 from torchrl_h2o.comparison.results_file import append_run
-from torchrl_h2o.training.run_folder import claimed, open_run
+from torchrl_h2o.training.run_folder import claimed, open_run, resumable
 
 
 @hydra.main(config_path="config", config_name="train", version_base=None)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hydra
 import torch
-from torchrl_h2o.training.environments import make_reality, make_simulator
+from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of, task_of
 from torchrl_h2o.training.returns import evaluate
 from torchrl_h2o.training.methods import method_named
 from omegaconf import DictConfig
@@ -58,7 +58,14 @@ def main(options: DictConfig) -> None:
     (directory / "evaluation.json").write_text(json.dumps(summary | {"returns": result.returns}, indent=2) + "\n")
     if options.film is not None:
         path = directory / options.film
-        film(cfg, policy, path, simulator=options["in"] == "simulator", seconds=options.seconds)
+        film(
+            task_of(cfg),
+            preprocessing_of(cfg),
+            policy,
+            path,
+            simulator=options["in"] == "simulator",
+            seconds=options.seconds,
+        )
         print(f"look at {path}")
 
 

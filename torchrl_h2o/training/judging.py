@@ -1,54 +1,64 @@
-"""What a run's policies do in reality and in the simulator they learnt in: summary.json and learning_curve.png."""
+"""Evaluates trained policies in reality and in their simulator; writes summary.json and learning_curve.png."""
+
+from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
-from torchrl_h2o.training.environments import make_reality, make_simulator
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
-from torchrl_h2o.training.real_data import behaviour_in
+from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.run_folder import write_summary
+from torchrl_h2o.training.task import Task
 
-H2O_PLUS_S = ("backbone", "mixing", "ratio")  # which no other method reads
+DATA = "the data's behaviour"
 
 
 def judge(
-    cfg: DictConfig,
-    real: TensorDictBase,
-    policies: dict[str, torch.nn.Module],
-    trainings: dict[str, Trained],
+    task: Task,
+    preprocessing: Preprocessing,
+    policies: Mapping[str, torch.nn.Module],
+    trainings: Mapping[str, Trained],
+    behaviour: Evaluation,
     directory: Path,
+    *,
+    episodes: int,
+    settings: Mapping[str, Any],
     wall_s: float,
 ) -> dict[str, Evaluation]:
-    """Evaluates the policies and leaves summary.json and learning_curve.png.
+    """Evaluates the policies and writes summary.json and learning_curve.png.
 
     Args:
-        cfg: the run's configuration.
-        real: the measured transitions.
-        policies: by method; the one that the run is about, and maybe others beside it.
-        trainings: theirs.
+        task: the task.
+        preprocessing: of the observations that the policies read.
+        policies: by method; the first is the one that the run is about, the others are baselines.
+        trainings: their trainings, by method.
+        behaviour: returns of the data's own episodes.
         directory: where the files go.
-        wall_s: seconds that the run took so far.
+        episodes: number of episodes in reality.
+        settings: further entries of the summary, see :func:`run_settings`.
+        wall_s: seconds that the run has taken so far.
 
     Returns:
-        The episodes in reality, by method, and the data's own.
+        The evaluations in reality by method, and the data's behaviour.
     """
     start = time.perf_counter()
     main = next(iter(policies))
-    reality, simulator = make_reality(cfg, cfg.final_episodes), make_simulator(cfg, 1)
-    in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
+    reality, simulator = task.make_reality(episodes, preprocessing), task.make_simulator(1, preprocessing)
+    in_reality = {name: evaluate(reality, policy, episodes) for name, policy in policies.items()}
     in_simulator = evaluate(simulator, policies[main], 1)
-    behaviour = behaviour_in(cfg, real)
-    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, cfg)
+    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, task)
     write_summary(
         directory,
         {
             "method": main,
-            **settings(cfg, real),
+            **settings,
             "updates": trainings[main].updates,
             "return_real": in_reality[main].summary(),
             "return_sim": in_simulator.summary(),
@@ -58,23 +68,24 @@ def judge(
             "wall_s": wall_s + time.perf_counter() - start,
         },
     )
-    return in_reality | {"the data's behaviour": behaviour}
+    return in_reality | {DATA: behaviour}
 
 
-def judge_failed(cfg: DictConfig, real: TensorDictBase, failure: dict, directory: Path) -> None:
-    """Leaves the summary.json of a run that has no policy to show, and says there why."""
+def write_failure(directory: Path, failure: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Writes the summary.json of a run without a policy, with the reason of its failure."""
     failed = {"updates": failure["updates"], "return_real": None, "failure": failure["why"]}
-    write_summary(directory, settings(cfg, real) | failed)
+    write_summary(directory, {**settings, **failed})
 
 
-def settings(cfg: DictConfig, real: TensorDictBase) -> dict:
-    """What a summary says of the run itself."""
+def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
+    """The entries of a summary that describe the run: environment, gap, data, the method's options and the seed."""
+    of_h2o_plus = ("backbone", "mixing", "ratio")  # options that no other method reads
     return {
         "env": cfg.env.name,
         "gap": cfg.gap,
         "gap_fix": cfg.get("gap_fix"),
         "data": cfg.data,
         "transitions": len(real),
-        **({key: cfg[key] for key in H2O_PLUS_S} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
+        **({key: cfg[key] for key in of_h2o_plus} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
         "seed": cfg.seed,
     }
