@@ -90,8 +90,8 @@ def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:
     """Further arguments of TorchRL's RayCollector."""
     chosen = cfg.collector
     return {
-        "total_frames": Budget.from_config(cfg).epochs
-        * cfg.steps_per_epoch,  # RayCollector collects nothing without it
+        # RayCollector collects nothing without a total.
+        "total_frames": Budget.from_config(cfg).epochs * cfg.steps_per_epoch,
         "collector_class": SeededCollector,
         "collector_kwargs": [{"postproc": methodcaller("select", *keys)} for _ in range(chosen.workers)],
         "remote_configs": OmegaConf.to_container(chosen.resources),
