@@ -36,16 +36,15 @@ from torchrl_h2o.objectives import (
     make_value,
     total_loss,
 )
-from torchrl_h2o.training.best_policy import BestPolicy
 from torchrl_h2o.training.compiling import maybe_compiled
-from torchrl_h2o.training.environments import measure_observation_norm, preprocessing_of, task_of
 from torchrl_h2o.training.film import try_to_film
-from torchrl_h2o.training.judging import judge, run_settings
-from torchrl_h2o.training.printout import table_of_run
+from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
-from torchrl_h2o.training.real_data import RECORDED, behaviour_of, read_real_data
-from torchrl_h2o.training.returns import evaluate
+from torchrl_h2o.training.real_data import RECORDED, behaviour_of
+from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
+from torchrl_h2o.training.task import Task
 
 
 @hydra.main(config_path="config", config_name="h2o_plus", version_base=None)
@@ -62,20 +61,31 @@ def train(cfg: DictConfig, folder: Path) -> None:
         raise ValueError(f"backbone={cfg.backbone}: choose expectile, sparse or exponential")
 
     # Task: the target dynamics (reality), and a simulator with the dynamics gap
-    task = task_of(cfg)
+    task = Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.gap_fix)
     task.make_simulator()  # fails before the data are loaded if an effect does not fit the model
 
     # Data: real transitions in TED, [T]; both streams show observations and rewards in the same way
-    real = read_real_data(task, cfg.data, cfg.columns)
-    measure_observation_norm(cfg, real)
+    real = task.read_real_data(cfg.data, cfg.columns)
+    behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
+    preprocessing = Preprocessing.fit(
+        real,
+        normalise=cfg.normalise_observation,
+        norm=cfg.observation_norm,
+        frames=cfg.frames,
+        reward_scale=cfg.reward_scale,
+        reward_offset=cfg.reward_offset,
+    )
+    cfg.observation_norm = preprocessing.norm
     save_config(cfg, folder)
-    preprocessing = preprocessing_of(cfg)
     shown = preprocessing.apply(real)
     replay = HybridReplayBuffer(shown, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
 
-    # Environments
-    reality = task.make_reality(cfg.eval_episodes, preprocessing)
+    # Environments: to collect, to evaluate during training, and for the evaluation at the end
     simulator = task.make_simulator(cfg.num_worlds, preprocessing)
+    reality = task.make_reality(cfg.eval_episodes, preprocessing)
+    trials = task.make_simulator(cfg.eval_episodes, preprocessing)
+    final_reality = task.make_reality(cfg.final_episodes, preprocessing)
+    final_simulator = task.make_simulator(1, preprocessing)
     observation_dim = reality.observation_spec["observation"].shape[-1]
     action_spec = reality.action_spec_unbatched
     action_dim = action_spec.shape[-1]
@@ -117,7 +127,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "replay": replay, "schedule": schedule}
     best = None
     if keeps_best(cfg):
-        best = BestPolicy(actor, task.make_simulator(cfg.eval_episodes, preprocessing), cfg.eval_episodes)
+        best = BestPolicy(actor, trials, cfg.eval_episodes)
         parts["policy"] = best.policy
     training = Training("H2O+", folder, budget, **parts)
     setup_s = time.perf_counter() - start
@@ -162,15 +172,17 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Results
     policy = actor if best is None else best.policy
+    settings = run_settings(cfg, real)
     in_reality = judge(
         task,
-        preprocessing,
+        final_reality,
+        final_simulator,
         {"H2O+": policy},
         {"H2O+": training},
-        behaviour_of(real, recorded=cfg.data == RECORDED),
+        behaviour,
         folder,
         episodes=cfg.final_episodes,
-        settings=run_settings(cfg, real),
+        settings=settings,
         wall_s=setup_s + training.progress["seconds"],
     )
     film = try_to_film(task, preprocessing, policy, folder) if cfg.render else None

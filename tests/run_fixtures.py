@@ -9,7 +9,6 @@ import pytest
 
 from tests.small_runs import ROBOT, ROOT, SMALL
 from torchrl_h2o.training.environments import measure_observation_norm, task_of
-from torchrl_h2o.training.real_data import read_real_data
 
 
 @pytest.fixture(scope="session")
@@ -37,7 +36,7 @@ def compose(cache, monkeypatch):
     def build(*overrides, config="h2o_plus"):
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
             cfg = hydra.compose(config, [*SMALL, *ROBOT, *overrides])
-        real = read_real_data(task_of(cfg), cfg.data, cfg.columns)
+        real = task_of(cfg).read_real_data(cfg.data, cfg.columns)
         measure_observation_norm(cfg, real)
         return cfg, real
 

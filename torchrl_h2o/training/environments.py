@@ -25,7 +25,7 @@ def preprocessing_of(cfg: DictConfig) -> Preprocessing:
     return Preprocessing(
         loc=None if norm is None else tuple(norm.loc),
         scale=None if norm is None else tuple(norm.scale),
-        frames=cfg.get("frames", 1),  # configurations of earlier versions have none
+        frames=cfg.get("frames", 1),  # configurations of earlier versions have no such entry
         reward_scale=cfg.reward_scale,
         reward_offset=cfg.reward_offset,
     )
@@ -33,9 +33,8 @@ def preprocessing_of(cfg: DictConfig) -> Preprocessing:
 
 def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:
     """Writes the real data's mean and standard deviation into the configuration, if the run normalises with them."""
-    if cfg.normalise_observation and cfg.observation_norm is None:
-        fitted = Preprocessing.fit(real, normalise=True)
-        cfg.observation_norm = {"loc": list(fitted.loc or ()), "scale": list(fitted.scale or ())}
+    fitted = Preprocessing.fit(real, normalise=cfg.normalise_observation, norm=cfg.observation_norm)
+    cfg.observation_norm = fitted.norm
 
 
 def make_reality(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:

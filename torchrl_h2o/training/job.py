@@ -11,10 +11,9 @@ from tqdm import tqdm
 from torchrl_h2o.training.collection import check_collector
 from torchrl_h2o.training.environments import measure_observation_norm, preprocessing_of, task_of
 from torchrl_h2o.training.film import try_to_film
-from torchrl_h2o.training.judging import judge, run_settings
+from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.loop import Method, train
-from torchrl_h2o.training.printout import table_of_run
-from torchrl_h2o.training.real_data import RECORDED, behaviour_of, read_real_data
+from torchrl_h2o.training.real_data import RECORDED, behaviour_of
 from torchrl_h2o.training.run_folder import save_config
 
 
@@ -38,7 +37,8 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
     task, preprocessing = task_of(cfg), preprocessing_of(cfg)
     in_reality = judge(
         task,
-        preprocessing,
+        task.make_reality(cfg.final_episodes, preprocessing),
+        task.make_simulator(1, preprocessing),
         policies,
         trainings,
         behaviour_of(real, recorded=cfg.data == RECORDED),
@@ -56,7 +56,7 @@ def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
     task = task_of(cfg)
     task.make_simulator()
     check_collector(cfg)
-    real = read_real_data(task, cfg.data, cfg.columns)
+    real = task.read_real_data(cfg.data, cfg.columns)
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)
     return real

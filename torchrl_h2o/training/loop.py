@@ -15,13 +15,12 @@ from torch.optim.lr_scheduler import LinearLR
 from torchrl.data import TensorSpec
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.training.best_policy import BestPolicy
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
-from torchrl_h2o.training.returns import evaluate
+from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import keeps_best
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,25 +29,42 @@ class Preprocessing:
     reward_offset: float = 0.0
 
     @classmethod
-    def fit(cls, real: TensorDictBase, *, normalise: bool = False, **options) -> Preprocessing:
+    def fit(
+        cls,
+        real: TensorDictBase,
+        *,
+        normalise: bool = False,
+        norm: Mapping[str, Sequence[float]] | None = None,
+        **options,
+    ) -> Preprocessing:
         """Takes mean and standard deviation of the observations from the real data.
 
         Args:
             real: the measured transitions, ``[T]``.
             normalise: whether observations are normalised.
+            norm: ``loc`` and ``scale`` to use instead of the data's own.
             **options: ``frames``, ``reward_scale`` and ``reward_offset``.
         """
+        if norm is not None:
+            return cls(tuple(norm["loc"]), tuple(norm["scale"]), **options)
         if not normalise:
             return cls(**options)
         observation = real["observation"]
         scale = observation.std(0).clamp_min(1e-6)
         return cls(tuple(observation.mean(0).tolist()), tuple(scale.tolist()), **options)
 
+    @property
+    def norm(self) -> dict[str, list[float]] | None:
+        """Mean and standard deviation as a configuration holds them; None without normalisation."""
+        if self.loc is None or self.scale is None:
+            return None
+        return {"loc": list(self.loc), "scale": list(self.scale)}
+
     def transforms(self) -> list[Transform]:
         """The transforms that show an environment's observations in this way."""
         chosen: list[Transform] = []
         if self.loc is not None:
-            chosen.append(ObservationNorm(**self._norm(), in_keys=["observation"], standard_normal=True))
+            chosen.append(ObservationNorm(**self._tensors(), in_keys=["observation"], standard_normal=True))
         if self.frames > 1:
             chosen.append(CatFrames(N=self.frames, dim=-1, in_keys=["observation"]))
         return chosen
@@ -57,7 +74,7 @@ class Preprocessing:
         real = real.copy()
         real["next"] = real["next"].copy().set("reward", self.reward(real["next", "reward"]))
         if self.loc is not None:
-            norm = self._norm()
+            norm = self._tensors()
             for part in (real, real["next"]):
                 part["observation"] = (part["observation"] - norm["loc"]) / norm["scale"]
         if self.frames > 1:
@@ -70,9 +87,5 @@ class Preprocessing:
         """The reward of the losses, from the task's own; reported returns are the task's own."""
         return self.reward_scale * (reward + self.reward_offset)
 
-    def _norm(self) -> dict[str, torch.Tensor]:
-        return {"loc": _tensor(self.loc), "scale": _tensor(self.scale)}
-
-
-def _tensor(values: Sequence[float] | None) -> torch.Tensor:
-    return torch.tensor(list(values or ()))
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        return {name: torch.tensor(values) for name, values in (self.norm or {}).items()}

@@ -4,25 +4,30 @@ import contextlib
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from hydra.utils import instantiate
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
 from torchrl_h2o import __version__
 from torchrl_h2o.data import DataError, check_specs, episodes, load, read_ted, write_ted
 from torchrl_h2o.envs import record
 from torchrl_h2o.training.returns import Evaluation
-from torchrl_h2o.training.task import Task
 
 RECORDED = "recorded"
 
 
-def read_real_data(task: Task, data: str, columns: str | None = None) -> TensorDictBase:
+def read_real_data(
+    config: Mapping[str, Any], reality: EnvBase, data: str, columns: str | None = None
+) -> TensorDictBase:
     """Reads real transitions in TED, ``[T]``, and checks them against the task.
 
     Args:
-        task: the task that they belong to.
+        config: the ``env`` section of a configuration, see :class:`~torchrl_h2o.training.task.Task`.
+        reality: one env of the task, with observations in their own units.
         data: ``"recorded"``, or what :func:`torchrl_h2o.data.load` reads: a data set's name, a file or a folder.
         columns: the YAML file that describes a log's columns; the task's own by default.
 
@@ -31,13 +36,12 @@ def read_real_data(task: Task, data: str, columns: str | None = None) -> TensorD
         torchrl_h2o.data.DataError: for data that cannot be read or do not fit the task.
     """
     if data == RECORDED:
-        return _recorded(task)
-    env = task.config
+        return _recorded(config, reality)
     if columns is None and is_log(data):
-        columns = env.get("columns")
-    reward = instantiate(env["reward"]) if "reward" in env else None
-    real = load(data, columns=columns, reward=reward, task=env["make"].get("env_name", task.name))
-    check_specs(real, task.make_reality(), source=data)
+        columns = config.get("columns")
+    reward = instantiate(config["reward"]) if "reward" in config else None
+    real = load(data, columns=columns, reward=reward, task=config["make"].get("env_name", config["name"]))
+    check_specs(real, reality, source=data)
     return real
 
 
@@ -46,17 +50,17 @@ def is_log(data: str) -> bool:
     return Path(data).is_file() and Path(data).suffix not in (".hdf5", ".h5")
 
 
-def _recorded(task: Task) -> TensorDictBase:
-    if "behaviour" not in task.config:
+def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
+    if "behaviour" not in config:
         raise ValueError(
-            f"data=recorded needs a controller to record, and {task.name} has none: name a data set, "
+            f"data=recorded needs a controller to record, and {config['name']} has none: name a data set, "
             "such as data=halfcheetah/medium-replay-v0"
         )
-    made_of = [task.config[key] for key in ("make", "reality", "behaviour", "recording")]
+    made_of = [config[key] for key in ("make", "reality", "behaviour", "recording")]
     digest = hashlib.sha256(json.dumps([made_of, __version__], sort_keys=True).encode()).hexdigest()[:12]
-    folder = _cache() / f"{task.name}_{digest}"
+    folder = _cache() / f"{config['name']}_{digest}"
     if not folder.exists():
-        data = record(task.make_reality(), instantiate(task.config["behaviour"]), **task.config["recording"])
+        data = record(reality, instantiate(config["behaviour"]), **config["recording"])
         with contextlib.suppress(DataError):  # another run may have written the folder in the meantime
             write_ted(data, folder)
     return read_ted(folder)

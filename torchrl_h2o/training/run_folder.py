@@ -1,17 +1,13 @@
-"""The folder of a run: its configuration, its lock, and the versions that made its files."""
+"""The folder of a run: its configuration and its lock."""
 
 from __future__ import annotations
 
-import json
 import os
-import shlex
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -19,8 +15,6 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
-
-PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 
 KEEP = ("last", "best_in_simulator")
 
@@ -150,24 +144,3 @@ def keeps_best(cfg: DictConfig) -> bool:
 def checkpoint_folder(directory: str | Path, name: str) -> Path:
     """The folder of a method's checkpoints."""
     return Path(directory) / "checkpoints" / name.lower().replace(" ", "_")
-
-
-def write_summary(directory: Path, summary: dict) -> None:
-    """Writes summary.json, with the versions and the command that made it."""
-    summary = summary | {
-        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
-        "command": shlex.join(["python", *sys.argv]),
-    }
-    (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-
-
-def _commit() -> dict[str, str]:
-    """The commit of the library, if it runs from a repository. Changed result files do not count as changes."""
-    git = ["git", "-C", str(Path(__file__).parent)]
-    try:
-        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return {}
-    unchanged = [*git, "diff", "--quiet", "HEAD", "--", ":/", ":(exclude,top)recipes/results"]
-    dirty = "-dirty" * (subprocess.run(unchanged, check=False).returncode != 0)
-    return {"commit": commit.stdout.strip() + dirty}

@@ -8,12 +8,14 @@ from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 
 from torchrl_h2o.effects import Effect, paper_gap
 from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.real_data import read_real_data
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,10 @@ class Task:
     ) -> EnvBase:
         """Builds an environment with the simulator's dynamics P̂; arguments as for :meth:`make_reality`."""
         return self._make(self.simulator, num_worlds, preprocessing, kwargs)
+
+    def read_real_data(self, data: str, columns: str | None = None) -> TensorDictBase:
+        """Reads the real transitions, ``[T]``; see :func:`~torchrl_h2o.training.real_data.read_real_data`."""
+        return read_real_data(self.config, self.make_reality(), data, columns)
 
     def _make(
         self, effects: tuple[Effect, ...], num_worlds: int | None, preprocessing: Preprocessing | None, kwargs: dict

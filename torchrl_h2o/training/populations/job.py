@@ -8,10 +8,9 @@ from tqdm import tqdm
 
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.job import prepare
-from torchrl_h2o.training.judging import DATA, judge, run_settings, write_failure
+from torchrl_h2o.training.judging import DATA, judge, run_settings, table_of_population, write_failure
 from torchrl_h2o.training.methods.h2o_plus import make_learner
 from torchrl_h2o.training.populations.loop import members_of, train_population
-from torchrl_h2o.training.printout import table_of_population
 from torchrl_h2o.training.real_data import RECORDED, behaviour_of
 
 
@@ -34,14 +33,15 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
     in_reality = {}
     for name, outcome in outcomes.items():
         own, folder = members[name], directory / name
-        settings = run_settings(own, real)
+        settings, task, preprocessing = run_settings(own, real), task_of(own), preprocessing_of(own)
         if outcome.failure is not None:
             write_failure(folder, outcome.failure, settings)
             in_reality[name] = None
             continue
         in_reality[name] = judge(
-            task_of(own),
-            preprocessing_of(own),
+            task,
+            task.make_reality(own.final_episodes, preprocessing),
+            task.make_simulator(1, preprocessing),
             {"H2O+": outcome.policy},
             {"H2O+": outcome},
             behaviour,
