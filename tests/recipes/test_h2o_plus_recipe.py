@@ -11,7 +11,7 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
-from torchrl_h2o.commands.evaluate import load_policy
+from torchrl_h2o.training.trained_policy import load_policy
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.training.environments import make_simulator
 from torchrl_h2o.training.loop import train
