@@ -14,7 +14,6 @@ from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_h2o.commands.evaluate import load_policy
 from torchrl_h2o.comparison.results_file import IDENTITY, identity
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
@@ -22,6 +21,7 @@ from torchrl_h2o.training.environments import as_observed, make_reality, task_of
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import SEED
 from torchrl_h2o.training.run_folder import checkpoint_folder, load_config
+from torchrl_h2o.training.trained_policy import load_policy
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
 EVERY = 0.2  # s
