@@ -33,7 +33,7 @@ def compose(cache, monkeypatch):
     """The configuration and the real data of a small run of the robot's."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
 
-    def build(*overrides, config="h2o_plus"):
+    def build(*overrides, config="train"):
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
             cfg = hydra.compose(config, [*SMALL, *ROBOT, *overrides])
         real = task_of(cfg).read_real_data(cfg.data, cfg.columns)
