@@ -154,7 +154,7 @@ def test_the_exploration_term_can_be_swapped(parts, batch):
     loss.load_state_dict(base.state_dict())
     difference = loss.mixed_target(batch) - base.mixed_target(batch)
     alive = ~batch["next", "terminated"].squeeze(-1)
-    action, _ = loss._sample_action(batch["next"])
+    action, _ = loss.sample_action(batch["next"])
     expected = 0.99 * novelty(batch["next", "observation"], action).squeeze(-1) * alive
     torch.testing.assert_close(difference, expected)
 
@@ -169,7 +169,7 @@ def test_only_the_q_network_gets_a_gradient(parts, batch):
 def test_td_error_is_written_for_prioritised_replay(parts, batch):
     loss = parts.bellman()
     loss(batch)
-    error = loss._qvalues(batch, loss.qvalue_network_params) - loss.mixed_target(batch)
+    error = loss.qvalues(batch, loss.qvalue_network_params) - loss.mixed_target(batch)
     torch.testing.assert_close(batch["td_error"], error.detach().abs().amax(0))
 
 

@@ -54,7 +54,7 @@ def test_the_bellman_terms_are_those_of_equation_1(parts, batch):
     loss = h2o(parts, exploration=NO_BONUS)
     batch = weighted(parts, batch)
     torch.manual_seed(5)
-    next_action, _ = loss.loss._sample_action(batch["next"])
+    next_action, _ = loss.loss.sample_action(batch["next"])
     targets = [reference.layers(loss.target_qvalue_network_params, member) for member in range(2)]
     errors = {True: [], False: []}
     for row, action, ratio in zip(
@@ -141,7 +141,7 @@ def test_the_term_moves_q_alone_down_in_the_simulator_and_up_on_the_data(parts, 
 
 
 def q_of_streams(loss, batch):
-    qvalues = loss.loss._qvalues(batch, loss.qvalue_network_params).mean(0)
+    qvalues = loss.loss.qvalues(batch, loss.qvalue_network_params).mean(0)
     return qvalues[batch["real"]].mean().item(), qvalues[~batch["real"]].mean().item()
 
 

@@ -52,7 +52,7 @@ def test_no_tensor_stands_twice_in_the_state_dict(parts):
 def test_actor_and_alpha_losses_are_equation_10(parts, batch):
     loss = parts.h2o_plus(alpha_init=0.3)
     torch.manual_seed(4)
-    action, log_prob = loss._sample_action(batch)
+    action, log_prob = loss.sample_action(batch)
     actor = reference.layers(loss.actor_network_params)
     qvalues = [reference.layers(loss.qvalue_network_params, member) for member in range(2)]
     terms, entropies = {True: [], False: []}, {True: [], False: []}
