@@ -47,7 +47,7 @@ class DynamicsGap(Transform):
     Raises:
         TypeError: if one of them is not an effect.
         ValueError: when put on an env that is batched, does not run on MuJoCo, had another gap, or
-            whose model has nothing that one of the effects could act on, or that has less noise than
+            whose model has no element that one of the effects could act on, or that has less noise than
             one of them takes away; or, with action or
             observation effects, after transforms of other kinds.
 
@@ -198,7 +198,7 @@ def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:
         >>> print(model.geom("torso").size[1], "m,", model.body_mass.sum().round(6), "kg")
         2.0 m, 14.0 kg
 
-    Source: H2O+ (arXiv 2309.12716), simulation experiments.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, simulation experiments.
     """
     return DynamicsGap(paper_gap(name, strength))
 

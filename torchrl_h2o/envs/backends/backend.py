@@ -90,7 +90,7 @@ class MujocoBackend(ABC):
                 Action and observation effects are passed over.
 
         Raises:
-            ValueError: if the model has nothing that an effect could act on, or has a gap in it that
+            ValueError: if the model has no element that an effect could act on, or has a gap in it that
                 the env has not. Nothing is changed.
         """
         applied = self.gaps

@@ -65,7 +65,7 @@ def reward(task: str, observation: Array, action: Array, next_observation: Array
         >>> float(reward("standing_still", upright, np.array([2.0]), pushed))
         24.99
 
-    Source: H2O+ (arXiv 2309.12716), section on the real-world experiments.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, section on the real-world experiments.
     """
     effort = (action * action).sum(-1)
     if task == "standing_still":
