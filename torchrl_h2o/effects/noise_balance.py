@@ -36,7 +36,7 @@ def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTIN
         >>> balanced([ActionNoise(-0.6), ActionNoise(1.0)])
         Traceback (most recent call last):
         ...
-        ValueError: noise of standard deviation 0.6 taken off all actuators: the effects before it add one of 0 on
+        ValueError: noise of standard deviation 0.6 taken off all actuators: the effects before it add only 0 on
         exactly these actuators; put it behind an ActionNoise that is at least as large, with the same actuators
     """
     settled = list(effects)
@@ -53,7 +53,7 @@ def _without(negative: ActionNoise, before: Sequence[Effect], settings: EffectSe
     taken = negative.std**2
     if taken > (1.0 + settings.noise_excess) * there:
         raise ValueError(
-            f"{negative.describe()}: the effects before it add one of {sqrt(there):g} on exactly these actuators; "
+            f"{negative.describe()}: the effects before it add only {sqrt(there):g} on exactly these actuators; "
             "put it behind an ActionNoise that is at least as large, with the same actuators"
         )
     left = 1.0 - taken / there

@@ -129,5 +129,5 @@ def those_with(attribute: str, joints: list) -> list:
 def added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
     """Returns the sum of value and addend; raises ValueError if it is negative."""
     if value + addend < 0.0:
-        raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, {-addend:g} cannot be taken away")
+        raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, {-addend:g} cannot be removed")
     return value + addend
