@@ -64,7 +64,7 @@ def test_noise_is_measured_where_it_is_added_whatever_follows():
 
 def test_a_fit_that_is_a_little_too_large_takes_all():
     assert stds(ActionNoise(2.0), ActionNoise(-2.0 * np.sqrt(1.009))) == [0.0, 0.0]
-    with pytest.raises(ValueError, match="add one of 2 on exactly"):
+    with pytest.raises(ValueError, match="add only 2 on exactly"):
         balanced([ActionNoise(2.0), ActionNoise(-2.0 * np.sqrt(1.011))])
 
 
@@ -81,7 +81,7 @@ def test_a_fit_that_is_a_little_too_large_takes_all():
     ],
 )
 def test_noise_that_is_not_there_cannot_be_taken_away(effects):
-    with pytest.raises(ValueError, match=r"taken off .*: the effects before it add one of .*; put it behind"):
+    with pytest.raises(ValueError, match=r"taken off .*: the effects before it add only .*; put it behind"):
         balanced(effects)
 
 

@@ -1,7 +1,7 @@
-"""What can differ between two dynamics: effects, each one physical cause with units and bounds.
+"""Effects: named physical causes by which two dynamics differ, with units and bounds.
 
-Needs mujoco and numpy, no torch. Effects compose: the model is edited in the effects' order and then
-compiled once, actions and observations pass through their effects in order, forces are summed.
+Requires mujoco and numpy, but not torch. Effects compose: the model is edited in the effects' order and then compiled
+once, actions and observations pass through their effects in order, and forces are summed.
 """
 
 from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation

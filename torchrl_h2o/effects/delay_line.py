@@ -1,4 +1,4 @@
-"""A delay by any number of steps, also a fraction of one: step by step, or of a whole run at once."""
+"""Delays a signal by any number of steps, fractions included: step by step, or a whole run at once."""
 
 from collections import deque
 from collections.abc import Callable
@@ -7,12 +7,12 @@ import numpy as np
 
 
 def delay_line(steps: float, before: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
-    """A function that returns what it was given some steps ago.
+    """Returns a function that delays its argument by a number of calls.
 
     Args:
         steps: the delay k + f, in steps; the fraction f mixes two neighbours, (1 - f) · v(t - k) +
             f · v(t - k - 1).
-        before: from the first value to the one that the line holds before it.
+        before: returns, from the first value, the value to assume before it.
 
     Returns:
         A function from a value (n,) to the delayed one, a new array.
@@ -30,12 +30,12 @@ def delay_line(steps: float, before: Callable[[np.ndarray], np.ndarray]) -> Call
 
 
 def delayed(values: np.ndarray, steps: float, before: np.ndarray) -> np.ndarray:
-    """A whole run, delayed as by :func:`delay_line`.
+    """Delays a whole run, as :func:`delay_line` does step by step.
 
     Args:
         values: the run (T, n).
         steps: the delay, in steps.
-        before: what the line holds before the first value, (n,).
+        before: the value to assume before the first one, (n,).
 
     Returns:
         The delayed run (T, n), a new array.
@@ -47,14 +47,14 @@ def delayed(values: np.ndarray, steps: float, before: np.ndarray) -> np.ndarray:
 
 
 def advanced(values: np.ndarray, steps: float) -> np.ndarray:
-    """A whole run, as it was before a delay: interpolated ahead, NaN where the run has ended.
+    """Undoes the delay of a whole run by interpolating ahead; NaN beyond the end of the run.
 
     Args:
         values: the delayed run (T, n).
         steps: the delay, in steps.
 
     Returns:
-        The run (T, n), a new array. Exact for whole steps, and for what changes evenly.
+        The run (T, n), a new array. Exact for delays of whole steps and for signals that are linear in time.
     """
     whole, fraction = divmod(steps, 1.0)
     ended = np.full((int(whole) + 1, *values.shape[1:]), np.nan)

@@ -1,7 +1,7 @@
-"""What an effect is: one named physical cause by which two dynamics differ.
+"""Base classes of effects: named physical causes by which two dynamics differ.
 
-An effect is a frozen dataclass. Its parameters carry a unit, bounds and a neutral value; what it
-touches is one of four kinds: the model, the actions, the forces or the observations.
+An effect is a frozen dataclass whose parameters have a unit, bounds and a neutral value. It acts on one of four
+things: the model, the actions, the forces or the observations.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from torchrl_h2o.effects.indices import Indices, checked_indices
 from torchrl_h2o.effects.parameter import Parameter
 from torchrl_h2o.effects.selection import Names, checked_names
 
-# by the types of the fields, as types and as text under ``from __future__ import annotations``
+# keyed by the fields' types, both as types and as the strings of ``from __future__ import annotations``
 _SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_indices, "Indices": checked_indices}
 
 EntryNames = Mapping[str, Sequence[str]]
@@ -32,14 +32,14 @@ BatchedForce = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.nda
 class Effect(ABC):
     """Base of all effects. Subclass one of the four kinds below, not this class.
 
-    A subclass is a frozen dataclass: fields made by :func:`parameter` are its parameters, all other
-    fields say what it acts on, name patterns (``Names``) or indices (``Indices``). ``wording`` is
-    what it does in words, with the fields' names in braces. ``random`` is whether it draws from the
-    generator that it is given.
+    A subclass is a frozen dataclass. Fields made by :func:`parameter` are its parameters; all other fields select what
+    it acts on, by name patterns (``Names``) or indices (``Indices``). The class attribute ``wording`` describes the
+    effect, with the fields' names in braces. ``random`` marks effects that draw from the generator that
+    :meth:`process` receives.
 
     Raises:
-        ValueError: if a parameter is not a number within its bounds, or a field of type ``Names`` or
-            ``Indices`` selects nothing.
+        ValueError: for a parameter that is not a number within its bounds, or a field of type ``Names`` or
+            ``Indices`` with an invalid selection.
 
     Examples:
         >>> from torchrl_h2o.effects import Gravity
@@ -64,7 +64,7 @@ class Effect(ABC):
             elif field.type in _SELECTIONS:
                 value = self._selected(field, value)
             elif isinstance(value, Iterable) and not isinstance(value, str):
-                value = tuple(value)  # a list from a configuration file must stay hashable
+                value = tuple(value)  # a list, as from a configuration file, would make the effect unhashable
             object.__setattr__(self, field.name, value)
 
     def _checked(self, name: str, value: float, low: float, high: float) -> float:
@@ -74,7 +74,7 @@ class Effect(ABC):
             raise ValueError(
                 f"{type(self).__name__}: {name} = {value!r} is not a number; choose one in [{low:g}, {high:g}]"
             ) from None
-        if not low <= value <= high:  # so written, a NaN is caught too
+        if not low <= value <= high:  # this form also rejects NaN
             raise ValueError(
                 f"{type(self).__name__}: {name} = {value:g} lies outside its bounds "
                 f"[{low:g}, {high:g}]; choose a value within them"
@@ -98,11 +98,11 @@ class Effect(ABC):
 
     @property
     def is_neutral(self) -> bool:
-        """Whether every parameter stands at its neutral value."""
+        """Whether every parameter has its neutral value, so that the effect changes nothing."""
         return all(p.value == p.neutral for p in self.parameters.values())
 
     def with_parameters(self, values: Mapping[str, float]) -> "Effect":
-        """The effect with other values of its parameters, some or all, by name.
+        """Returns the effect with other values for some or all of its parameters, by name.
 
         Raises:
             ValueError: if a value is not a number within the parameter's bounds.
@@ -110,10 +110,10 @@ class Effect(ABC):
         return dataclasses.replace(self, **values)
 
     def describe(self, names: EntryNames = NO_NAMES) -> str:
-        """What the effect does, in words with units.
+        """Describes the effect in words with units.
 
         Args:
-            names: what a simulator calls the entries chosen by index, by field (``"actuators"``, ``"entries"``).
+            names: names for the entries that are selected by index, by field (``"actuators"``, ``"entries"``).
 
         Examples:
             >>> from torchrl_h2o.effects import ActionGain
@@ -130,7 +130,7 @@ class Effect(ABC):
 
 
 def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> str:
-    """``joints`` and ``"*"`` become "all joints", ``actuators`` and ``(0, 2)`` "actuators 0, 2", or their names."""
+    """Words for a selection: "all joints" for ``"*"``; "actuators 0, 2" for ``(0, 2)``, or the names of these."""
     if chosen is None or chosen == "*":
         return f"all {field}"
     chosen = (chosen,) if isinstance(chosen, str) else chosen
@@ -138,26 +138,26 @@ def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> s
 
 
 class ModelEffect(Effect):
-    """An effect that lies in the model: masses, geometry, joints, contacts, gravity."""
+    """An effect on the model: masses, geometry, joints, contacts, gravity."""
 
     @abstractmethod
     def edit(self, spec: mujoco.MjSpec) -> None:
         """Edits the model's specification in place.
 
         Args:
-            spec: the specification, as parsed from the model's own file. It is compiled after the
-                last edit, so that masses and inertias follow from the geometry.
+            spec: the specification, as parsed from the model's own file. It is compiled after the last edit, so that
+                masses and inertias follow from the geometry.
 
         Raises:
-            ValueError: if the model has nothing that the effect could act on.
+            ValueError: if the model has no element that the effect could act on.
         """
 
 
 class ActionEffect(Effect):
-    """An effect on the way in: what the simulator executes of the action asked for.
+    """An effect on the actions: how the executed action differs from the commanded one.
 
-    ``memoryless`` is whether an action executed depends on nothing but the one asked for at the same
-    step, so that :meth:`process` may be given many steps at once.
+    ``memoryless`` marks effects whose executed action depends only on the action commanded in the same step. Their
+    process accepts many steps at once.
     """
 
     memoryless: ClassVar[bool] = False
@@ -171,20 +171,20 @@ class ActionEffect(Effect):
             rng: the episode's random generator, shared by its random effects.
 
         Returns:
-            A function from the action asked for to the action executed, both (..., nu), called
-            once a control step. What it must remember, it keeps to itself: the effect stays frozen.
+            A function from the commanded to the executed action, both (..., nu), called once per control step. It
+            holds the state of the episode, because the effect itself is frozen.
         """
 
     def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
-        """What becomes of the actions of one whole run, as :meth:`process` makes it step by step.
+        """Alters the actions of one whole run, with the same result as :meth:`process` step by step.
 
         Args:
-            actions: the actions asked for (T, nu), from the start of the run.
+            actions: the commanded actions (T, nu), from the start of the run.
             dt: the control step, in seconds.
             rng: the run's random generator.
 
         Returns:
-            The actions executed (T, nu), a new array.
+            The executed actions (T, nu), a new array.
         """
         process = self.process(dt, rng)
         if self.memoryless:
@@ -195,41 +195,41 @@ class ActionEffect(Effect):
 class ForceEffect(Effect):
     """An effect that is a generalised force, a function of state, action and time.
 
-    Forces act anew at every physics step. What steps many states at once must therefore step under
-    forces by one physics step at a time.
+    The force is evaluated anew at every physics step, so a simulator that steps many states at once must advance by
+    one physics step at a time.
     """
 
     @abstractmethod
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
-        """Returns the function that is the force of one episode.
+        """Returns the force of one episode as a function of the state.
 
         Args:
-            model: the model in use, in which names are found once, here.
+            model: the model in use; names are resolved once, in this call.
             rng: the episode's random generator, shared by its random effects.
 
         Returns:
-            A function from the state before a physics step (``qpos``, ``qvel``, ``ctrl``, ``time``,
-            with the bodies' positions and velocities up to date; read only) to the forces in N and
-            torques in N·m on every degree of freedom, (nv,), which are not written to. What it must
-            remember, it keeps to itself: the effect stays frozen.
+            A function from the state before a physics step (``qpos``, ``qvel``, ``ctrl``, ``time``, with the bodies'
+            positions and velocities up to date; read only) to the forces in N and torques in N·m on every degree of
+            freedom, (nv,), which the caller does not write to. It holds the state of the episode, because the effect
+            itself is frozen.
 
         Raises:
-            ValueError: if the model has nothing that the effect could act on.
+            ValueError: if the model has no element that the effect could act on.
         """
 
     def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
-        """Returns the force in many states at once, for an effect that remembers nothing.
+        """Returns the force as a function of many states, for an effect without memory.
 
         Args:
             model: the model in use.
             rng: the random generator of a random effect.
 
         Returns:
-            A function of ``qpos`` (B, nq), ``qvel`` (B, nv), ``ctrl`` (B, nu) and ``time`` (B,) to the
-            generalised forces (B, nv), which are not written to.
+            A function from ``qpos`` (B, nq), ``qvel`` (B, nv), ``ctrl`` (B, nu) and ``time`` (B,) to the generalised
+            forces (B, nv), which the caller does not write to.
 
         Raises:
-            ValueError: if the model has nothing that the effect could act on.
+            ValueError: if the model has no element that the effect could act on.
         """
         force, data = self.process(model, rng or np.random.default_rng()), mujoco.MjData(model)
 
@@ -247,10 +247,10 @@ class ForceEffect(Effect):
 
 
 class ObservationEffect(Effect):
-    """An effect on the way out: what is observed of the simulator's state.
+    """An effect on the observations: how the reported observation differs from the true one.
 
-    ``memoryless`` is whether an observation reported depends on nothing but the true one at the same time, so that one
-    process can alter any number of observations at once, (..., n).
+    ``memoryless`` marks effects whose reported observation depends only on the true one at the same time. Their
+    process accepts any number of observations at once, (..., n).
     """
 
     memoryless: ClassVar[bool] = False
@@ -264,19 +264,19 @@ class ObservationEffect(Effect):
             rng: the episode's random generator, shared by its random effects.
 
         Returns:
-            A function from the true observation to the one reported, both (..., n), called at the
-            reset and after every control step.
+            A function from the true to the reported observation, both (..., n), called at the reset and after every
+            control step.
         """
 
     def restore(self, observations: np.ndarray, dt: float) -> np.ndarray:
-        """The best guess of what was true, from what was reported in one whole run.
+        """Estimates the true observations from the reported ones of one whole run.
 
         Args:
-            observations: the observations reported (T, n), from the start of the run.
+            observations: the reported observations (T, n), from the start of the run.
             dt: the control step, in seconds.
 
         Returns:
-            The observations without the effect (T, n), a new array: by default those reported, NaN
-            where nothing is known.
+            The observations without the effect (T, n), a new array, with NaN where they are unknown. The default
+            returns the reported observations.
         """
         return np.array(observations, dtype=float)

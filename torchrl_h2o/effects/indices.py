@@ -9,7 +9,7 @@ Indices = tuple[int, ...] | None
 
 
 def checked_indices(value: Any) -> Indices:
-    """None or a tuple of at least one index, made of a bare one too; raises ValueError for others."""
+    """Converts an index or several to a tuple, keeps None; raises ValueError for anything else."""
     if value is None:
         return None
     indices = tuple(value) if isinstance(value, Iterable) else (value,)
@@ -19,17 +19,17 @@ def checked_indices(value: Any) -> Indices:
 
 
 def entry_mask(vector: np.ndarray, indices: Indices) -> np.ndarray:
-    """Marks the chosen entries of the last dimension.
+    """Returns a mask of the chosen entries of the last dimension.
 
     Args:
         vector: an action or an observation, (..., n).
         indices: the chosen entries, None for all.
 
     Returns:
-        A mask, (n,).
+        A boolean mask, (n,).
 
     Raises:
-        ValueError: if the vector has no such entry.
+        ValueError: if an index exceeds the size of the vector.
     """
     size = vector.shape[-1]
     if indices is None:

@@ -1,6 +1,7 @@
-"""Settles noise that is taken away against the noise before it.
+"""Settles negative action noise against the noise of the effects before it.
 
-No process can undo what another one drew; so negative noise is never executed, the noise before it is made smaller.
+Negative noise cannot be executed, because no process can undo the random numbers of another. The noise before it is
+reduced instead.
 """
 
 from collections.abc import Sequence
@@ -12,21 +13,21 @@ from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
 
 
 def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTINGS) -> tuple[Effect, ...]:
-    """The effects as they are executed: negative noise made neutral, the noise before it smaller by its variance.
+    """Returns the effects with negative noise made neutral and the noise before it reduced by the same variance.
 
-    Noise is taken off effects that are on the very same actuators. Several of them shrink in proportion. It is
-    measured where it is added: what other effects make of it on its way, such as a gain, does not count.
+    Only noise on exactly the same actuators is reduced; several such effects are reduced in proportion. Variances are
+    compared where the noise is added: later effects on the action, such as a gain, do not enter.
 
     Args:
         effects: all effects of a simulator, in their order.
         settings: the tolerance for negative noise that exceeds the noise before it.
 
     Returns:
-        As many effects in the same order, and the very same where there is no negative noise.
+        The same number of effects in the same order; identical objects where there is no negative noise.
 
     Raises:
-        ValueError: if noise is to be taken away where the effects before it do not add as much. Up to 1 % of
-            the variance too much is taken for all of it.
+        ValueError: if negative noise exceeds the noise before it by more than ``settings.noise_excess``. A smaller
+            excess removes all of the noise.
 
     Examples:
         >>> from torchrl_h2o.effects import ActionNoise
@@ -35,7 +36,7 @@ def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTIN
         >>> balanced([ActionNoise(-0.6), ActionNoise(1.0)])
         Traceback (most recent call last):
         ...
-        ValueError: noise of standard deviation 0.6 taken off all actuators: the effects before it add one of 0 on
+        ValueError: noise of standard deviation 0.6 taken off all actuators: the effects before it add only 0 on
         exactly these actuators; put it behind an ActionNoise that is at least as large, with the same actuators
     """
     settled = list(effects)
@@ -47,12 +48,12 @@ def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTIN
 
 
 def _without(negative: ActionNoise, before: Sequence[Effect], settings: EffectSettings) -> list[Effect]:
-    """The effects before negative noise, without the variance that it takes away."""
+    """Returns the effects before negative noise, reduced by its variance."""
     there = sum(effect.std**2 for effect in before if _same_actuators(effect, negative))
     taken = negative.std**2
     if taken > (1.0 + settings.noise_excess) * there:
         raise ValueError(
-            f"{negative.describe()}: the effects before it add one of {sqrt(there):g} on exactly these actuators; "
+            f"{negative.describe()}: the effects before it add only {sqrt(there):g} on exactly these actuators; "
             "put it behind an ActionNoise that is at least as large, with the same actuators"
         )
     left = 1.0 - taken / there
@@ -64,5 +65,5 @@ def _without(negative: ActionNoise, before: Sequence[Effect], settings: EffectSe
 
 
 def _same_actuators(effect: Effect, noise: ActionNoise) -> bool:
-    # None, for all actuators, selects none by index
+    # None stands for all actuators and compares as the empty set
     return isinstance(effect, ActionNoise) and set(effect.actuators or ()) == set(noise.actuators or ())

@@ -1,6 +1,7 @@
-"""The nine dynamics gaps of the H2O+ paper, by name: one table.
+"""The nine dynamics gaps of the H2O+ paper, as a table by name.
 
-Source: H2O+ (arXiv 2309.12716), simulation experiments, and the strengths of the authors' published code.
+Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, simulation experiments; the strengths are those of the
+authors' published code.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,9 +21,9 @@ class PaperGap:
     """One of the paper's gaps.
 
     Args:
-        effect: makes the effect from a strength, the value of the effect's first parameter.
+        effect: builds the effect from a strength, the value of the effect's first parameter.
         strength: the paper's strength.
-        tasks: the tasks that the paper has it in.
+        tasks: the tasks in which the paper uses the gap.
     """
 
     effect: Callable[[float], Effect]
@@ -30,7 +31,7 @@ class PaperGap:
     tasks: tuple[str, ...] = ("HalfCheetah", "Walker2d")
 
 
-# "*thigh*/*" are the joints of the thigh bodies, whatever the joints themselves are called.
+# "*thigh*/*" selects the joints of the thigh bodies by the body's name, because joint names differ between tasks.
 PAPER_GAPS: Mapping[str, PaperGap] = MappingProxyType(
     {
         "gravity": PaperGap(Gravity, 2.0),
@@ -47,22 +48,21 @@ PAPER_GAPS: Mapping[str, PaperGap] = MappingProxyType(
 
 
 def paper_gap(name: str, strength: float | None = None) -> Effect:
-    """The effect of one of the paper's gaps.
+    """Builds the effect of one of the paper's gaps.
 
-    The changes are those of the authors' text edit of the task's MJCF, but for one accident of it:
-    in Walker2d their edit of ``range`` also hits the ``ctrlrange`` of the thighs' motors, where
-    this changes the joints' range alone.
+    The changes equal the authors' text edit of the task's MJCF with one exception: in Walker2d their edit of ``range``
+    also changes the ``ctrlrange`` of the thighs' motors, whereas this effect changes only the joints' range.
 
     Args:
         name: ``gravity``, ``friction``, ``joint_noise``, ``big_thigh``, ``small_thigh``,
             ``broken_thigh``, ``flexible_thigh``, ``long_torso`` or ``soft_feet``.
-        strength: the factor, or for ``joint_noise`` the standard deviation. The paper's by default.
+        strength: the factor, or for ``joint_noise`` the standard deviation; the paper's value by default.
 
     Returns:
         The effect.
 
     Raises:
-        ValueError: if there is no such gap, or the strength is out of the effect's bounds.
+        ValueError: for an unknown gap or a strength outside the effect's bounds.
 
     Examples:
         >>> paper_gap("gravity").describe(), paper_gap("gravity", 1.5).describe()

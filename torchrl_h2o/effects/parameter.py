@@ -1,4 +1,4 @@
-"""What a parameter of an effect is: a value with a unit, bounds and the value that changes nothing."""
+"""Parameters of effects: a value with its unit, its bounds and its neutral value."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect, with what a fit or a reader needs to know of it.
+    """A parameter of an effect.
 
     Args:
-        value: the value, in ``unit``.
+        value: the value, in units of ``unit``.
         unit: the unit, ``"1"`` for a pure number.
-        bounds: the smallest and the largest legal value, both inclusive.
+        bounds: the smallest and the largest allowed value, both inclusive.
         neutral: the value at which the effect changes nothing.
     """
 
@@ -26,11 +26,11 @@ class Parameter:
 
 
 def parameter(*, unit: str, bounds: tuple[float, float], neutral: float) -> Any:
-    """A dataclass field that is a parameter of an effect; its default is the neutral value.
+    """Declares a dataclass field as a parameter of an effect; its default is the neutral value.
 
     Args:
         unit: the unit, ``"1"`` for a pure number.
-        bounds: the smallest and the largest legal value, both inclusive.
+        bounds: the smallest and the largest allowed value, both inclusive.
         neutral: the value at which the effect changes nothing.
 
     Returns:

@@ -1,8 +1,8 @@
 """Selects the bodies, joints and geoms of a model that an effect acts on, by name patterns.
 
-A pattern is a shell pattern on the element's name: ``"*thigh*"``. With a slash, ``"*thigh*/*"``, it
-is one on ``body/name``: every element of the bodies so named. ``"*"`` selects all. What is the name
-of an element is no pattern: ``"j[0]"`` selects the joint of that name.
+A pattern is a shell pattern on the element's name: ``"*thigh*"``. A pattern with a slash, ``"*thigh*/*"``, is matched
+against ``body/name`` and selects elements by their body. ``"*"`` selects all. A pattern that equals an element's name
+selects that element literally: ``"j[0]"`` selects the joint of that name.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,7 @@ Names = str | tuple[str, ...]
 
 
 def checked_names(value: Any) -> Names:
-    """One name pattern or a tuple of at least one; raises ValueError for anything else."""
+    """Returns one name pattern, or several as a tuple; raises ValueError for anything else."""
     if isinstance(value, str) and value:
         return value
     if isinstance(value, Iterable):
@@ -26,23 +26,23 @@ def checked_names(value: Any) -> Names:
 
 
 def joints(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsJoint]:
-    """The joints of a specification that match; raises ValueError where a pattern matches none."""
+    """Returns the matching joints of a specification; raises ValueError if a pattern matches none."""
     return [spec.joints[i] for i in matching(_paths(spec.joints), patterns, "joint")]
 
 
 def geoms(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsGeom]:
-    """The geoms of a specification that match; raises ValueError where a pattern matches none."""
+    """Returns the matching geoms of a specification; raises ValueError if a pattern matches none."""
     return [spec.geoms[i] for i in matching(_paths(spec.geoms), patterns, "geom")]
 
 
 def bodies(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsBody]:
-    """The bodies but the world that match; raises ValueError where a pattern matches none."""
+    """Returns the matching bodies except the world; raises ValueError if a pattern matches none."""
     moving = spec.bodies[1:]
     return [moving[i] for i in matching(_paths(moving), patterns, "body")]
 
 
 def joint_dofs(model: mujoco.MjModel, patterns: Names) -> list[int]:
-    """The degrees of freedom of a compiled model's joints that match."""
+    """Returns the degrees of freedom of the matching joints of a compiled model."""
     views = [model.joint(i) for i in range(model.njnt)]
     paths = [(model.body(model.jnt_bodyid[joint.id]).name, joint.name) for joint in views]
     chosen = matching(paths, patterns, "joint")
@@ -50,7 +50,7 @@ def joint_dofs(model: mujoco.MjModel, patterns: Names) -> list[int]:
 
 
 def body_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:
-    """The ids of a compiled model's bodies, but the world, that match."""
+    """Returns the ids of the matching bodies of a compiled model, except the world."""
     views = [model.body(i) for i in range(1, model.nbody)]
     paths = [(model.body(view.parentid[0]).name, view.name) for view in views]
     return [1 + i for i in matching(paths, patterns, "body")]
@@ -61,7 +61,16 @@ def _paths(elements: Sequence) -> list[tuple[str, str]]:
 
 
 def matching(paths: Sequence[tuple[str, str]], patterns: Names, kind: str) -> list[int]:
-    """The indices of the (body, name) pairs that match at least one of the patterns."""
+    """Returns the indices of the (body, name) pairs that match at least one of the patterns.
+
+    Args:
+        paths: the pairs.
+        patterns: one pattern or several.
+        kind: the kind of element, for the error message.
+
+    Raises:
+        ValueError: if a pattern matches none.
+    """
     chosen = set()
     for pattern in (patterns,) if isinstance(patterns, str) else patterns:
         matches = {i for i, (body, name) in enumerate(paths) if pattern in (name, f"{body}/{name}")} or {

@@ -1,4 +1,4 @@
-"""An effect as a dictionary that JSON can hold, and back: its class and its fields by name."""
+"""Converts effects to JSON-compatible dictionaries and back."""
 
 import dataclasses
 import inspect
@@ -10,14 +10,14 @@ from torchrl_h2o.effects.effect import Effect
 
 
 def effect_to_dict(effect: Effect) -> dict[str, Any]:
-    """The effect as a dictionary of numbers, texts and lists.
+    """Converts an effect to a dictionary of numbers, strings and lists.
 
     Args:
         effect: the effect.
 
     Returns:
-        ``effect``, the name of its class, and its fields by name. JSON has no infinity: it is the text
-        ``"inf"``.
+        ``effect``, the name of its class, and its fields by name. Infinity becomes the string ``"inf"``, because JSON
+        has none.
 
     Examples:
         >>> from torchrl_h2o.effects import ActionSaturation, BodyMass
@@ -31,20 +31,18 @@ def effect_to_dict(effect: Effect) -> dict[str, Any]:
 
 
 def effect_from_dict(entries: Mapping[str, Any]) -> Effect:
-    """The effect that :func:`effect_to_dict` made a dictionary of.
+    """Builds the effect of a dictionary that :func:`effect_to_dict` returned.
 
-    An effect that is defined elsewhere, as a subclass of one of the four kinds, is found too once its
-    module is imported.
+    An effect class defined outside this package is found once its module has been imported.
 
     Args:
-        entries: ``effect``, the name of the class, and its fields by name; what is left out has its
-            default.
+        entries: ``effect``, the name of the class, and its fields by name; missing fields take their defaults.
 
     Returns:
         The effect.
 
     Raises:
-        ValueError: if there is no such class, or it has no such field, or a value is illegal.
+        ValueError: for an unknown class, an unknown field or a value that the effect does not allow.
 
     Examples:
         >>> effect_from_dict({"effect": "BodyMass", "scale": 1.2, "bodies": "torso"})

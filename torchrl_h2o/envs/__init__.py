@@ -1,6 +1,6 @@
-"""Simulators with dynamics gaps in them: the TorchRL transform and the environments.
+"""TorchRL environments with dynamics gaps: the transform, batched simulation and the wheel-legged robot.
 
-Needs MuJoCo, and Gymnasium or dm_control for their tasks (``pip install torchrl_h2o[envs]``).
+Requires MuJoCo, and Gymnasium or dm_control for their tasks (``pip install torchrl_h2o[envs]``).
 """
 
 from torchrl_h2o.envs.batched_env import BatchedMujocoEnv

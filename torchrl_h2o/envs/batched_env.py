@@ -1,4 +1,4 @@
-"""Many MuJoCo worlds of one task in one TorchRL env, stepped at once by ``mujoco.rollout``."""
+"""A TorchRL env of many MuJoCo worlds of one task, stepped at once with ``mujoco.rollout``."""
 
 from __future__ import annotations
 
@@ -28,29 +28,30 @@ from torchrl_h2o.envs.task_rules import rules_of
 class BatchedMujocoEnv(EnvBase):
     """N worlds of a Gymnasium MuJoCo task, stepped at once on all processors.
 
-    Observations, rewards, terminations, resets and the time limit are those of the task: from the same states and
-    actions they agree with Gymnasium's to rounding. Worlds are reset one by one, through TorchRL's ``"_reset"``.
+    Observations, rewards, terminations, resets and the time limit are those of the task; from the same states and
+    actions they agree with Gymnasium's to rounding. Worlds are reset individually, through TorchRL's ``"_reset"``.
 
-    Effects that are in the env that is given (its :class:`~torchrl_h2o.envs.DynamicsGap`) are in every world. Further
-    ones may be the same for all or differ from world to world, which makes domain randomisation one line.
+    The effects of the given env (its :class:`~torchrl_h2o.envs.DynamicsGap`) act in every world. Further effects are
+    common to all worlds or differ between them, which serves domain randomisation.
 
     Args:
-        env: one env of the task, with or without dynamics gaps. It is kept, to draw where episodes begin. Other
-            transforms go around the batched env.
-        num_worlds: N.
-        effects: more effects, for all worlds, or one list of them a world.
+        env: one env of the task, with or without dynamics gaps. The batched env keeps it, to draw initial states.
+            Other transforms go around the batched env.
+        num_worlds: number of worlds, N.
+        effects: further effects for all worlds, or one list of effects per world.
 
     Keyword Args:
-        num_threads: of ``mujoco.rollout``, at most one a world. As many as there are processors by default.
+        num_threads: number of threads of ``mujoco.rollout``, at most one per world; the number of processors by
+            default.
 
     Attributes:
-        states: (N, size), MuJoCo's full physics state of each world: time, positions, velocities, activations. May be
-            written to.
-        physics_steps: of a control step.
+        states: MuJoCo's full physics state of each world (time, positions, velocities, activations), (N, size). May
+            be written to.
+        physics_steps: physics steps per control step.
 
     Raises:
-        ValueError: if the env is no Gymnasium MuJoCo task whose rules are known, repeats actions, or has transforms
-            other than dynamics gaps, or there is not one list of effects a world.
+        ValueError: if the env is not a Gymnasium MuJoCo task with implemented rules, repeats actions or has transforms
+            other than dynamics gaps, or if the number of lists of effects is not N.
 
     Examples:
         >>> import numpy as np
@@ -84,7 +85,7 @@ class BatchedMujocoEnv(EnvBase):
         self._models = self._compiled(backend)
         self._differ = len(set(self._pipelines)) > 1
         threads = min(num_threads or cpu_count(), num_worlds)
-        self._pool = Rollout(nthread=threads if threads > 1 else 0)  # 0 is the caller's own
+        self._pool = Rollout(nthread=threads if threads > 1 else 0)  # 0 runs in the calling thread
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
         self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], FULL_PHYSICS)))
         self._steps = np.zeros(num_worlds, dtype=np.int64)
@@ -98,18 +99,18 @@ class BatchedMujocoEnv(EnvBase):
 
     @property
     def models(self) -> Sequence[mujoco.MjModel]:
-        """The model of each world, with its effects in it."""
+        """The model of each world, with its effects."""
         return self._models
 
     def _compiled(self, backend: GymnasiumBackend) -> list[mujoco.MjModel]:
-        """A model a world; worlds with the same effects share one."""
+        """Compiles one model per world; worlds with the same effects share a model."""
         models = {pipeline: pipeline.compile(backend.spec()) for pipeline in dict.fromkeys(self._pipelines)}
         for model in models.values():
             backend.check_sizes(model)
         return [models[pipeline] for pipeline in self._pipelines]
 
     def _batched_forces(self) -> list[BatchedForce]:
-        """The forces that act, each in the worlds that it acts in."""
+        """Returns the forces of all worlds; each acts only in its own worlds."""
         forces = []
         for pipeline in dict.fromkeys(self._pipelines):
             worlds = np.array([index for index, own in enumerate(self._pipelines) if own == pipeline])
@@ -122,7 +123,7 @@ class BatchedMujocoEnv(EnvBase):
         self.action_spec = env.action_spec_unbatched.expand(n, *env.action_spec_unbatched.shape)
         self.reward_spec = env.reward_spec.expand(n, *env.reward_spec.shape)
         self.done_spec = Composite({key: spec.expand(n, 1) for key, spec in env.full_done_spec.items()}, shape=(n,))
-        # to look one up takes longer than most of a step's sums
+        # stored here, because looking up a spec in every step is slow
         self._observation_dtype = env.observation_spec["observation"].dtype
         self._reward_dtype = env.reward_spec.dtype
 
@@ -178,14 +179,14 @@ class BatchedMujocoEnv(EnvBase):
         )
 
     def _begin(self, index: int) -> None:
-        """Begins an episode in one world: the task draws where it starts, with the world's own generator."""
+        """Begins an episode in one world: the task draws the initial state with the world's own generator."""
         task = self._task
         task.np_random = self._generators[index]
         mujoco.mj_resetData(task.model, task.data)
         task.reset_model()
         state = self.states[index]
         mujoco.mj_getState(task.model, task.data, state, FULL_PHYSICS)
-        # a task may start from a pose of its own; where it starts from the model's, follow that of the world's model
+        # coordinates that start at the model's qpos0 follow the world's model; a task's own initial values stay
         own, qpos0 = self._models[index].qpos0, task.model.qpos0
         state[1 : 1 + len(own)] += np.where(task.init_qpos == qpos0, own - qpos0, 0.0)
         self._steps[index] = 0
@@ -199,7 +200,7 @@ class BatchedMujocoEnv(EnvBase):
         return pipeline.begin(self._control_steps[index], rng)
 
     def _observe(self, mask: np.ndarray | slice = slice(None)) -> torch.Tensor:
-        """What is observed, (N, n), by the sensors of the worlds in a mask; TorchRL takes nothing of the others."""
+        """Returns observations (N, n). Sensor effects act only in the worlds of a mask; TorchRL ignores the others."""
         observed = self._rules.observe(*positions_and_velocities(self._models[0], self.states))
         if self._alters_observations:
             for index in np.arange(self.num_worlds)[mask]:
@@ -208,7 +209,7 @@ class BatchedMujocoEnv(EnvBase):
 
 
 def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
-    """A force that acts in some worlds alone."""
+    """Restricts a force to some worlds; it is zero in the others."""
 
     def forces(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
         everywhere = np.zeros(qvel.shape)
@@ -224,7 +225,7 @@ def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_w
         return [tuple(effects)] * num_worlds
     if len(effects) != num_worlds:
         raise ValueError(
-            f"there are {len(effects)} lists of effects for {num_worlds} worlds: give one a world, or one list for all"
+            f"there are {len(effects)} lists of effects for {num_worlds} worlds: give one per world, or one for all"
         )
     return [tuple(own) for own in effects]
 
@@ -233,20 +234,20 @@ def _backend_in(env: EnvBase) -> GymnasiumBackend:
     """Returns the backend of an env that a batch can step; raises ValueError for other envs."""
     backend = find_backend(env)
     if not isinstance(backend, GymnasiumBackend):
-        raise ValueError(f"{env} is no Gymnasium task; build one world of it with GymEnv")
+        raise ValueError(f"{env} is no Gymnasium task; build one world with GymEnv")
     others = [type(transform).__name__ for transform in transforms_of(env) if not isinstance(transform, DynamicsGap)]
     if others:
         raise ValueError(
-            f"the env that is given has transforms that a batch would be without ({', '.join(others)}): put them "
-            "around it, TransformedEnv(BatchedMujocoEnv(...), ...)"
+            f"the given env has transforms that the batched env would ignore ({', '.join(others)}): put them around "
+            "the batched env, TransformedEnv(BatchedMujocoEnv(...), ...)"
         )
     if backend.env.wrapper_frame_skip != 1:
-        raise ValueError("the env that is given repeats actions (frame_skip); leave that out")
+        raise ValueError("the given env repeats actions (frame_skip); build it without frame_skip")
     return backend
 
 
 def _time_limit(env: EnvBase) -> float:
-    """The steps after which the task's TimeLimit wrapper truncates; infinite without one."""
+    """Returns the number of steps after which the task's TimeLimit wrapper truncates; infinite without one."""
     wrapper = env._env
     while wrapper is not wrapper.unwrapped:
         if isinstance(wrapper, TimeLimit):

@@ -1,4 +1,4 @@
-"""DynamicsGap, the TorchRL transform that puts effects into a simulator."""
+"""DynamicsGap, the TorchRL transform that applies effects to a simulator."""
 
 import mujoco
 import numpy as np
@@ -13,43 +13,38 @@ from torchrl_h2o.envs.mujoco_model import find_backend
 
 
 class DynamicsGap(Transform):
-    """What a list of effects does to a simulator.
+    """Applies a list of effects to a simulator.
 
-    The model is changed when the transform is put on an env: its effects edit the task's own
-    MJCF, in memory, and the result is compiled and replaces the model in use. The env must be reset
-    after that. Actions are altered on their way to the simulator, while the tensordict keeps the
-    action asked for; observations are altered before any other transform reads them; forces act at
-    every physics step.
+    Model effects act when the transform is added to an env: they edit the task's own MJCF in memory, and the compiled
+    result replaces the model in use. Reset the env afterwards. Action effects alter what the simulator executes, while
+    the tensordict keeps the commanded action. Observation effects act before any other transform reads the
+    observation. Forces act at every physics step.
 
-    Effects compose in their order: model edits first to last before one compilation, action
-    effects first to last, forces summed, observation effects first to last. Of several gaps on one
-    env, the one put on first edits first; actions pass through the outermost first, as through any
-    transforms of TorchRL.
+    Effects compose in their order: model edits first to last before one compilation, action effects first to last,
+    forces summed, observation effects first to last. With several gaps on one env, the model edits of the innermost
+    gap come first; actions pass through the outermost gap first, as through all TorchRL transforms.
 
-    Negative :class:`~torchrl_h2o.effects.ActionNoise` takes away noise that the effects before it add:
-    those of the same gap, and all of the gaps nearer to the simulator.
+    Negative :class:`~torchrl_h2o.effects.ActionNoise` removes noise that the effects before it add: those of the same
+    gap and of all gaps nearer to the simulator.
 
-    A gap is for one simulator and for its life: taking the transform off the env does not mend the
-    simulator, and another gap needs a new env. Put it directly on the env, before other transforms,
-    and within each worker of a batched env. A copy of the env has its gaps again from its first
-    reset on.
+    A gap belongs to one simulator permanently: removing the transform from the env does not restore the simulator, and
+    another gap needs a new env. Put the gap directly on the env, before other transforms, and inside each worker of a
+    batched env. In a copy of the env, the gaps are applied again at the first reset.
 
-    All randomness of an episode is seeded at its reset from torch's global generator:
-    ``torch.manual_seed`` repeats it. In ``ParallelEnv`` each worker has a generator of its own;
-    the env's ``set_seed`` makes them differ.
+    The random effects of an episode are seeded at its reset from torch's global generator, so ``torch.manual_seed``
+    repeats them. In ``ParallelEnv`` each worker has its own generator; the env's ``set_seed`` makes them differ.
 
-    An observation effect sees the env's floating-point observations as one vector, in the order of
-    the observation spec.
+    Observation effects receive the env's floating-point observations as one vector, in the order of the observation
+    spec.
 
     Args:
-        *effects: the effects.
+        *effects: the effects, in their order.
 
     Raises:
-        TypeError: if one of them is not an effect.
-        ValueError: when put on an env that is batched, does not run on MuJoCo, had another gap, or
-            whose model has nothing that one of the effects could act on, or that has less noise than
-            one of them takes away; or, with action or
-            observation effects, after transforms of other kinds.
+        TypeError: if an argument is not an effect.
+        ValueError: when added to an env that is batched, does not run on MuJoCo or had another gap; if the model has
+            no element that one of the effects could act on, or less noise than negative noise removes; or, with
+            action or observation effects, when added after transforms of other kinds.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -74,12 +69,12 @@ class DynamicsGap(Transform):
                     "the paper's gaps by name, use dynamics_gap"
                 )
         self.effects = effects
-        # TorchRL clones transforms freely, also onto the env that they are on already. Clones share
-        # this object, by which the simulator knows a gap that it has, and its present episode.
+        # TorchRL clones transforms, sometimes onto the same env. Clones share this object, which identifies the gap
+        # and its current episode in the simulation.
         self._identity = object()
 
     def describe(self) -> str:
-        """What the gap does, in words with units."""
+        """Describes the gap in words with units."""
         return ", ".join(effect.describe() for effect in self.effects)
 
     def __repr__(self) -> str:
@@ -102,15 +97,15 @@ class DynamicsGap(Transform):
         backend.apply(self._identity, {gap._identity: gap.effects for gap in self._gaps_on(env)})
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
-        # A copied or unpickled env may have built its simulator anew, without the gaps.
+        # a copied or unpickled env may have rebuilt its simulator without the gaps
         env = _env_of(self)
         self._check_place(env)
         gaps = self._gaps_on(env)
         effects = {gap._identity: gap.effects for gap in gaps}
         if len(effects) < len(gaps):
             raise ValueError(
-                f"{self} and a clone of it are on one env, where they count as one gap; to have "
-                "its effects twice, make a second DynamicsGap"
+                f"{self} and a clone of it are on one env, where they count as one gap; to apply its effects twice, "
+                "make a second DynamicsGap"
             )
         backend = find_backend(env)
         for identity in effects:
@@ -157,38 +152,37 @@ class DynamicsGap(Transform):
         return [transform for transform in _transforms_of(self, env) if isinstance(transform, DynamicsGap)]
 
     def _check_place(self, env: EnvBase) -> None:
-        """Complains where another transform would stand between the simulator and what the effects alter."""
+        """Raises ValueError if another transform is between the simulator and this gap's actions or observations."""
         if not any(isinstance(effect, ActionEffect | ObservationEffect) for effect in self.effects):
             return
         transforms = _transforms_of(self, env)
         if any(isinstance(transform, FrameSkipTransform) for transform in transforms):
             raise ValueError(
-                f"FrameSkipTransform repeats actions as {self} has altered them, which would alter them "
-                "once more; let the env itself skip frames: GymEnv(..., frame_skip=...)"
+                f"FrameSkipTransform repeats actions that {self} has altered, which would alter them again; let the "
+                "env itself skip frames: GymEnv(..., frame_skip=...)"
             )
         for transform in transforms[: transforms.index(self)]:
             if not isinstance(transform, DynamicsGap):
                 raise ValueError(
-                    f"{self} stands after {type(transform).__name__}, so that its actions and "
-                    "observations are not those of the simulator; put it first: "
-                    "env.insert_transform(0, DynamicsGap(...))"
+                    f"{self} stands after {type(transform).__name__}, so its actions and observations are not those "
+                    "of the simulator; put it first: env.insert_transform(0, DynamicsGap(...))"
                 )
 
 
 def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:
-    """One of the paper's dynamics gaps, by its name.
+    """Builds one of the paper's dynamics gaps by its name.
 
     Args:
         name: ``gravity``, ``friction``, ``joint_noise``, ``big_thigh``, ``small_thigh``,
             ``broken_thigh``, ``flexible_thigh``, ``long_torso`` or ``soft_feet``; see
             :func:`~torchrl_h2o.effects.paper_gap`.
-        strength: the factor, or for ``joint_noise`` the standard deviation. The paper's by default.
+        strength: the factor, or for ``joint_noise`` the standard deviation; the paper's value by default.
 
     Returns:
         The transform.
 
     Raises:
-        ValueError: if there is no such gap, or the strength is out of bounds.
+        ValueError: for an unknown gap or a strength out of bounds.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -198,13 +192,13 @@ def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:
         >>> print(model.geom("torso").size[1], "m,", model.body_mass.sum().round(6), "kg")
         2.0 m, 14.0 kg
 
-    Source: H2O+ (arXiv 2309.12716), simulation experiments.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, simulation experiments.
     """
     return DynamicsGap(paper_gap(name, strength))
 
 
 def _env_of(transform: Transform) -> EnvBase | None:
-    """The env that a transform is on; Transform.container fails where there is none yet."""
+    """Returns the env of a transform, or None if it has none; Transform.container raises in that case."""
     container = transform
     while isinstance(container, Transform):
         reference = container.__dict__["_container"]
@@ -213,7 +207,7 @@ def _env_of(transform: Transform) -> EnvBase | None:
 
 
 def _transforms_of(transform: Transform, env: EnvBase) -> list[Transform]:
-    """All transforms of the env that a transform is on or is just being put on, the innermost first."""
+    """Returns all transforms of a transform's env, the innermost first, also while the transform is being added."""
     root = transform
     while isinstance(container := root.__dict__["_container"](), Transform):
         root = container
@@ -221,7 +215,7 @@ def _transforms_of(transform: Transform, env: EnvBase) -> list[Transform]:
 
 
 def transforms_of(node: EnvBase | Transform) -> list[Transform]:
-    """All transforms in an env or a transform, the innermost first."""
+    """Returns all transforms in an env or a transform, the innermost first."""
     if isinstance(node, TransformedEnv):
         return [*transforms_of(node.base_env), *transforms_of(node.transform)]
     if isinstance(node, Compose):

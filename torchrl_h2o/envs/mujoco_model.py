@@ -1,4 +1,4 @@
-"""Finds the MuJoCo simulation of a TorchRL env, and returns the model that it runs on."""
+"""Finds the MuJoCo simulation of a TorchRL env and its model."""
 
 import mujoco
 from torchrl.envs import EnvBase
@@ -9,9 +9,9 @@ from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 
 
 def mujoco_model(env: EnvBase) -> mujoco.MjModel:
-    """The MuJoCo model in use, with all of the env's dynamics gaps in it.
+    """Returns the MuJoCo model in use, with all of the env's dynamics gaps applied.
 
-    The model changes when a gap is put in: ask again rather than keep it.
+    Applying a gap replaces the model, so call this function again instead of keeping the result.
 
     Args:
         env: a GymEnv or DMControlEnv of a MuJoCo task, with or without transforms.
@@ -31,13 +31,13 @@ def mujoco_model(env: EnvBase) -> mujoco.MjModel:
 
 
 def find_backend(env: EnvBase) -> MujocoBackend:
-    """The MuJoCo simulation inside an env.
+    """Returns the backend of an env: access to its MuJoCo simulation.
 
     Args:
         env: a GymEnv or DMControlEnv of a MuJoCo task, with or without transforms.
 
     Returns:
-        The simulation.
+        The backend.
 
     Raises:
         ValueError: if the env is batched or does not run on MuJoCo.
@@ -45,8 +45,8 @@ def find_backend(env: EnvBase) -> MujocoBackend:
     base = base_env(env)
     if base.batch_size:
         raise ValueError(
-            f"{base} is batched, with batch size {tuple(base.batch_size)}: its simulations cannot "
-            "be reached from outside. Put the gap inside each worker, as in "
+            f"{base} is batched, with batch size {tuple(base.batch_size)}: its simulations are not accessible from "
+            "outside. Put the gap inside each worker, as in "
             "ParallelEnv(2, lambda: TransformedEnv(GymEnv('HalfCheetah-v5'), DynamicsGap(...)))"
         )
     backend = GymnasiumBackend.inside(base) or DMControlBackend.inside(base)

@@ -1,4 +1,4 @@
-"""Many states of MuJoCo models, stepped at once by ``mujoco.rollout``, also under forces that follow the state."""
+"""Steps many states of MuJoCo models at once with ``mujoco.rollout``, optionally under state-dependent forces."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ def roll_out(
 ) -> np.ndarray:
     """Steps many states at once, each under its own actions.
 
-    Without forces that follow the state this is one rollout. With them it goes physics step by physics step, each under
-    the forces of the state that it starts from.
+    Without state-dependent forces this is one rollout. With them it advances by one physics step at a time, each under
+    the forces of its initial state.
 
     Args:
-        pool: of threads.
-        models: one for all states, or one a state, all of the same sizes.
-        data: scratch space, one a thread.
-        states: (B, size), full physics states to start from.
-        actions: (B, H, nu), each executed for one control step.
-        physics_steps: of a control step.
-        forces: functions of the state.
-        applied: (B, H, nv), generalised forces in N or N·m beside these.
+        pool: the threads of ``mujoco.rollout``.
+        models: one model for all states, or one per state, all of the same sizes.
+        data: scratch space, one per thread.
+        states: initial full physics states, (B, size).
+        actions: actions, (B, H, nu), each executed for one control step.
+        physics_steps: physics steps per control step.
+        forces: generalised forces as functions of the state.
+        applied: further generalised forces in N or N·m, (B, H, nv), constant within a control step.
 
     Returns:
         The states after each control step, (B, H, size).
@@ -67,6 +67,6 @@ def roll_out(
 
 
 def positions_and_velocities(model: mujoco.MjModel, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Views of the positions, (B, nq), and velocities, (B, nv), in full physics states, (B, size)."""
-    velocities = 1 + model.nq  # behind the time and the positions
+    """Returns views of the positions (B, nq) and velocities (B, nv) in full physics states (B, size)."""
+    velocities = 1 + model.nq  # the state starts with the time and the positions
     return states[:, 1:velocities], states[:, velocities : velocities + model.nv]

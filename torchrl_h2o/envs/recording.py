@@ -1,4 +1,4 @@
-"""Recording measured data from an env: one function, a policy and a seed in, transitions out."""
+"""Records transitions from an env under a policy."""
 
 from __future__ import annotations
 
@@ -21,27 +21,25 @@ def record(
     *,
     progress: bool = True,
 ) -> TensorDict:
-    """Records transitions in the order in which they happen, episode after episode.
+    """Records transitions in temporal order, over as many episodes as needed.
 
-    The last one is marked as truncated, because the recording breaks off there. The policy
-    explores, and finds in ``is_init`` where episodes start. The same seed gives the same data;
-    torch's own random state is left as it was.
+    The last transition is marked as truncated. The policy explores; ``is_init`` marks the start of episodes for it.
+    The same seed gives the same data, and torch's global random state is restored.
 
     Args:
-        env: not batched; is reset first, and stays open.
+        env: the env, not batched; it is reset first and stays open.
         policy: a TensorDict module or function that writes ``action``.
-        num_transitions: how many; the default is the size of the real robot's log.
-        seed: of env and policy.
+        num_transitions: number of transitions; the default is the size of the real robot's log.
+        seed: seed of env and policy.
         progress: whether to show a progress bar.
 
     Returns:
-        TensorDict of batch size ``(num_transitions,)`` in TED form: observation, action, done,
-        terminated, truncated, and under ``next`` observation, reward, done, terminated, truncated.
-        Whatever the env's own precision, numbers are float32, as in all measured data.
+        TensorDict of batch size ``(num_transitions,)`` in TED form: observation, action, done, terminated, truncated,
+        and under ``next`` observation, reward, done, terminated, truncated. Numbers are float32 for any precision of
+        the env, as in all measured data.
 
     Raises:
-        ValueError: for fewer than one transition, or for an env that is batched or has no
-            ``observation``.
+        ValueError: for fewer than one transition, or for an env that is batched or has no ``observation``.
 
     Example:
         >>> from torchrl_h2o.envs.wheel_legged.balance_controller import BalanceController
@@ -54,15 +52,15 @@ def record(
         raise ValueError(f"num_transitions is {num_transitions}; record at least one")
     if env.batch_size:
         raise ValueError(
-            f"record takes one env, not a batch of {tuple(env.batch_size)}; record from each of "
-            "its envs and concatenate"
+            f"record takes one env, not a batch of {tuple(env.batch_size)}; record from each of its envs and "
+            "concatenate the results"
         )
     if "observation" not in env.observation_spec.keys():
         raise ValueError(
-            f"{env} has no 'observation', but {', '.join(map(str, env.observation_spec.keys()))}; join "
-            "what belongs to it: env.append_transform(CatTensors([...], out_key='observation'))"
+            f"{env} has no 'observation', but {', '.join(map(str, env.observation_spec.keys()))}; concatenate these: "
+            "env.append_transform(CatTensors([...], out_key='observation'))"
         )
-    # nested on purpose: TorchRL would unwrap the env, warn of it, and work on clones of its transforms
+    # auto_unwrap=False, because TorchRL would otherwise warn and work on clones of the env's transforms
     tracked = TransformedEnv(env, InitTracker(), auto_unwrap=False)
     keys = ["observation", "action", *DONE_KEYS, ("next", "observation"), ("next", "reward")]
     keys += [("next", key) for key in DONE_KEYS]

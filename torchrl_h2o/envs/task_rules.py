@@ -1,6 +1,6 @@
-"""What Gymnasium's MuJoCo tasks observe, pay for and end at, of many worlds at once.
+"""Observations, rewards and terminations of Gymnasium's MuJoCo tasks, for many worlds at once.
 
-Each is Gymnasium's own formula, with the constants of the task object: the tests hold them against it.
+These are Gymnasium's own formulas with the constants of the task object; the tests compare the two.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 class TaskRules(ABC):
-    """The rules of one task.
+    """The observation, reward and termination of one task.
 
     Args:
-        task: an object of it, whose constants are read.
+        task: the Gymnasium task, whose constants are read.
     """
 
     def __init__(self, task: MujocoEnv) -> None:
@@ -31,29 +31,29 @@ class TaskRules(ABC):
 
     @abstractmethod
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """The observations, (N, n), of states (N, nq) and (N, nv): a new array, as the env goes on writing to those."""
+        """Returns the observations (N, n) of states (N, nq), (N, nv) as a new array, because the env reuses those."""
 
     @abstractmethod
     def reward(
         self, before: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray, control_step: np.ndarray
     ) -> np.ndarray:
-        """The rewards, (N), of going from positions ``before`` (N, nq) to states, by actions (N, nu).
+        """Returns the rewards (N,) of one step.
 
         Args:
-            before: positions where the step began.
-            qpos: positions where it ended.
-            qvel: velocities where it ended.
-            action: as the simulator was given them.
-            control_step: of each world, (N), in s.
+            before: positions at the start of the step, (N, nq).
+            qpos: positions at the end of the step, (N, nq).
+            qvel: velocities at the end of the step, (N, nv).
+            action: executed actions, (N, nu).
+            control_step: the control step of each world in s, (N,).
         """
 
     @abstractmethod
     def is_terminated(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """Whether episodes end in these states, (N)."""
+        """Returns whether episodes end in these states, (N,)."""
 
 
 class Running(TaskRules):
-    """HalfCheetah: forward velocity, less the effort; it never ends."""
+    """HalfCheetah: rewards forward velocity minus control cost; never terminates."""
 
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         skipped = int(self.task._exclude_current_positions_from_observation)
@@ -73,10 +73,10 @@ class Running(TaskRules):
 
 
 class Walking(Running):
-    """Walker2d: the same, velocities cut off, pay for being healthy, and an end when it is not."""
+    """Walker2d: as HalfCheetah, with clipped velocities, a healthy reward, and termination when unhealthy."""
 
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        return super().observe(qpos, np.clip(qvel, -10.0, 10.0))
+        return super().observe(qpos, np.clip(qvel, -10.0, 10.0))  # Gymnasium's own bounds
 
     def is_terminated(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         if not self.task._terminate_when_unhealthy:
@@ -91,7 +91,7 @@ class Walking(Running):
 
 
 class Hopping(Walking):
-    """Hopper: the same, and healthy only while no other coordinate is far off."""
+    """Hopper: as Walker2d, and healthy only while all other coordinates are within a range."""
 
     def _is_healthy(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         rest = np.concatenate([qpos[:, 2:], qvel], axis=1)
@@ -99,7 +99,7 @@ class Hopping(Walking):
 
 
 class Balancing(TaskRules):
-    """The wheel-legged robot."""
+    """The wheel-legged robot: the reward of its task; terminates when it falls."""
 
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         x, theta, v, theta_dot = qpos[:, 0], qpos[:, 2], qvel[:, 0], qvel[:, 2]
@@ -113,7 +113,7 @@ class Balancing(TaskRules):
         return reward(self.task.task, observation, action, observation)
 
     def is_terminated(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        return ~(np.abs(qpos[:, 2]) <= MAX_PITCH)  # a pitch that is not a number counts as lost
+        return ~(np.abs(qpos[:, 2]) <= MAX_PITCH)  # this form also counts a NaN pitch as fallen
 
 
 RULES: dict[type[MujocoEnv], type[TaskRules]] = {
@@ -125,16 +125,16 @@ RULES: dict[type[MujocoEnv], type[TaskRules]] = {
 
 
 def rules_of(task: MujocoEnv) -> TaskRules:
-    """The rules of a task.
+    """Returns the rules of a task.
 
     Raises:
-        ValueError: for a task that has none here.
+        ValueError: for a task whose rules are not implemented.
     """
     if type(task) not in RULES:
         known = ", ".join(kind.__name__ for kind in RULES)
         raise ValueError(
-            f"the rules of {type(task).__name__} are not known to step it in a batch, only those of {known}; take "
-            "ParallelEnv, or add a TaskRules of it to torchrl_h2o.envs.task_rules.RULES"
+            f"{type(task).__name__} cannot be stepped in a batch, because its rules are not implemented, only those of "
+            f"{known}; use ParallelEnv, or add its TaskRules to torchrl_h2o.envs.task_rules.RULES"
         )
     return RULES[type(task)](task)
 

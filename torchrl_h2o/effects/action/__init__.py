@@ -1,1 +1,1 @@
-"""Effects on the way in: what the simulator executes of the action asked for."""
+"""Effects on actions: how the executed action differs from the commanded one."""

@@ -1,4 +1,4 @@
-"""Effects on what an actuator follows of its command: dead band, saturation, backlash."""
+"""Nonlinearities between command and actuation: dead band, saturation, backlash."""
 
 import math
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class ActionDeadBand(ActionEffect):
-    """Commands that are too small do nothing, larger ones lose as much.
+    """A dead band: small commands have no effect, larger ones are reduced by the width of the band.
 
     Args:
-        width: the size below which a command does nothing, to either side, in units of the action.
-        actuators: indices of the entries of the action that have a dead band, all by default.
+        width: half the width of the band around zero, in units of the action.
+        actuators: indices of the entries of the action that have a dead band; all by default.
 
     Examples:
         >>> import numpy as np
@@ -41,11 +41,11 @@ class ActionDeadBand(ActionEffect):
 
 @dataclass(frozen=True)
 class ActionSaturation(ActionEffect):
-    """Commands that are too large are cut off.
+    """Saturation: commands are clipped at a limit.
 
     Args:
-        limit: the largest size of a command that is followed, in units of the action.
-        actuators: indices of the entries of the action that are cut off, all by default.
+        limit: largest magnitude of the executed action, in units of the action.
+        actuators: indices of the entries of the action that saturate; all by default.
 
     Examples:
         >>> import numpy as np
@@ -70,14 +70,14 @@ class ActionSaturation(ActionEffect):
 
 @dataclass(frozen=True)
 class ActionBacklash(ActionEffect):
-    """Play between command and actuator, as of worn gears: on reversal nothing moves at first.
+    """Backlash between command and actuator, as in worn gears: after a reversal the actuator rests at first.
 
-    The executed action follows only when the command pushes it from one side, half a width away (the
-    play operator). It starts at zero.
+    The executed action changes only while the command is half a width ahead of it (the play operator). It starts at
+    zero.
 
     Args:
-        width: the whole play, in units of the action.
-        actuators: indices of the entries of the action that have play, all by default.
+        width: full width of the backlash, in units of the action.
+        actuators: indices of the entries of the action that have backlash; all by default.
 
     Examples:
         >>> import numpy as np

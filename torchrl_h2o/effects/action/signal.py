@@ -1,4 +1,4 @@
-"""Effects on the size of actions: stronger or weaker, off by a constant, noisy."""
+"""Effects on the size of actions: gain, bias and noise."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,19 +12,18 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class ActionNoise(ActionEffect):
-    """Gaussian noise on the executed action, drawn anew every control step.
+    """Gaussian noise on the executed action, drawn independently at every control step.
 
-    The noisy action may leave the bounds of the action; MuJoCo clamps the controls that are
-    limited.
+    The noisy action may exceed the bounds of the action; MuJoCo clamps the controls that have limits.
 
-    What mends a simulator that is noisier than reality is noise taken away: a negative ``std``. It
-    has no process of its own. :func:`balanced` reduces the noise of the effects before it instead,
-    as :class:`~torchrl_h2o.envs.DynamicsGap` does for all gaps on an env.
+    A negative ``std`` removes noise from a simulator that is noisier than reality. It cannot be executed by itself:
+    :func:`balanced` reduces the noise of the effects before it instead, as :class:`~torchrl_h2o.envs.DynamicsGap`
+    does for all gaps on an env.
 
     Args:
-        std: standard deviation, in units of the action; below zero it takes away noise that effects
-            before it add. Variances add: 1 and then -0.6 leave 0.8.
-        actuators: indices of the noisy entries of the action, all by default.
+        std: standard deviation, in units of the action. A negative value removes noise that the effects before it
+            add. Variances add: 1 followed by -0.6 leaves 0.8.
+        actuators: indices of the noisy entries of the action; all by default.
 
     Examples:
         >>> import numpy as np
@@ -34,7 +33,7 @@ class ActionNoise(ActionEffect):
         >>> ActionNoise(-1.0).describe()
         'noise of standard deviation 1 taken off all actuators'
 
-    Source: H2O+ (arXiv 2309.12716), the gap ``joint_noise``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gap ``joint_noise``.
     """
 
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"
@@ -52,8 +51,8 @@ class ActionNoise(ActionEffect):
     def process(self, dt: float, rng: np.random.Generator) -> Process:
         if self.std < 0.0:
             raise ValueError(
-                f"ActionNoise: std = {self.std:g} cannot be executed by itself: it takes away noise that effects "
-                "before it add; pass all effects together through balanced(effects) first"
+                f"ActionNoise: std = {self.std:g} cannot be executed by itself, because it removes noise that the "
+                "effects before it add; pass all effects together through balanced(effects) first"
             )
 
         def noisy(action: np.ndarray) -> np.ndarray:
@@ -65,14 +64,13 @@ class ActionNoise(ActionEffect):
 
 @dataclass(frozen=True)
 class ActionGain(ActionEffect):
-    """Actuation that is stronger or weaker than asked for.
+    """A gain of the actuation: the executed action is stronger or weaker than the commanded one.
 
-    The scaled action may leave the bounds of the action; MuJoCo clamps the controls that are
-    limited.
+    The scaled action may exceed the bounds of the action; MuJoCo clamps the controls that have limits.
 
     Args:
         scale: factor on the action.
-        actuators: indices of the scaled entries of the action, all by default.
+        actuators: indices of the scaled entries of the action; all by default.
 
     Examples:
         >>> import numpy as np
@@ -94,11 +92,11 @@ class ActionGain(ActionEffect):
 
 @dataclass(frozen=True)
 class ActionBias(ActionEffect):
-    """Actuation that is off by a constant.
+    """A constant offset of the executed action.
 
     Args:
-        bias: what is added to the action, in units of the action.
-        actuators: indices of the entries of the action that are off, all by default.
+        bias: offset added to the action, in units of the action.
+        actuators: indices of the offset entries of the action; all by default.
 
     Examples:
         >>> import numpy as np

@@ -1,4 +1,4 @@
-"""Effects on when an actuator follows its command: late, or gradually."""
+"""Effects on the timing of actuators: delay and first-order lag."""
 
 import math
 from dataclasses import dataclass
@@ -14,16 +14,15 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class ActionDelay(ActionEffect):
-    """Actuation that is late, by any time, also a fraction of a control step.
+    """Delayed actuation, by any time, including fractions of a control step.
 
-    With a delay of k + f control steps the drive still follows the command before last for the
-    first f of a step. A control step executes one action, so it is given the mean of the two,
-    (1 - f) · a(t - k) + f · a(t - k - 1), which has the same impulse. Before the first command the
-    delay line holds zeros.
+    With a delay of k + f control steps, the drive follows a(t - k - 1) for the first fraction f of a step and a(t - k)
+    for the rest. A control step executes one action, so it executes the mean, (1 - f) · a(t - k) + f · a(t - k - 1),
+    which has the same impulse. Actions before the first command are taken as zero.
 
     Args:
         delay: the delay, in s.
-        actuators: indices of the late entries of the action, all by default.
+        actuators: indices of the delayed entries of the action; all by default.
 
     Examples:
         >>> import numpy as np
@@ -47,14 +46,14 @@ class ActionDelay(ActionEffect):
 
 @dataclass(frozen=True)
 class ActionLag(ActionEffect):
-    """Actuation that follows gradually, as a first-order lag.
+    """A first-order lag of the actuation.
 
-    The drive obeys ẏ = (a - y) / T and starts at rest, y = 0. Within a control step the command a
-    stands, so that y is known exactly; the step executes its mean, which has the same impulse.
+    The drive obeys ẏ = (a - y) / T and starts at y = 0. The command a is constant within a control step, so y is
+    computed exactly; the step executes the mean of y, which has the same impulse.
 
     Args:
-        time_constant: T, in s, after which 63 % of a step of the command are followed.
-        actuators: indices of the lagging entries of the action, all by default.
+        time_constant: T, in s; the drive covers 63 % of a step of the command in this time.
+        actuators: indices of the lagging entries of the action; all by default.
 
     Examples:
         >>> import numpy as np
@@ -90,7 +89,7 @@ class ActionLag(ActionEffect):
         return np.where(entry_mask(actions, self.actuators), actions + mean_left * behind, actions)
 
     def _left_after(self, dt: float) -> tuple[float, float]:
-        """What a control step leaves of the way to the command: at its end, and in its mean."""
+        """Returns the shares of the initial error that remain at the end of a control step and in its mean."""
         if self.time_constant == 0.0:
             return 0.0, 0.0
         ratio = dt / self.time_constant

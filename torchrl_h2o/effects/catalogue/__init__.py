@@ -1,4 +1,4 @@
-"""The catalogue of a model: every effect that its simulator may lack, with values to try first."""
+"""The catalogue of a model: candidate effects that its simulator may lack, with trial values for their fits."""
 
 from torchrl_h2o.effects.catalogue.catalogue import catalogue
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry

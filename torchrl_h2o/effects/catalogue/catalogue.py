@@ -1,7 +1,8 @@
-"""Generates the catalogue of a model: every effect that its simulator could lack.
+"""Generates the catalogue of a model: candidate effects that its simulator may lack, with trial values.
 
-An effect is tried on single elements, on those whose names share a word and on all together, wherever
-it can change something. Its trials are sized by the model's own masses, torques and control step.
+An effect is tried on single elements, on groups of elements whose names share a word, and on all elements, wherever
+it changes the model. The trial values are sized by the model's own masses, torques and control step; as part of an
+entry's definition they stand beside it, except the common factors, which are settings.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,19 +33,19 @@ from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
 def catalogue(
     spec: mujoco.MjSpec, *, num_observations: int, dt: float, settings: EffectSettings = EFFECT_SETTINGS
 ) -> tuple[CatalogueEntry, ...]:
-    """The effects that a simulator of a model could lack, with values to start their fits from.
+    """Returns the effects that a simulator of a model may lack, with initial values for their fits.
 
     Args:
-        spec: the model's specification, which is left as it is.
-        num_observations: how many entries an observation has, 0 to leave the sensors out.
+        spec: the model's specification, which is not changed.
+        num_observations: number of entries of the observation; 0 omits sensor effects.
         dt: the control step, in s.
         settings: sizes of the trials.
 
     Returns:
-        The entries; no two of them have the same effect.
+        The entries, all with different effects.
 
     Raises:
-        ValueError: if the control step is not positive, or there are fewer than no observations.
+        ValueError: if the control step is not positive or the number of observations is negative.
 
     Examples:
         >>> pole = '''<mujoco><worldbody><body name="pole"><joint name="hinge" axis="0 1 0"/>
@@ -122,7 +123,7 @@ def _observation_entries(num: int, dt: float) -> Iterator[CatalogueEntry]:
 
 
 def _changes_something(entry: CatalogueEntry, spec: mujoco.MjSpec, unchanged: bytes) -> bool:
-    """Whether the first trial compiles, to another model; what is no model effect may stay."""
+    """Whether the first trial of a model effect compiles to a different model; True for other effects."""
     first = entry.starts[0]
     if not isinstance(first, ModelEffect):
         return True

@@ -1,4 +1,4 @@
-"""The selections that a catalogue tries: each element by itself, those of a family, all together."""
+"""The selections that a catalogue tries: single elements, families of elements, and all elements."""
 
 from collections.abc import Collection, Sequence
 
@@ -15,17 +15,16 @@ def named_choices(
     passed_over: Collection[int] = (),
     groups: bool = True,
 ) -> dict[Names, tuple[int, ...]]:
-    """Selections by name patterns; no two select the same.
+    """Returns selections by name patterns, no two of which select the same elements.
 
     Args:
-        paths: the names (body, element) of all elements of the kind. Unnamed elements are selected
-            through their body.
+        paths: the names (body, element) of all elements of the kind. Unnamed elements are selected by their body.
         eligible: the indices of the elements to select.
-        passed_over: indices that a pattern may select besides, because nothing comes of it.
-        groups: whether to select families and all together too, not only single elements.
+        passed_over: indices that a pattern may select in addition, because the effect does not change them.
+        groups: whether to also select families and all elements.
 
     Returns:
-        The indices that are selected, by the selection.
+        The selected indices, by selection.
 
     Examples:
         >>> paths = [("torso", "hip"), ("bthigh", "bknee"), ("fthigh", "fknee")]
@@ -43,7 +42,7 @@ def named_choices(
     chosen = {}
     for indices, patterns in wanted:
         for pattern in patterns:
-            if "" in (pattern if isinstance(pattern, tuple) else (pattern,)):  # what cannot be named
+            if "" in (pattern if isinstance(pattern, tuple) else (pattern,)):  # an element without a name
                 continue
             selected = tuple(i for i in selection.matching(paths, pattern, "element") if i not in passed_over)
             if selected == indices and indices not in chosen.values():
@@ -52,15 +51,15 @@ def named_choices(
 
 
 def indexed_choices(names: Sequence[str], *, groups: bool = False, singles: bool = True) -> dict[Indices, tuple]:
-    """Selections by indices; no two select the same.
+    """Returns selections by indices, no two of which select the same entries.
 
     Args:
-        names: the names of all entries, ``""`` for one without.
-        groups: whether to select families too.
-        singles: whether to select single entries too, besides all together.
+        names: the names of all entries, ``""`` for an entry without a name.
+        groups: whether to also select families.
+        singles: whether to also select single entries.
 
     Returns:
-        The indices that are selected, by the selection.
+        The selected indices, by selection.
 
     Examples:
         >>> indexed_choices(["left_wheel", "right_wheel", "arm"], groups=True)

@@ -1,4 +1,4 @@
-"""An entry of a catalogue: an effect that a simulator may lack, and where to start looking."""
+"""An entry of a catalogue: a candidate effect with initial values for its fit."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -13,15 +13,15 @@ Trials = tuple[dict[str, float], ...]
 
 @dataclass(frozen=True)
 class CatalogueEntry:
-    """A candidate: an effect at its neutral value, and the values from which its fit starts.
+    """A candidate effect at its neutral value, with the initial values of its fit.
 
     Args:
-        effect: the effect, neutral, with what it acts on filled in.
-        trials: values of parameters by name, the same parameters in each: those to fit. All others
-            keep their neutral values.
+        effect: the neutral effect, with its selection filled in.
+        trials: initial values of the fitted parameters by name, the same parameters in every trial. All other
+            parameters keep their neutral values.
 
     Raises:
-        ValueError: if the effect is not neutral, or the trials are none or not of the same parameters.
+        ValueError: if the effect is not neutral, or there are no trials, or they name different parameters.
 
     Examples:
         >>> from torchrl_h2o.effects import BodyMass
@@ -44,18 +44,18 @@ class CatalogueEntry:
 
     @property
     def name(self) -> str:
-        """The class of the effect and what it acts on: ``BodyMass torso``, ``ActionGain 3``, ``Gravity``."""
+        """The class of the effect and its selection: ``BodyMass torso``, ``ActionGain 3``, ``Gravity``."""
         fields = [f.name for f in dataclasses.fields(self.effect) if f.name not in self.effect.parameters]
         return " ".join([type(self.effect).__name__, *(_label(getattr(self.effect, field)) for field in fields)])
 
     @property
     def fitted(self) -> tuple[str, ...]:
-        """The names of the parameters to fit."""
+        """The names of the fitted parameters."""
         return tuple(self.trials[0])
 
     @property
     def starts(self) -> tuple[Effect, ...]:
-        """The effect at each of the trials."""
+        """The effect with the values of each trial."""
         return tuple(self.effect.with_parameters(trial) for trial in self.trials)
 
 
@@ -65,14 +65,14 @@ def entries_of(
     choices: Mapping[Names | Indices, tuple[int, ...]],
     trials: Callable[[tuple[int, ...]], Trials],
 ) -> Iterator[CatalogueEntry]:
-    """An entry for each of the choices of what an effect acts on.
+    """Yields one entry per selection of what an effect acts on.
 
     Args:
         effect: the class of the effect.
-        field: its field that says what it acts on.
-        choices: the indices that are selected, by the selection.
-        trials: from the indices that are selected to the trials, which are cut off at the bounds of
-            the effect. Without trials there is no entry.
+        field: the field of the effect that holds the selection.
+        choices: the selected indices, by selection.
+        trials: returns the trials for selected indices. Their values are clipped to the bounds of the effect; a
+            selection without trials gives no entry.
 
     Yields:
         The entries.
@@ -89,7 +89,7 @@ def entries_of(
 
 
 def each(parameter: str, *values: float) -> Trials:
-    """Trials of one parameter."""
+    """Returns one trial per value of a single parameter."""
     return tuple({parameter: value} for value in values)
 
 

@@ -1,20 +1,19 @@
-"""Finds which elements of a model belong together by their names: the thighs, the feet, the left leg."""
+"""Groups the elements of a model by shared words in their names, such as thighs, feet or the left leg."""
 
 import re
 from collections.abc import Sequence
 
-_SIDES = "bflr"  # back, front, left, right: bthigh and fthigh are thighs
+_SIDES = "bflr"  # prefixes back, front, left and right of MuJoCo's models: bthigh and fthigh are thighs
 
 
 def families(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
-    """Groups of at least two names that share a word.
+    """Returns groups of at least two names that share a word.
 
-    Words are what stands between digits, underscores and other marks; a letter for the side in front
-    of a word is taken off too, where that makes a group. A group that several words make is there
-    once, under the first of them.
+    Words are separated by digits, underscores and other marks. A leading letter for the side is also removed from a
+    word where that forms a group. A group that several words form is listed once, under the first of them.
 
     Args:
-        names: the names; one without letters is in no group.
+        names: the names; a name without letters belongs to no group.
 
     Returns:
         The indices of the names in each group, by the shared word.
@@ -27,7 +26,7 @@ def families(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
     """
     words = [re.findall(r"[^\W\d_]+", name) for name in names]
     sided = [[word[1:] for word in own if word[0].lower() in _SIDES and len(word) > 3] for own in words]
-    # whole words go first: "left" makes the same group as "eft"
+    # whole words first, so that a group is named "left" rather than "eft"
     groups = {}
     for candidates in (words, [own + bare for own, bare in zip(words, sided, strict=True)]):
         for word in dict.fromkeys(word for own in candidates for word in own):

@@ -1,6 +1,6 @@
-"""What a compiled model is built like, as far as a catalogue of effects has to know.
+"""Structural facts about a compiled model that size and select the entries of a catalogue.
 
-Which joints carry a floating root, what moves in one plane, what can touch, and how large torques are.
+These are floating roots, planar motion, possible contacts, and the magnitudes of torques and inertias.
 """
 
 import mujoco
@@ -8,7 +8,7 @@ import numpy as np
 
 from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
 
-# as integers: MuJoCo's own constants are not found in tuples by the integers that a model holds
+# converted to integers, because MuJoCo's constants do not compare equal to a model's integers inside tuples
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _ROUND = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("SPHERE", "CYLINDER", "ELLIPSOID"))
@@ -33,19 +33,19 @@ class Mechanism:
         self.weight = self.mass * float(np.linalg.norm(model.opt.gravity))
 
     def driven(self, joint: int) -> bool:
-        """Whether an actuator acts on a joint by itself."""
+        """Whether an actuator acts on this joint alone."""
         return joint in self._joint_of_actuators()
 
     def actuator_label(self, actuator: int) -> str:
-        """The name of an actuator, or of the joint that it drives."""
+        """Returns the name of an actuator, or of the joint that it drives."""
         name, joint = self.model.actuator(actuator).name, self._joint_of_actuators()[actuator]
         return name or (self.model.joint(joint).name if joint is not None else "")
 
     def floating(self, joint: int) -> bool:
-        """Whether a joint lets the whole mechanism float: no bearing, in which nothing rubs or springs.
+        """Whether a joint lets the whole mechanism float. Such a joint is no bearing and has no friction or spring.
 
-        Such are a free joint, and undriven joints, at least two and one of them sliding, between the
-        world and one body.
+        These are free joints, and groups of at least two undriven joints, one of them sliding, between the world and
+        one body.
         """
         model, body = self.model, self.model.jnt_bodyid[joint]
         if model.jnt_type[joint] == _FREE:
@@ -56,7 +56,7 @@ class Mechanism:
         return any(self.slides(mate) for mate in mates)
 
     def planar(self, body: int) -> bool:
-        """Whether a body can move in the x-z plane alone: slides in it, hinges about y."""
+        """Whether a body moves only in the x-z plane: all joints up to the world slide in it or turn about y."""
         while body:
             first = self.model.body_jntadr[body]
             for joint in range(first, first + self.model.body_jntnum[body]):
@@ -69,22 +69,22 @@ class Mechanism:
         return True
 
     def axes(self, body: int) -> tuple[str, ...]:
-        """The axes of a body's frame along which it matters where its mass lies."""
+        """Returns the axes of a body's frame along which a shift of its mass has an effect."""
         return ("x", "z") if self.planar(body) else ("x", "z", "y")
 
     def slides(self, joint: int) -> bool:
-        """Whether a joint is a sliding one."""
+        """Whether a joint is a sliding joint."""
         return self.model.jnt_type[joint] == _SLIDE
 
     def wheel(self, geom: int) -> bool:
-        """Whether a geom can roll: round, on a body that turns without a limit against another."""
+        """Whether a geom can roll: a round geom on a body with an unlimited hinge."""
         model, body = self.model, self.model.geom_bodyid[geom]
         joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
         turning = any(model.jnt_type[j] == _HINGE and not model.jnt_limited[j] for j in joints)
         return turning and model.geom_type[geom] in _ROUND and not any(self.floating(j) for j in joints)
 
     def torque(self, joint: int) -> float:
-        """The largest torque (force) on a joint: its actuator's, else the weight (times 0.1 m)."""
+        """Returns the largest torque (force) on a joint: that of its actuator, else the weight (times the lever)."""
         largest = 0.0
         for actuator, target in enumerate(self._joint_of_actuators()):
             if target == joint:
@@ -93,21 +93,21 @@ class Mechanism:
         return largest or self.weight * lever or 1.0
 
     def control(self, actuator: int) -> float:
-        """The largest control of an actuator, 1 if it has no limit."""
+        """Returns the largest magnitude of an actuator's control, 1 if it has no limit."""
         if not self.model.actuator_ctrllimited[actuator]:
             return 1.0
         return float(np.abs(self.model.actuator_ctrlrange[actuator]).max())
 
     def inertia(self, joint: int) -> float:
-        """The inertia of the whole mechanism that a joint feels, in kg·m² (kg)."""
+        """Returns the inertia of the mechanism about a joint, in kg·m² (kg for a sliding joint)."""
         return float(self.model.dof_M0[self.model.jnt_dofadr[joint]])
 
     def radius_of_gyration(self, body: int) -> float:
-        """The square root of a body's largest inertia over its mass, in m."""
+        """Returns the square root of a body's largest moment of inertia over its mass, in m."""
         return float(np.sqrt(self.model.body_inertia[body].max() / self.model.body_mass[body]))
 
     def touching(self) -> list[tuple[int, int]]:
-        """The pairs of geoms that may collide by their masks, on bodies that move against each other."""
+        """Returns the pairs of geoms whose masks allow a collision, on bodies that move relative to each other."""
         model, pairs = self.model, []
         weld, parent = model.body_weldid, model.body_parentid
         for a in range(model.ngeom):
@@ -116,7 +116,7 @@ class Mechanism:
                     model.geom_contype[b] & model.geom_conaffinity[a]
                 )
                 one, other = weld[model.geom_bodyid[a]], weld[model.geom_bodyid[b]]
-                # MuJoCo's filter: no contact between a body and its parent, unless that is the world
+                # MuJoCo's filter excludes contacts between a body and its parent, unless the parent is the world
                 kin = one and other and (weld[parent[one]] == other or weld[parent[other]] == one)
                 if masks and one != other and not kin:
                     pairs.append((a, b))

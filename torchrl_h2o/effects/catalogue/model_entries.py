@@ -1,6 +1,6 @@
-"""The entries of a catalogue for the bodies, joints and geoms of a model, and for forces on them.
+"""Catalogue entries for the bodies, joints and geoms of a model, and for forces on them.
 
-Values to start from are sized by the model: inertias and torques at the joints, masses of the bodies.
+The trial values are sized by the model's inertias and torques at the joints and by the masses of the bodies.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -24,17 +24,17 @@ Choices = dict[Names, tuple[int, ...]]
 
 
 def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
-    """Mass, inertia, centre of mass and payload of the bodies that have a mass."""
+    """Yields entries for mass, inertia, centre of mass and payload of the bodies that have a mass."""
     model = mechanism.model
     heavy = [b for b in range(1, model.nbody) if model.body_weldid[b] and model.body_mass[b] > mujoco.mjMINVAL]
     paths = _body_paths(model)
-    # indices without the world, as the patterns for bodies count
+    # indices that skip the world, as the name patterns of bodies do
     eligible, massless = [b - 1 for b in heavy], set(range(model.nbody - 1)) - {b - 1 for b in heavy}
     yield from _factors(mechanism, BodyMass, "bodies", named_choices(paths, eligible, passed_over=massless))
     singles = named_choices(paths, eligible, groups=False)
     yield from _factors(mechanism, BodyInertia, "bodies", singles)
     yield from entries_of(BodyCentreOfMass, "bodies", singles, lambda chosen: _shifts(mechanism, chosen[0] + 1))
-    # what carries something is a trunk or the end of a limb
+    # a payload sits on a trunk or at the end of a limb
     carrying = {
         name: (index,)
         for name, (index,) in singles.items()
@@ -44,7 +44,7 @@ def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
 
 
 def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
-    """Range, springs, damping, friction and armature of the joints, but of those that let a root float."""
+    """Yields entries for range, springs, damping, friction and armature of the joints, except floating roots."""
     model = mechanism.model
     bearings = [j for j in mechanism.single_joints if not mechanism.floating(j)]
     limited = [j for j in bearings if model.jnt_limited[j]]
@@ -68,7 +68,7 @@ def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
 
 
 def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
-    """Size, length, friction, softness and rolling of the geoms that weigh or touch something."""
+    """Yields entries for size, length, friction, softness and rolling of geoms that have mass or contacts."""
     model, pairs = mechanism.model, mechanism.touching()
     everything, touching = set(range(model.ngeom)), sorted({geom for pair in pairs for geom in pair})
     moving = [g for g in everything if model.body_weldid[model.geom_bodyid[g]]]
@@ -106,7 +106,7 @@ def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[Catalogu
 
 
 def force_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
-    """Constant forces on joints, and drag on the bodies that stand on the world or on all together."""
+    """Yields entries for constant forces on joints, and for drag on root bodies and on all bodies."""
     model = mechanism.model
     pushed = [j for j in mechanism.single_joints if mechanism.slides(j) or not mechanism.floating(j)]
     forces = _signed(mechanism.torque, "torque", 0.05)
@@ -129,13 +129,13 @@ def _factors(mechanism: Mechanism, effect: type, field: str, choices: Choices) -
 
 
 def _shifts(mechanism: Mechanism, body: int) -> Trials:
-    """Along every axis that counts, to both sides."""
+    """Returns shifts of the centre of mass in both directions of every axis that has an effect."""
     far, axes = 0.5 * mechanism.radius_of_gyration(body), mechanism.axes(body)
     return tuple({**dict.fromkeys(axes, 0.0), axis: sign * far} for axis in axes for sign in (1.0, -1.0))
 
 
 def _loads(mechanism: Mechanism, body: int) -> Trials:
-    """A light and a heavy payload at the centre of mass."""
+    """Returns a light and a heavy payload at the centre of mass."""
     model = mechanism.model
     centre = dict(zip("xyz", model.body_ipos[body], strict=True))
     place = {axis: centre[axis] for axis in mechanism.axes(body)}
@@ -145,7 +145,14 @@ def _loads(mechanism: Mechanism, body: int) -> Trials:
 def _added(
     size: Callable[[int], float], parameter: str, shares: Sequence[float], own: Callable[[int], float] | None = None
 ) -> Callable[[tuple[int, ...]], Trials]:
-    """Trials that add shares of the joints' median size, and one that takes half of what all have."""
+    """Returns trials that add shares of the joints' median size, and one that removes half of the smallest own value.
+
+    Args:
+        size: returns the size for a joint, in units of the parameter.
+        parameter: the name of the parameter.
+        shares: shares of the median size.
+        own: returns the joint's present value; without it nothing is removed.
+    """
 
     def trials(joints: tuple[int, ...]) -> Trials:
         typical = float(np.median([size(j) for j in joints]))
@@ -179,7 +186,7 @@ def _weighing(mechanism: Mechanism, spec: mujoco.MjSpec, geoms: Sequence[int]) -
 def _rubs_otherwise(
     model: mujoco.MjModel, pairs: Sequence[tuple[int, int]], geoms: Sequence[int], factor: float
 ) -> bool:
-    """Whether any contact has another friction once that of the geoms is scaled: the larger counts."""
+    """Whether scaling the friction of geoms changes any contact, which uses the larger of its two frictions."""
     before = model.geom_friction[:, 0]
     after = before.copy()
     after[list(geoms)] *= factor

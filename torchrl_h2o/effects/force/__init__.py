@@ -1,1 +1,1 @@
-"""Effects that are generalised forces, applied at every physics step."""
+"""Effects that are generalised forces."""

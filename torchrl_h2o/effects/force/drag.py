@@ -1,4 +1,4 @@
-"""Effects that are generalised forces, put on the joints at every physics step."""
+"""Constant forces on joints and drag on bodies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ from torchrl_h2o.effects.selection import Names
 
 @dataclass(frozen=True)
 class JointForce(ForceEffect):
-    """A constant torque (on a sliding joint: a force) on joints.
+    """A constant torque on joints; a force on sliding joints.
 
     Args:
-        torque: the torque in N·m, or the force in N, on every degree of freedom.
+        torque: torque in N·m, or force in N, on every degree of freedom of the joints.
         joints: name patterns of the joints.
 
     Raises:
@@ -45,7 +45,7 @@ class JointForce(ForceEffect):
 
 @dataclass(frozen=True)
 class LinearDrag(ForceEffect):
-    """A force on bodies against the velocity of their centre of mass and proportional to it.
+    """Drag on bodies, proportional to the velocity of their centre of mass.
 
     Args:
         coefficient: force per velocity, in N·s/m.
@@ -69,7 +69,7 @@ class LinearDrag(ForceEffect):
 
 @dataclass(frozen=True)
 class QuadraticDrag(ForceEffect):
-    """A force on bodies against the velocity v of their centre of mass, -c |v| v, as of air or water.
+    """Drag on bodies, -c |v| v for the velocity v of their centre of mass, as in air or water.
 
     Args:
         coefficient: c, force per velocity squared, in N·s²/m².
@@ -92,7 +92,7 @@ class QuadraticDrag(ForceEffect):
 
 
 def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[float], float]) -> Force:
-    """The force on bodies against their velocity, of a resistance (N·s/m) that depends on the speed."""
+    """Returns the drag on bodies for a resistance in N·s/m that depends on the speed in m/s."""
     bodies = selection.body_ids(model, names)
     jacobian = np.zeros((3, model.nv))
 

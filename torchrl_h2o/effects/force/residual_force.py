@@ -1,4 +1,4 @@
-"""A force that no catalogue holds: a sum of terms found in measured data, written as text."""
+"""A generalised force given as a sum of terms in text form, as found in measured data."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ class DegreeOfFreedom:
     """A degree of freedom of a model.
 
     Args:
-        name: the joint's name; of a free or ball joint with the axis behind it.
+        name: the joint's name, with the axis appended for a free or ball joint.
         velocity: its index in ``qvel``.
-        position: its index in ``qpos``, None for rotations in space.
-        sliding: whether it is in m, else in rad.
+        position: its index in ``qpos``; None for rotations in space.
+        sliding: whether it is a translation in m rather than a rotation in rad.
     """
 
     name: str
@@ -36,15 +36,15 @@ class DegreeOfFreedom:
 class ResidualForce(ForceEffect):
     """A generalised force that is a sum of terms in position, velocity, action and time.
 
-    Every term is a text, ``"torque on elbow: 0.41 · sin(7 q)"``, see
-    :class:`~torchrl_h2o.effects.force.term.ForceTerm`. Its parameters are the terms' coefficients (neutral: zero) and
-    the frequencies, phases and starts in them; of the second term, ``coefficient_2``, ``frequency_2`` and so on.
+    Every term is a string such as ``"torque on elbow: 0.41 · sin(7 q)"``; see
+    :class:`~torchrl_h2o.effects.force.term.ForceTerm`. The parameters are the terms' coefficients (neutral value zero)
+    and the frequencies, phases and start times in them, numbered by term: ``coefficient_2``, ``frequency_2``.
 
     Args:
         terms: the terms.
 
     Raises:
-        ValueError: for a text that is no term; when put into a model that has no such joint, control or coordinate.
+        ValueError: for a string that is no term; when put into a model that has no such joint, control or coordinate.
 
     Examples:
         >>> ripple = ResidualForce(("torque on elbow: 0.41 · sin(7 q)",))
@@ -65,7 +65,7 @@ class ResidualForce(ForceEffect):
 
     @cached_property
     def parsed(self) -> tuple[ForceTerm, ...]:
-        """The terms, read."""
+        """The terms, parsed."""
         return tuple(ForceTerm.parse(term) for term in self.terms)
 
     @property
@@ -114,7 +114,7 @@ class ResidualForce(ForceEffect):
 
 
 def degrees_of_freedom(model: mujoco.MjModel) -> list[DegreeOfFreedom]:
-    """The degrees of freedom of a model, in its order.
+    """Returns the degrees of freedom of a model, in the model's order.
 
     Examples:
         >>> free = mujoco.MjModel.from_xml_string(
@@ -140,7 +140,16 @@ def degrees_of_freedom(model: mujoco.MjModel) -> list[DegreeOfFreedom]:
 def coordinate(
     name: str, freedom: DegreeOfFreedom, qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray
 ) -> np.ndarray:
-    """The values (...) of a coordinate of a term, in states (..., nq), (..., nv), at controls (..., nu), time (...)."""
+    """Returns the values (...) of a coordinate of a term.
+
+    Args:
+        name: ``q``, ``v``, ``t`` or ``a0``, ``a1``, ...
+        freedom: the degree of freedom that the force acts on.
+        qpos: positions, (..., nq).
+        qvel: velocities, (..., nv).
+        ctrl: controls, (..., nu).
+        time: time in s, (...).
+    """
     if name == "q":
         return qpos[..., freedom.position]
     if name == "v":

@@ -1,6 +1,6 @@
-"""A term of a generalised force, written as text: ``torque on elbow: 0.41 · sin(7 q)``.
+"""Terms of a generalised force in text form: ``torque on elbow: 0.41 · sin(7 q)``.
 
-A term is a coefficient times factors from a closed set, read by patterns: no text is ever evaluated.
+A term is a coefficient times factors from a fixed set. Terms are parsed with patterns; no text is evaluated as code.
 """
 
 import re
@@ -23,21 +23,21 @@ _FACTORS = {
     "step": re.compile(rf"step\(t - ({_NUMBER})\)"),
 }
 _RAISED = str.maketrans({"2": "²", "3": "³", "4": "⁴", "5": "⁵", "6": "⁶", "7": "⁷", "8": "⁸", "9": "⁹"})
-_LARGEST = 1e9
+_LARGEST = 1e9  # nominal bound: every Parameter has bounds, and a number in a term has no physical limit
 
 
 @dataclass(frozen=True)
 class Factor:
     """One factor of a term, a function of one coordinate.
 
-    The coordinates are of the degree of freedom that the force acts on, its position ``q`` and velocity ``v``, or an
-    entry of the controls, ``a0``, or the time ``t``; all in SI units.
+    A coordinate is the position ``q`` or velocity ``v`` of the degree of freedom that the force acts on, an entry of
+    the controls such as ``a0``, or the time ``t``, in SI units.
 
     Args:
         function: ``power``, ``size`` (the absolute value), ``sign``, ``sin`` or ``step``.
         coordinate: ``q``, ``v``, ``a0``, ``a1``, ..., or ``t``.
-        exponent: of a power.
-        numbers: frequency and phase of a sine; the start of a step.
+        exponent: exponent of a power.
+        numbers: frequency and phase of a sine; start time of a step.
 
     Examples:
         >>> str(Factor("sin", "q", numbers=(7.0, 0.5))), str(Factor("power", "v", 3))
@@ -51,7 +51,7 @@ class Factor:
 
     @classmethod
     def parse(cls, text: str) -> "Factor":
-        """The factor that a text stands for; raises ValueError for anything else."""
+        """Parses a factor; raises ValueError for a string that is none."""
         for function, pattern in _FACTORS.items():
             if match := pattern.fullmatch(text):
                 return cls._read(function, match.groups())
@@ -74,7 +74,7 @@ class Factor:
         return self.written(_exact)
 
     def written(self, number: Callable[[float], str]) -> str:
-        """The text of the factor, its numbers written by a function."""
+        """Returns the text of the factor, with its numbers formatted by a function."""
         if self.function == "power":
             return self.coordinate if self.exponent == 1 else f"{self.coordinate}^{self.exponent}"
         if self.function == "size":
@@ -88,7 +88,7 @@ class Factor:
         return f"sin({number(frequency)} {self.coordinate}{shift})"
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """The factor at values of its coordinate, of any shape."""
+        """Evaluates the factor at values of its coordinate, of any shape."""
         if self.function == "power":
             return values**self.exponent
         if self.function == "sin":
@@ -98,7 +98,11 @@ class Factor:
         return np.abs(values) if self.function == "size" else np.sign(values)
 
     def parameters(self, sliding: bool) -> dict[str, Parameter]:
-        """The numbers by name, in their units; no value of theirs is neutral."""
+        """Returns the numbers by name, with units. They have no neutral value (NaN).
+
+        Args:
+            sliding: whether the degree of freedom is a translation in m rather than a rotation in rad.
+        """
         per = {"q": "rad/m" if sliding else "1", "v": "rad·s/m" if sliding else "s", "t": "rad/s"}
         names = {"sin": ("frequency", "phase"), "step": ("start",)}.get(self.function, ())
         units = {"frequency": per.get(self.coordinate, "1"), "phase": "rad", "start": "s"}
@@ -113,10 +117,10 @@ class ForceTerm:
     """A coefficient times factors, as a force on one degree of freedom.
 
     Args:
-        joint: the joint's name; of a free or ball joint with the axis behind it, ``root_x`` or ``root_pitch``.
-        coefficient: in SI units.
-        factors: of the term, none for a constant.
-        sliding: whether it is a force in N, else it is a torque in N·m.
+        joint: the joint's name; for a free or ball joint with the axis appended, ``root_x`` or ``root_pitch``.
+        coefficient: coefficient in SI units.
+        factors: factors of the term; none for a constant force.
+        sliding: whether the term is a force in N rather than a torque in N·m.
 
     Examples:
         >>> wind = ForceTerm.parse("force on slider: -0.02 · v^3")
@@ -131,7 +135,7 @@ class ForceTerm:
 
     @classmethod
     def parse(cls, text: str) -> "ForceTerm":
-        """The term that a text stands for; raises ValueError for anything else."""
+        """Parses a term; raises ValueError for a string that is none."""
         match = _TERM.fullmatch(text)
         if match is None:
             raise ValueError(f"{text!r} is no term of a force; write it like 'torque on elbow: 0.41 · sin(7 q)'")
@@ -149,7 +153,7 @@ class ForceTerm:
 
     @property
     def unit(self) -> str:
-        """The unit of the coefficient: that of the force over those of the factors."""
+        """The unit of the coefficient: the unit of the force divided by the units of the factors."""
         length, time = 0, 0
         for factor in self.factors:
             if factor.function in ("power", "size"):
@@ -162,12 +166,12 @@ class ForceTerm:
         return "·".join(force) + (f"/{below}" if below else "")
 
     def words(self) -> str:
-        """The term in words, with units."""
+        """Describes the term in words, with units."""
         factors = [re.sub(r"\^(\d)", lambda m: m[1].translate(_RAISED), f.written(_rounded)) for f in self.factors]
         return _TIMES.join([f"{self.kind} on joint {self.joint}: {self.coefficient:.4g} {self.unit}", *factors])
 
     def parameters(self) -> dict[str, Parameter]:
-        """The coefficient and the numbers in the factors, by name."""
+        """Returns the coefficient and the numbers in the factors, by name."""
         found = {"coefficient": Parameter(self.coefficient, self.unit, (-_LARGEST, _LARGEST), 0.0)}
         for factor in self.factors:
             for name, value in factor.parameters(self.sliding).items():
@@ -175,7 +179,7 @@ class ForceTerm:
         return found
 
     def with_parameters(self, values: dict[str, float]) -> "ForceTerm":
-        """The term with other values, some or all by name."""
+        """Returns the term with other values for some or all of its parameters, by name."""
         given = {name: parameter.value for name, parameter in self.parameters().items()} | values
         numbers = [float(value) for value in given.values()]
         coefficient, rest, factors = numbers[0], numbers[1:], []
@@ -185,7 +189,11 @@ class ForceTerm:
         return replace(self, coefficient=coefficient, factors=tuple(factors))
 
     def shape(self, coordinate: Callable[[str], np.ndarray]) -> np.ndarray | float:
-        """The product of the factors, from a function that returns the values of a coordinate."""
+        """Returns the product of the factors.
+
+        Args:
+            coordinate: returns the values of a coordinate by its name.
+        """
         product = 1.0
         for factor in self.factors:
             product = product * factor(coordinate(factor.coordinate))

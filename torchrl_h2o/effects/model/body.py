@@ -1,4 +1,4 @@
-"""Effects on bodies: how heavy they are, and where their mass lies."""
+"""Effects on bodies: mass, inertia, centre of mass and payload."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -15,9 +15,9 @@ from torchrl_h2o.effects.selection import Names
 
 @dataclass(frozen=True)
 class BodyMass(ModelEffect):
-    """Mass and inertia of bodies, scaled together: the same shape of another density.
+    """Scales the mass and inertia of bodies together, as a change of density does.
 
-    The other bodies keep their masses, also in a model that fixes its total (``settotalmass``).
+    The other bodies keep their masses, even in a model with a fixed total mass (``settotalmass``).
 
     Args:
         scale: factor on mass and inertia.
@@ -38,7 +38,7 @@ class BodyMass(ModelEffect):
     def edit(self, spec: mujoco.MjSpec) -> None:
         before = compile_unscaled(spec).body_mass.sum()
         for body in selection.bodies(spec, self.bodies):
-            # Given explicitly or derived from the geoms: the compiler reads one of the two.
+            # the compiler reads either the explicit values or those of the geoms, so both are scaled
             body.mass *= self.scale
             body.inertia *= self.scale
             body.fullinertia *= self.scale
@@ -46,15 +46,15 @@ class BodyMass(ModelEffect):
                 geom.density *= self.scale
                 geom.mass *= self.scale
         if spec.compiler.settotalmass > 0.0:
-            # The compiler scales all bodies to the total, so that has to change with the chosen.
+            # the compiler scales all bodies to this total, so it has to change with the selected bodies
             spec.compiler.settotalmass *= compile_unscaled(spec).body_mass.sum() / before
 
 
 @dataclass(frozen=True)
 class BodyInertia(ModelEffect):
-    """Rotational inertia of bodies, scaled at the same mass: mass nearer to the centre or further out.
+    """Scales the rotational inertia of bodies at constant mass.
 
-    The bodies' masses and inertias no longer follow from their geoms: put effects on the geoms first.
+    Afterwards the bodies' masses and inertias no longer follow from their geoms, so effects on geoms must come first.
 
     Args:
         scale: factor on the inertia about the centre of mass.
@@ -80,9 +80,9 @@ class BodyInertia(ModelEffect):
 
 @dataclass(frozen=True)
 class BodyCentreOfMass(ModelEffect):
-    """The centre of mass of bodies, shifted; mass, and inertia about the centre, stay.
+    """Shifts the centre of mass of bodies; mass and inertia about the centre stay the same.
 
-    The bodies' masses and inertias no longer follow from their geoms: put effects on the geoms first.
+    Afterwards the bodies' masses and inertias no longer follow from their geoms, so effects on geoms must come first.
 
     Args:
         x: shift along the x axis of the body's frame, in m.
@@ -113,16 +113,16 @@ class BodyCentreOfMass(ModelEffect):
 
 @dataclass(frozen=True)
 class Payload(ModelEffect):
-    """A point mass fixed to bodies: a battery, a camera, what the robot carries.
+    """A point mass fixed to bodies, such as a battery or a camera.
 
-    The bodies' masses and inertias no longer follow from their geoms: put effects on the geoms first.
-    Without a mass, the position changes nothing.
+    Afterwards the bodies' masses and inertias no longer follow from their geoms, so effects on geoms must come first.
+    The position has no effect while the mass is zero.
 
     Args:
-        mass: of the payload on every body, in kg.
-        x: where it is on the x axis of the body's frame, in m.
-        z: where it is on the z axis of the body's frame, in m.
-        y: where it is on the y axis of the body's frame, in m.
+        mass: mass of the payload on each body, in kg.
+        x: x coordinate in the body's frame, in m.
+        z: z coordinate in the body's frame, in m.
+        y: y coordinate in the body's frame, in m.
         bodies: name patterns of the bodies.
 
     Raises:

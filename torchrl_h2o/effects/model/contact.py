@@ -1,4 +1,4 @@
-"""Effects on what geoms do when they touch: how softly they give way, how hard they roll."""
+"""Effects on contacts: softness and rolling resistance."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,10 +13,10 @@ from torchrl_h2o.effects.selection import Names
 
 @dataclass(frozen=True)
 class ContactSoftness(ModelEffect):
-    """How slowly contacts push geoms apart: the time constant of their ``solref``, scaled.
+    """Scales the time constant of contacts (``solref``).
 
-    The damping ratio stays. A contact takes the mean of its two geoms. MuJoCo refuses time constants
-    below two physics steps, so that a hard contact may not get harder.
+    The damping ratio stays the same. A contact uses the mean of its two geoms. MuJoCo does not accept time constants
+    below two physics steps, so contacts that are already that hard cannot become harder.
 
     Args:
         scale: factor on the time constant.
@@ -38,20 +38,20 @@ class ContactSoftness(ModelEffect):
         for geom in selection.geoms(spec, self.geoms):
             if geom.solref[0] > 0.0:
                 geom.solref[0] *= self.scale
-            else:  # minus stiffness and minus damping, which go with 1/time² and 1/time
+            else:  # -stiffness and -damping, which scale with 1/time² and 1/time
                 geom.solref[0] /= self.scale**2
                 geom.solref[1] /= self.scale
 
 
 @dataclass(frozen=True)
 class RollingResistance(ModelEffect):
-    """Resistance to rolling, as of a soft wheel or a carpet: a torque of ``coefficient`` · load.
+    """Rolling resistance, as of a soft wheel or a carpet: a torque of ``coefficient`` · load.
 
-    The geoms' contacts get the rolling friction of MuJoCo (``condim`` 6). Where they had none, the
-    torsional friction that the geom names begins to act as well.
+    The geoms' contacts use MuJoCo's rolling friction (``condim`` 6). Where it was inactive before, the geom's torsional
+    friction becomes active as well.
 
     Args:
-        coefficient: added to the rolling friction that acts already, in m.
+        coefficient: addition to the active rolling friction, in m.
         geoms: name patterns of the geoms.
 
     Raises:
@@ -70,5 +70,5 @@ class RollingResistance(ModelEffect):
         for geom in selection.geoms(spec, self.geoms):
             if self.coefficient and geom.condim < 6:
                 geom.condim = 6
-                geom.friction[2] = 0.0  # stood in the model but did not act
+                geom.friction[2] = 0.0  # the model's value was inactive with this condim
             geom.friction[2] += self.coefficient

@@ -1,4 +1,4 @@
-"""Effects on geoms: the shape of the limbs, and how they rub."""
+"""Effects on geoms: size, length and friction."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,10 +14,9 @@ from torchrl_h2o.effects.selection import Names
 
 @dataclass(frozen=True)
 class GeomFriction(ModelEffect):
-    """All three friction coefficients (sliding, torsional, rolling) of geoms, scaled.
+    """Scales all three friction coefficients (sliding, torsional, rolling) of geoms.
 
-    A contact takes the larger coefficient of its two geoms, so that to scale one of them alone may
-    change nothing.
+    A contact uses the larger coefficient of its two geoms, so scaling only one of them may change nothing.
 
     Args:
         scale: factor on the coefficients.
@@ -30,7 +29,7 @@ class GeomFriction(ModelEffect):
         >>> GeomFriction(0.3).describe()
         'friction of all geoms × 0.3'
 
-    Source: H2O+ (arXiv 2309.12716), the gap ``friction``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gap ``friction``.
     """
 
     wording: ClassVar[str] = "friction of {geoms} × {scale}"
@@ -44,10 +43,10 @@ class GeomFriction(ModelEffect):
 
 @dataclass(frozen=True)
 class GeomSize(ModelEffect):
-    """Every number of the size of geoms, scaled: a capsule's radius and its half length.
+    """Scales all entries of the size of geoms, such as the radius and half length of a capsule.
 
-    A geom given by its two ends (``fromto``) has no length in its size; see :class:`GeomLength`.
-    Masses and inertias follow where the model derives them from its geoms.
+    The size of a geom that is given by its two ends (``fromto``) does not include its length; see :class:`GeomLength`.
+    Masses and inertias change with the size where the model derives them from its geoms.
 
     Args:
         scale: factor on the sizes.
@@ -60,7 +59,7 @@ class GeomSize(ModelEffect):
         >>> GeomSize(2.0, geoms="*thigh*").describe()
         'size of geoms *thigh* × 2'
 
-    Source: H2O+ (arXiv 2309.12716), the gaps ``big_thigh`` and ``small_thigh``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gaps ``big_thigh`` and ``small_thigh``.
     """
 
     wording: ClassVar[str] = "size of {geoms} × {scale}"
@@ -74,20 +73,20 @@ class GeomSize(ModelEffect):
 
 @dataclass(frozen=True)
 class GeomLength(ModelEffect):
-    """The two ends (``fromto``) of geoms, scaled about the origin of their body.
+    """Scales the two ends (``fromto``) of geoms about the origin of their body.
 
     Args:
         scale: factor on the coordinates of both ends.
         geoms: name patterns of the geoms.
 
     Raises:
-        ValueError: when put into a model that has no such geom, or gives it by position and size.
+        ValueError: when put into a model that has no such geom, or that defines it by position and size.
 
     Examples:
         >>> GeomLength(4.0, geoms="torso").describe()
         'length of geoms torso × 4'
 
-    Source: H2O+ (arXiv 2309.12716), the gap ``long_torso``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gap ``long_torso``.
     """
 
     wording: ClassVar[str] = "length of {geoms} × {scale}"

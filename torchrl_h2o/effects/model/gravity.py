@@ -1,4 +1,4 @@
-"""Effects on gravity: how strong it is and where it points."""
+"""Effects on the magnitude and direction of gravity."""
 
 from dataclasses import dataclass
 from math import cos, pi, sin
@@ -12,7 +12,7 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class Gravity(ModelEffect):
-    """Gravity, scaled.
+    """Scales gravity.
 
     Args:
         scale: factor on the model's own gravity.
@@ -21,7 +21,7 @@ class Gravity(ModelEffect):
         >>> Gravity(2.0).describe()
         'gravity × 2'
 
-    Source: H2O+ (arXiv 2309.12716), the gap ``gravity``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gap ``gravity``.
     """
 
     wording: ClassVar[str] = "gravity × {scale}"
@@ -33,10 +33,10 @@ class Gravity(ModelEffect):
 
 @dataclass(frozen=True)
 class GravityTilt(ModelEffect):
-    """Gravity, turned: what a slope is to a robot that calls its floor level.
+    """Tilts gravity, which models a sloping floor in a simulator whose floor is level.
 
-    Gravity is turned about the world's x axis by ``roll``, then about its y axis by ``pitch``. A floor
-    that rises towards +x by an angle has gravity pitched by that angle.
+    Gravity is rotated about the world's x axis by ``roll``, then about its y axis by ``pitch``. A floor that rises
+    towards +x by some angle corresponds to a pitch of that angle.
 
     Args:
         pitch: angle about the world's y axis, in rad.
@@ -55,7 +55,7 @@ class GravityTilt(ModelEffect):
     roll: float = parameter(unit="rad", bounds=(-pi, pi), neutral=0.0)
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        if self.is_neutral:  # to turn by nothing would still make a -0.0 a 0.0
+        if self.is_neutral:  # a rotation by zero would still change -0.0 to 0.0
             return
         x, y, z = spec.option.gravity
         y, z = cos(self.roll) * y - sin(self.roll) * z, sin(self.roll) * y + cos(self.roll) * z

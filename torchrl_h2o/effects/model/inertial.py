@@ -1,7 +1,7 @@
-"""The inertial of a body, mass, centre of mass and inertia together, to read and to rewrite.
+"""Reads and rewrites the inertial of a body: its mass, centre of mass and inertia.
 
-A model may give it, or leave it to the compiler to derive it from the body's geoms. Here it is read off
-a compiled copy and written back as given, for the chosen bodies alone.
+A model gives the inertial explicitly or lets the compiler derive it from the body's geoms. Here it is read from a
+compiled copy and written back as an explicit one, for the selected bodies only.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,12 +15,12 @@ from torchrl_h2o.effects.model.compilation import compile_model
 
 @dataclass(frozen=True)
 class Inertial:
-    """How the mass of a body is distributed, in the body's frame.
+    """The mass distribution of a body, in the body's frame.
 
     Args:
-        mass: in kg.
-        centre: the centre of mass (3,), in m.
-        inertia: about the centre of mass (3, 3), in kg·m².
+        mass: mass in kg.
+        centre: centre of mass (3,), in m.
+        inertia: inertia about the centre of mass (3, 3), in kg·m².
     """
 
     mass: float
@@ -28,7 +28,7 @@ class Inertial:
     inertia: np.ndarray
 
     def with_point_mass(self, mass: float, position: np.ndarray) -> "Inertial":
-        """This inertial and a point mass (kg) at a position (3,), in m, as one."""
+        """Returns the inertial combined with a point mass in kg at a position (3,) in m."""
         total = self.mass + mass
         centre = (self.mass * self.centre + mass * position) / total
         own = self.inertia + _of_point(self.mass, self.centre - centre)
@@ -38,18 +38,18 @@ class Inertial:
 def edit_inertials(
     spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody], change: Callable[[Inertial], Inertial]
 ) -> None:
-    """Rewrites the inertials of bodies, which no longer follow from their geoms after that.
+    """Rewrites the inertials of bodies, which afterwards no longer follow from their geoms.
 
-    All other bodies keep theirs, also in a model that fixes its total mass (``settotalmass``).
+    All other bodies keep theirs, even in a model with a fixed total mass (``settotalmass``).
 
     Args:
         spec: the specification, edited in place.
         bodies: bodies of the specification.
-        change: from the present inertial of a body to its new one.
+        change: returns the new inertial of a body for its present one.
     """
     model = compile_unscaled(spec)
     total = spec.compiler.settotalmass
-    # what the compiler will multiply every mass with
+    # the factor by which the compiler will multiply every mass
     scale = total / model.body_mass.sum() if total > 0.0 else 1.0
     ids = [i for i, body in enumerate(spec.bodies) if body in bodies]
     _let_given_inertials_count(spec)
@@ -66,27 +66,30 @@ def edit_inertials(
 
 
 def compile_unscaled(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """A copy of the specification, compiled before the compiler scales the bodies to a total mass."""
+    """Compiles a copy of the specification without scaling the bodies to a total mass."""
     copy = spec.copy()
     copy.compiler.settotalmass = -1.0
     return compile_model(copy)
 
 
 def _of_point(mass: float, offset: np.ndarray) -> np.ndarray:
-    """Inertia (3, 3) of a point mass about a point at an offset: the parallel axis theorem."""
+    """Returns the inertia (3, 3) of a point mass about a point at an offset (parallel axis theorem)."""
     return mass * (offset @ offset * np.eye(3) - np.outer(offset, offset))
 
 
 def _let_given_inertials_count(spec: mujoco.MjSpec) -> None:
-    """Has the compiler read inertials that are given, where it derived them from geoms all the same."""
+    """Makes the compiler use explicit inertials in a model that derives all of them from geoms.
+
+    Bodies with geoms lose an explicit inertial, because the compiler ignored it before.
+    """
     if spec.compiler.inertiafromgeom != mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
         return
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     low, high = spec.compiler.inertiagrouprange
     for body in spec.bodies:
         if any(low <= geom.group <= high for geom in body.geoms):
-            body.explicitinertial = False  # was given, but did not count
-            body.ipos[0] = np.nan  # the compiler's sign for "not given"
+            body.explicitinertial = False  # the compiler ignored it before
+            body.ipos[0] = np.nan  # the compiler's mark for a missing value
 
 
 def _write(body: mujoco.MjsBody, inertial: Inertial) -> None:
@@ -94,10 +97,10 @@ def _write(body: mujoco.MjsBody, inertial: Inertial) -> None:
     body.mass = inertial.mass
     body.ipos = inertial.centre
     moments, axes = np.linalg.eigh(inertial.inertia)
-    axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
+    axes[:, 2] *= np.linalg.det(axes)  # makes the axes right-handed
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, axes.ravel())
     body.inertia = moments
     body.iquat = quaternion
     body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    body.fullinertia[0] = np.nan  # the compiler takes one of the two
+    body.fullinertia[0] = np.nan  # the compiler accepts only one of the two

@@ -1,6 +1,6 @@
-"""Effects on joints: range, and what resists their motion.
+"""Effects on joints: range, damping, dry friction and armature.
 
-Numbers for sliding joints have the sliding unit: N for N·m, kg for kg·m².
+For sliding joints, N·m stands for N and kg·m² for kg.
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from torchrl_h2o.effects.selection import Names
 
 @dataclass(frozen=True)
 class JointRange(ModelEffect):
-    """Both ends of the range of joints, scaled.
+    """Scales both ends of the range of joints.
 
     Args:
         scale: factor on the ends of the range.
-        joints: name patterns of the joints; those without a range are passed over.
+        joints: name patterns of the joints; joints without a range are skipped.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or none of them with a range.
+        ValueError: when put into a model that has no such joint with a range.
 
     Examples:
         >>> JointRange(0.5, joints="*thigh*").describe()
         'range of joints *thigh* × 0.5'
 
-    Source: H2O+ (arXiv 2309.12716), the gaps ``broken_thigh`` and ``flexible_thigh``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gaps ``broken_thigh`` and ``flexible_thigh``.
     """
 
     wording: ClassVar[str] = "range of {joints} × {scale}"
@@ -43,14 +43,14 @@ class JointRange(ModelEffect):
 
 @dataclass(frozen=True)
 class JointDamping(ModelEffect):
-    """Viscous friction in joints, a torque against the velocity and proportional to it.
+    """Viscous friction in joints: a torque proportional to the velocity and opposed to it.
 
     Args:
-        damping: added to the joints' own damping, in N·m·s/rad; below zero it takes away.
+        damping: addition to the joints' own damping, in N·m·s/rad; a negative value reduces it.
         joints: name patterns of the joints.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or less damping than is taken.
+        ValueError: when put into a model that has no such joint, or if the damping would become negative.
 
     Examples:
         >>> JointDamping(0.1, joints="*wheel*").describe()
@@ -69,14 +69,14 @@ class JointDamping(ModelEffect):
 
 @dataclass(frozen=True)
 class JointFrictionLoss(ModelEffect):
-    """Dry (Coulomb) friction in joints, a torque against the velocity whatever its size.
+    """Dry (Coulomb) friction in joints: a torque of constant magnitude opposed to the velocity.
 
     Args:
-        torque: added to the joints' own ``frictionloss``, in N·m; below zero it takes away.
+        torque: addition to the joints' own ``frictionloss``, in N·m; a negative value reduces it.
         joints: name patterns of the joints.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or less friction than is taken.
+        ValueError: when put into a model that has no such joint, or if the friction would become negative.
 
     Examples:
         >>> JointFrictionLoss(0.2, joints="*wheel*").describe()
@@ -94,14 +94,14 @@ class JointFrictionLoss(ModelEffect):
 
 @dataclass(frozen=True)
 class Armature(ModelEffect):
-    """Inertia of the rotors that drive joints, seen at the joint.
+    """Rotor inertia of the drives, reflected to the joint (armature).
 
     Args:
-        inertia: added to the joints' own ``armature``, in kg·m²; below zero it takes away.
+        inertia: addition to the joints' own ``armature``, in kg·m²; a negative value reduces it.
         joints: name patterns of the joints.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or less armature than is taken.
+        ValueError: when put into a model that has no such joint, or if the armature would become negative.
 
     Examples:
         >>> Armature(0.05, joints="*wheel*").describe()
@@ -118,7 +118,7 @@ class Armature(ModelEffect):
 
 
 def those_with(attribute: str, joints: list) -> list:
-    """Of the joints, those whose attribute is not zero, which no factor could change."""
+    """Returns the joints whose attribute is not zero; raises ValueError if there are none to scale."""
     chosen = [joint for joint in joints if any(getattr(joint, attribute))]
     if not chosen:
         names = ", ".join(joint.name for joint in joints)
@@ -127,7 +127,7 @@ def those_with(attribute: str, joints: list) -> list:
 
 
 def added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
-    """The sum; raises ValueError where more is taken away than there is."""
+    """Returns the sum of value and addend; raises ValueError if it is negative."""
     if value + addend < 0.0:
-        raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, {-addend:g} cannot be taken away")
+        raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, {-addend:g} cannot be removed")
     return value + addend

@@ -1,6 +1,6 @@
-"""Effects on the springs of joints: how stiff they are and where they rest.
+"""Effects on the springs of joints: stiffness and rest position.
 
-Numbers for sliding joints have the sliding unit: N/m for N·m/rad, m for rad.
+For sliding joints, N·m/rad stands for N/m and rad for m.
 """
 
 import math
@@ -18,20 +18,20 @@ from torchrl_h2o.effects.selection import Names
 
 @dataclass(frozen=True)
 class JointStiffness(ModelEffect):
-    """The springs of joints, scaled.
+    """Scales the stiffness of joints.
 
     Args:
         scale: factor on the stiffness.
-        joints: name patterns of the joints; those without a spring are passed over.
+        joints: name patterns of the joints; joints without a spring are skipped.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or none of them with a spring.
+        ValueError: when put into a model that has no such joint with a spring.
 
     Examples:
         >>> JointStiffness(0.0, joints="*foot*").describe()
         'stiffness of joints *foot* × 0'
 
-    Source: H2O+ (arXiv 2309.12716), the gap ``soft_feet``.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gap ``soft_feet``.
     """
 
     wording: ClassVar[str] = "stiffness of {joints} × {scale}"
@@ -45,16 +45,16 @@ class JointStiffness(ModelEffect):
 
 @dataclass(frozen=True)
 class JointSpring(ModelEffect):
-    """A spring on joints, as of a cable or a hose: a torque proportional to the way from rest.
+    """A spring on joints, as of a cable or a hose: a torque proportional to the deflection.
 
-    It pulls towards the rest position that the joint has (``springref``), zero unless the model says.
+    The rest position is that of the joint (``springref``), which is zero unless the model sets it.
 
     Args:
-        stiffness: added to the joints' own stiffness, in N·m/rad; below zero it takes away.
+        stiffness: addition to the joints' own stiffness, in N·m/rad; a negative value reduces it.
         joints: name patterns of the joints.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or less stiffness than is taken.
+        ValueError: when put into a model that has no such joint, or if the stiffness would become negative.
 
     Examples:
         >>> JointSpring(0.5, joints="*hip*").describe()
@@ -73,14 +73,14 @@ class JointSpring(ModelEffect):
 
 @dataclass(frozen=True)
 class JointRest(ModelEffect):
-    """The rest position of the springs of joints, shifted.
+    """Shifts the rest position of the springs of joints.
 
     Args:
-        angle: added to the joints' ``springref``, in rad.
-        joints: name patterns of the joints; those without a spring are passed over.
+        angle: addition to the joints' ``springref``, in rad.
+        joints: name patterns of the joints; joints without a spring are skipped.
 
     Raises:
-        ValueError: when put into a model that has no such joint, or none of them with a spring.
+        ValueError: when put into a model that has no such joint with a spring.
 
     Examples:
         >>> JointRest(0.1, joints="*foot*").describe()

@@ -1,4 +1,4 @@
-"""Effects on the simulator's clock."""
+"""Effect on the physics timestep."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -11,9 +11,9 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class Timestep(ModelEffect):
-    """The physics step, scaled: the system runs faster or slower than the simulator's clock says.
+    """Scales the physics timestep, so that the system runs faster or slower than nominal.
 
-    A control step takes as many physics steps as before, so that it covers ``scale`` times the time.
+    The number of physics steps per control step stays the same, so a control step covers ``scale`` times the time.
 
     Args:
         scale: factor on the model's timestep.

@@ -1,1 +1,1 @@
-"""Effects on the way out: what sensors report of the simulator's state."""
+"""Effects on observations: how the reported observation differs from the true one."""

@@ -1,4 +1,4 @@
-"""Effects on the way out: what the sensors make of the simulator's state."""
+"""Sensor effects: noise, bias, gain and delay of the observation."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,11 +13,11 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class ObservationNoise(ObservationEffect):
-    """Gaussian noise on the observation, drawn anew at every reading.
+    """Gaussian noise on the observation, drawn independently at every reading.
 
     Args:
         std: standard deviation, in units of the observation.
-        entries: indices of the noisy entries of the observation, all by default.
+        entries: indices of the noisy entries of the observation; all by default.
 
     Examples:
         >>> import numpy as np
@@ -42,11 +42,11 @@ class ObservationNoise(ObservationEffect):
 
 @dataclass(frozen=True)
 class ObservationBias(ObservationEffect):
-    """A constant error of the observation.
+    """A constant offset of the observation.
 
     Args:
-        bias: what is added, in units of the observation.
-        entries: indices of the wrong entries of the observation, all by default.
+        bias: offset, in units of the observation.
+        entries: indices of the offset entries of the observation; all by default.
 
     Examples:
         >>> import numpy as np
@@ -71,11 +71,11 @@ class ObservationBias(ObservationEffect):
 
 @dataclass(frozen=True)
 class ObservationGain(ObservationEffect):
-    """Sensors that read too much or too little, in proportion.
+    """A gain error of the sensors.
 
     Args:
         scale: factor on the observation.
-        entries: indices of the scaled entries of the observation, all by default.
+        entries: indices of the scaled entries of the observation; all by default.
 
     Examples:
         >>> import numpy as np
@@ -101,14 +101,14 @@ class ObservationGain(ObservationEffect):
 
 @dataclass(frozen=True)
 class ObservationDelay(ObservationEffect):
-    """Sensors that are late, by any time, also a fraction of a control step.
+    """Delayed sensors, by any time, including fractions of a control step.
 
-    Between two readings the observation is taken to change evenly. Until the first reading has
-    arrived it is reported already.
+    The observation is interpolated linearly between two readings. Until a delayed reading is available, the first one
+    is reported.
 
     Args:
         delay: the delay, in s.
-        entries: indices of the late entries of the observation, all by default.
+        entries: indices of the delayed entries of the observation; all by default.
 
     Examples:
         >>> import numpy as np

@@ -1,1 +1,1 @@
-"""The MuJoCo simulation inside a TorchRL env, for Gymnasium and for dm_control."""
+"""Access to the MuJoCo simulation inside a TorchRL env, for Gymnasium and dm_control tasks."""

@@ -1,6 +1,6 @@
-"""The MuJoCo simulation inside a TorchRL env, alike for Gymnasium and dm_control.
+"""The interface to the MuJoCo simulation inside a TorchRL env, common to Gymnasium and dm_control.
 
-What :class:`~torchrl_h2o.envs.DynamicsGap` needs of a simulation, and nothing that it does not.
+It has what :class:`~torchrl_h2o.envs.DynamicsGap` and :class:`~torchrl_h2o.envs.BatchedMujocoEnv` need.
 """
 
 from abc import ABC, abstractmethod
@@ -15,19 +15,19 @@ from torchrl_h2o.effects import Effect, ForceEffect, Pipeline, compile_model
 from torchrl_h2o.effects.effect import Force
 from torchrl_h2o.envs.episode import GapEpisodes
 
+# fields of MjModel that a dynamics gap must not change
 _SIZES = ("nq", "nv", "nu", "na", "nbody", "njnt", "ngeom", "nsite", "nsensor")
 
 
 class MujocoBackend(ABC):
-    """The simulation inside one env: its model, and how to put another one in.
+    """The simulation inside one env: access to its model, and replacement of it.
 
-    The gaps that are in a simulation, and their episodes, are remembered on the object that owns the
-    model. A copy that is built anew, without the gaps' model, thus comes without the memory of them
-    too; and all clones that TorchRL makes of a gap on one env live in the same episode.
+    The applied gaps and their episodes are stored on the object that owns the model. A copy that is rebuilt from the
+    original model therefore lists no gaps, and all clones that TorchRL makes of a gap on one env share an episode.
 
     Args:
-        owner: the object that owns model and data, and lives as long as they do.
-        env: the TorchRL env around it.
+        owner: the object that owns model and data and has the same lifetime.
+        env: the TorchRL env around it, without transforms.
     """
 
     def __init__(self, owner: Any, env: EnvBase):
@@ -42,56 +42,56 @@ class MujocoBackend(ABC):
     @property
     @abstractmethod
     def data(self) -> mujoco.MjData:
-        """The state in use."""
+        """The simulation state in use."""
 
     @property
     @abstractmethod
     def control_step(self) -> float:
-        """The time between two actions, in s."""
+        """The control step, the time between two actions, in s."""
 
     @abstractmethod
     def spec(self) -> mujoco.MjSpec:
-        """The specification of the model without any gap, parsed anew from its source."""
+        """Returns the specification of the model without gaps, parsed anew from its source."""
 
     @property
     @abstractmethod
     def source(self) -> str:
-        """Where the model without any gap comes from, for error messages."""
+        """The source of the model without gaps, for error messages."""
 
     @property
     def written_at_reset(self) -> tuple[str, ...]:
-        """The fields of the model that the task itself writes whenever an episode begins."""
+        """The fields of the model that the task itself writes at every reset."""
         return ()
 
     @abstractmethod
     def load(self, model: mujoco.MjModel) -> None:
-        """Puts a model and fresh data in, where the simulation and its renderers will use them."""
+        """Replaces the model and data that the simulation and its renderers use."""
 
     @abstractmethod
     def push(self) -> None:
-        """Makes every physics step from now on apply the forces of the present episodes."""
+        """Makes every later physics step apply the forces of the current episodes."""
 
     @property
     def gaps(self) -> Mapping[object, Sequence[Effect]]:
-        """What every gap that is in consists of, under what stands for the gap, in the order in which they came in."""
+        """The effects of every applied gap, by the gap's identity, in the order of application."""
         return getattr(self.owner, "_dynamics_gaps", {})
 
     @property
     def episodes(self) -> GapEpisodes:
-        """The present episode of every gap, under what stands for the gap."""
+        """The current episode of every gap, by the gap's identity."""
         return self.owner.__dict__.setdefault("_dynamics_gap_episodes", GapEpisodes())
 
     def apply(self, gap: object, on_env: Mapping[object, Sequence[Effect]]) -> None:
-        """Puts a gap in, after those that are in already; does nothing if it is one of them.
+        """Applies a gap to the model, after the gaps applied before; does nothing if it is one of them.
 
         Args:
-            gap: stands for the gap: the same object, the same gap.
-            on_env: what each of the env's gaps consists of, this one included, the innermost first.
-                Action and observation effects are passed over.
+            gap: the gap's identity; the same object denotes the same gap.
+            on_env: the effects of each of the env's gaps by identity, this one included, the innermost first. Action
+                and observation effects are ignored.
 
         Raises:
-            ValueError: if the model has nothing that an effect could act on, or has a gap in it that
-                the env has not. Nothing is changed.
+            ValueError: if the model has no element that an effect could act on, or if a gap was applied that is not
+                among those of the env. The simulation is then unchanged.
         """
         applied = self.gaps
         if gap in applied:
@@ -99,8 +99,8 @@ class MujocoBackend(ABC):
         if not applied.keys() <= on_env.keys():
             left = ", ".join(e.describe() for other in applied if other not in on_env for e in applied[other])
             raise ValueError(
-                f"the simulator of {self.env} still has a gap in it that is not among the transforms "
-                f"of this env ({left}), and would have both: make a new env for the new gap"
+                f"a gap that is not among the transforms of this env was applied to the simulator of {self.env} "
+                f"before ({left}) and cannot be removed: make a new env for the new gap"
             )
         if not applied:
             self._check_source([effect for effects in on_env.values() for effect in effects])
@@ -117,16 +117,15 @@ class MujocoBackend(ABC):
 
     def _check_source(self, effects: Sequence[Effect]) -> None:
         self.check_sizes(compile_model(self.spec()))
-        # dm_control copies a model with its gaps, but not what we remember of them
+        # a copy by dm_control contains the effects of the gaps, but not the list of gaps
         if not self._came_from([]) and not self._came_from(effects):
             raise ValueError(
-                f"the model of {self.env} is not the one of {self.source}: it was changed after "
-                "loading or built with arguments of its own, and a dynamics gap compiles its source "
-                "anew. Make the change an effect of the gap"
+                f"the model of {self.env} differs from {self.source}: it was changed after loading or built with "
+                "other arguments, and a dynamics gap recompiles the source. Make the change an effect of the gap"
             )
 
     def _came_from(self, effects: Sequence[Effect]) -> bool:
-        """Whether the model in use is the one of the source with these effects in it."""
+        """Whether the model in use equals the model of the source with these effects."""
         model, source = self.model, compile_model(self.spec(), effects)
         source.vis.global_.offwidth = model.vis.global_.offwidth
         source.vis.global_.offheight = model.vis.global_.offheight
@@ -135,10 +134,10 @@ class MujocoBackend(ABC):
         return np.array_equal(_bytes(source), _bytes(model))
 
     def check_sizes(self, model: mujoco.MjModel) -> None:
-        """Checks that a model has the joints, bodies and actuators of the one in use.
+        """Checks that a model has the same joints, bodies and actuators as the one in use.
 
         Raises:
-            ValueError: if it has not.
+            ValueError: if a size differs.
         """
         for size in _SIZES:
             ours, theirs = getattr(self.model, size), getattr(model, size)
@@ -150,10 +149,10 @@ class MujocoBackend(ABC):
                 )
 
     def _pushed_steps(self, step: Callable[[], None], n_steps: int) -> None:
-        """Takes physics steps one by one, each under the forces of the state that it starts from."""
+        """Takes physics steps one by one, each under the forces of its initial state."""
         model, data, forces = self.model, self.data, self._forces()
         for _ in range(n_steps):
-            # after a step, MuJoCo leaves the bodies where they were before it
+            # a step of MuJoCo leaves the body positions and velocities at their values before the step
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
@@ -163,7 +162,7 @@ class MujocoBackend(ABC):
             data.qfrc_applied[:] = others
 
     def _forces(self) -> list[Force]:
-        # in the order of the gaps, not of their resets, because a sum is rounded in its order
+        # in the order of the gaps rather than of their resets, because rounding depends on the order of a sum
         episodes = self.episodes
         return [force for gap in self.gaps if gap in episodes for force in episodes[gap].effects.forces]
 
@@ -175,7 +174,7 @@ def _bytes(model: mujoco.MjModel) -> np.ndarray:
 
 
 def base_env(env: EnvBase) -> EnvBase:
-    """The env under all of an env's transforms."""
+    """Returns the innermost env, without transforms."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env

@@ -1,4 +1,4 @@
-"""The simulation inside a task of the dm_control suite, wrapped by TorchRL's DMControlEnv."""
+"""The simulation inside a dm_control suite task in TorchRL's DMControlEnv."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from dm_control.mujoco import Physics
 
 
+# by the task's module; dm_control's source assigns these fields in initialize_episode
 _WRITTEN_AT_RESET = {
     "finger": ("site_rgba", "site_pos", "site_size", "dof_damping"),
     "fish": ("geom_rgba", "geom_pos"),
@@ -25,13 +26,13 @@ _WRITTEN_AT_RESET = {
 
 
 class DMControlBackend(MujocoBackend):
-    """A dm_control ``Physics``, whose model comes from the module of the task."""
+    """A dm_control ``Physics``, with the model that the task's module builds."""
 
     owner: Physics
 
     @classmethod
     def inside(cls, env: EnvBase) -> DMControlBackend | None:
-        """The simulation inside an env without transforms, None if there is none of this kind."""
+        """Returns the backend of an env without transforms; None for an env of another kind."""
         return cls(env._env.physics, env) if isinstance(env, DMControlWrapper) else None
 
     @property
@@ -50,14 +51,14 @@ class DMControlBackend(MujocoBackend):
         get = getattr(self._module, "get_model_and_assets", None)
         if get is None:
             raise ValueError(
-                f"{self.env}: {self._module.__name__} does not say where its model comes from "
-                "(get_model_and_assets), as most tasks of dm_control.suite do; choose one of those"
+                f"{self.env}: {self._module.__name__} has no function get_model_and_assets, from which most tasks of "
+                "dm_control.suite load their model; choose one of those"
             )
         asked = [p.name for p in inspect.signature(get).parameters.values() if p.default is p.empty]
         if asked:
             raise ValueError(
-                f"{self.env}: {self.source} builds a model from arguments ({', '.join(asked)}) that the "
-                "task does not keep, so that it cannot be built anew; choose a task whose model is a file"
+                f"{self.env}: {self.source} builds the model from arguments ({', '.join(asked)}) that the task does "
+                "not store, so the model cannot be rebuilt; choose a task whose model is a file"
             )
         xml, assets = get()
         return mujoco.MjSpec.from_string(xml.decode(), include=assets, assets=assets)
@@ -78,8 +79,8 @@ class DMControlBackend(MujocoBackend):
     def load(self, model: mujoco.MjModel) -> None:
         from dm_control.mujoco.wrapper import MjModel
 
-        # What Physics.reload_from_xml_string does, which would round the numbers on their way
-        # through text. It renews the named views and the rendering contexts as well.
+        # Physics.reload_from_xml_string does the same, but rounds numbers when it writes them as text. This call also
+        # renews the named views and the rendering contexts.
         self.owner._reload_from_model(MjModel(model))
 
     def push(self) -> None:

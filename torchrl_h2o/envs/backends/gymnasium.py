@@ -1,4 +1,4 @@
-"""The simulation inside a Gymnasium MuJoCo task, wrapped by TorchRL's GymEnv or GymWrapper."""
+"""The simulation inside a Gymnasium MuJoCo task in TorchRL's GymEnv or GymWrapper."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 class GymnasiumBackend(MujocoBackend):
-    """A :class:`gymnasium.envs.mujoco.MujocoEnv`, whose model comes from the file ``fullpath``."""
+    """A :class:`gymnasium.envs.mujoco.MujocoEnv`, with the model of the file ``fullpath``."""
 
     owner: MujocoEnv
 
     @classmethod
     def inside(cls, env: EnvBase) -> GymnasiumBackend | None:
-        """The simulation inside an env without transforms, None if there is none of this kind."""
+        """Returns the backend of an env without transforms; None for an env of another kind."""
         if not isinstance(env, GymWrapper):
             return None
         from gymnasium.envs.mujoco import MujocoEnv
@@ -51,19 +51,19 @@ class GymnasiumBackend(MujocoBackend):
     def load(self, model: mujoco.MjModel) -> None:
         task, old = self.owner, self.owner.model
         task.model, task.data = model, mujoco.MjData(model)
-        # A task may start from a pose of its own; where it starts from the model's, follow that.
+        # coordinates that start at the model's qpos0 follow the new model; a task's own initial values stay
         task.init_qpos = np.where(task.init_qpos == old.qpos0, model.qpos0, task.init_qpos)
         renderer = task.mujoco_renderer
-        renderer.close()  # its contexts hold the old model's geometry
+        renderer.close()  # its contexts contain the old model's geometry
         renderer._viewers.clear()
         renderer.viewer = None
         renderer.model, renderer.data = task.model, task.data
 
     def push(self) -> None:
-        # a method and no lambda, because a copy of the task must step itself and not this one
+        # a method rather than a lambda, so that a copy of the task steps its own simulation
         self.owner._step_mujoco_simulation = self._step
 
     def _step(self, ctrl: np.ndarray, n_frames: int) -> None:
         step = type(self.owner)._step_mujoco_simulation
-        self.data.ctrl[:] = ctrl  # forces are computed before the step that would write it
+        self.data.ctrl[:] = ctrl  # forces read the controls before the step writes them
         self._pushed_steps(lambda: step(self.owner, ctrl, 1), n_frames)

@@ -1,5 +1,6 @@
-"""A hand-made balancing controller for the wheel-legged robot: a policy that imitates the human
-operator who recorded the real robot's data. It keeps the robot up, but wanders as it does so.
+"""A hand-tuned balancing controller for the wheel-legged robot, used to record data in place of a human operator.
+
+It keeps the robot upright but lets it wander.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from torchrl.modules import OrnsteinUhlenbeckProcessModule
 
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS, TARGET_VELOCITY
 
-#: N·m per rad, rad/s, m and m/s; see :class:`BalanceController` for where they come from
+#: default gains in N·m per rad, rad/s, m and m/s; :class:`BalanceController` explains their choice
 DEFAULT_GAINS = {
     "standing_still": {"theta": 9.0, "theta_dot": 0.9, "x": 0.4, "v": 1.3},
     "moving_forward": {"v": 1.3, "theta": 9.0, "theta_dot": 0.9},
 }
-MAX_TORQUE = 3.0  # N·m
+# properties of the authors' robot, not thresholds
+MAX_TORQUE = 3.0  # N·m, per motor
 CONTROL_PERIOD = 0.005  # s
 
 
@@ -28,9 +30,9 @@ class StateFeedback(nn.Module):
     """``torque = gains · (observation - target)``, clipped to the bounds of the action.
 
     Args:
-        gains: ``(n,)``, N·m per unit of each observed quantity.
-        target: ``(n,)``, in the units of the observation.
-        max_torque: bound of the torque, N·m.
+        gains: gains in N·m per unit of each observed quantity, (n,).
+        target: target in units of the observation, (n,).
+        max_torque: bound of the torque, in N·m.
     """
 
     def __init__(self, gains: torch.Tensor, target: torch.Tensor, max_torque: float) -> None:
@@ -47,20 +49,19 @@ class StateFeedback(nn.Module):
 class BalanceController(TensorDictModule):
     """Balances the wheel-legged robot by state feedback; reads observation, writes action.
 
-    All gains are positive: to get the wheels back under a body that leans forward, or that must
-    first lean back to slow down, is the same forward torque. The default gains are below those of
-    a linear-quadratic regulator in the angle and near them in the velocity, and together with the
-    default noise of :func:`noisy_balance_controller` they make the robot wander about as widely
-    as in the real log.
+    All gains are positive, because a forward torque both moves the wheels under a body that leans forward and makes a
+    moving robot lean back before it slows down. The default gains are below those of a linear-quadratic regulator in
+    the angle and close to them in the velocity. With the default noise of :func:`noisy_balance_controller` the robot
+    wanders about as widely as in the real log.
 
     Args:
         task: ``"standing_still"``, about x = 0, or ``"moving_forward"``, at 0.2 m/s.
-        gains: N·m per rad, rad/s, m and m/s, by the names of
-            :data:`~torchrl_h2o.envs.wheel_legged.OBSERVATIONS`; those left out keep their default.
-        max_torque: bound of the torque, N·m.
+        gains: gains in N·m per rad, rad/s, m and m/s, by the names of
+            :data:`~torchrl_h2o.envs.wheel_legged.OBSERVATIONS`; missing ones keep their default.
+        max_torque: bound of the torque, in N·m.
 
     Raises:
-        ValueError: for a task that there is not, or a gain of a quantity not observed in it.
+        ValueError: for an unknown task, or a gain for a quantity that the task does not observe.
 
     Example:
         >>> import torch
@@ -78,7 +79,7 @@ class BalanceController(TensorDictModule):
         max_torque: float = MAX_TORQUE,
     ) -> None:
         if task not in OBSERVATIONS:
-            raise ValueError(f"no balance controller for the task {task!r}; take one of {', '.join(OBSERVATIONS)}")
+            raise ValueError(f"no balance controller for the task {task!r}; choose one of {', '.join(OBSERVATIONS)}")
         names = OBSERVATIONS[task]
         if unknown := sorted(set(gains or {}) - set(names)):
             raise ValueError(f"gains has {', '.join(unknown)}, but {task} observes only {', '.join(names)}")
@@ -103,25 +104,24 @@ def noisy_balance_controller(
     noise_time: float = 0.06,
     max_torque: float = MAX_TORQUE,
 ) -> TensorDictSequential:
-    """:class:`BalanceController` with the unsteady hand of an operator.
+    """:class:`BalanceController` with correlated noise on the torque, like that of a human operator.
 
-    The noise on the torque is TorchRL's Ornstein-Uhlenbeck process, so it is added only under
-    ``set_exploration_type(ExplorationType.RANDOM)``, and it starts anew where ``is_init`` says
-    that an episode does (:class:`torchrl.envs.InitTracker`; :func:`~torchrl_h2o.envs.record`
-    sees to both).
+    The noise is TorchRL's Ornstein-Uhlenbeck process: it is added only under
+    ``set_exploration_type(ExplorationType.RANDOM)`` and restarts where ``is_init`` marks a new episode
+    (:class:`torchrl.envs.InitTracker`). :func:`~torchrl_h2o.envs.record` provides both.
 
     Args:
         task: see :class:`BalanceController`.
         gains: see :class:`BalanceController`.
-        noise_std: standard deviation of the noise once it has settled, N·m.
-        noise_time: time in which its autocorrelation falls to 1/e, s; more than a control step.
-        max_torque: bound of the torque with its noise, N·m.
+        noise_std: stationary standard deviation of the noise, in N·m.
+        noise_time: time in which the autocorrelation falls to 1/e, in s; at least a control step.
+        max_torque: bound of the torque including noise, in N·m.
 
     Returns:
         A policy that reads ``observation`` and ``is_init`` and writes ``action``.
 
     Raises:
-        ValueError: for a negative ``noise_std``, or a ``noise_time`` of less than a control step.
+        ValueError: for a negative ``noise_std``, or a ``noise_time`` shorter than a control step.
 
     Example:
         >>> from torchrl_h2o.envs.recording import record
@@ -133,7 +133,7 @@ def noisy_balance_controller(
         raise ValueError(f"noise_std is {noise_std} N·m; it must not be negative")
     if noise_time < CONTROL_PERIOD:
         raise ValueError(f"noise_time is {noise_time} s; it must be at least the control period, {CONTROL_PERIOD} s")
-    # TorchRL's process is n' = (1 - theta dt) n + sigma sqrt(dt) w, whose variance settles at
+    # TorchRL's process is n' = (1 - theta dt) n + sigma sqrt(dt) w, with the stationary variance
     # sigma^2 dt / (1 - (1 - theta dt)^2)
     decay = 1.0 - CONTROL_PERIOD / noise_time
     noise = OrnsteinUhlenbeckProcessModule(

@@ -1,7 +1,7 @@
 """The paper's wheel-legged robot: reward, Gymnasium task and TorchRL env.
 
-The model is our own MJCF, assets/wheel_legged.xml; what makes it imperfect or real is left to
-effects, see recipes/config/env/wheel_legged.yaml.
+The model is this package's own MJCF, wheel_legged.xml. The differences between simulator and reality are effects; see
+torchrl_h2o/config/env/wheel_legged.yaml.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ if TYPE_CHECKING:
     Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 MODEL_PATH = Path(__file__).with_name("wheel_legged.xml")
-#: what each task observes, in this order, in m, m/s, rad and rad/s
+#: the observed quantities of each task, in this order, in m, m/s, rad and rad/s
 OBSERVATIONS = {
     "standing_still": ("theta", "theta_dot", "x", "v"),
     "moving_forward": ("v", "theta", "theta_dot"),
 }
+# definitions of the paper's tasks and dimensions of its robot, not thresholds
 TARGET_VELOCITY = 0.2  # m/s, of the task moving_forward
-MAX_PITCH = math.pi / 6  # rad; beyond it the robot is lost
-FRAME_SKIP = 2  # physics steps of 2.5 ms a control step: 200 Hz
+MAX_PITCH = math.pi / 6  # rad; an episode terminates beyond it
+FRAME_SKIP = 2  # physics steps of 2.5 ms per control step: 200 Hz
 WHEEL_RADIUS = 0.065  # m
 
 
 def reward(task: str, observation: Array, action: Array, next_observation: Array) -> Array:
-    r"""Reward of one or many transitions, for the env as it runs and for measured data alike.
+    r"""Returns the reward of transitions, both from the env and from measured data.
 
     * ``standing_still``: :math:`30 - x^2 - v^2 - \theta^2 - \dot\theta^2 - \tau^2`
     * ``moving_forward``: :math:`15 - (v - 0.2)^2 - \tau^2`
 
-    The state is the one that the transition reaches, :math:`\tau` the torque of ``action``. The
-    env pays for the torque that reaches it: the one asked for, except under an effect that alters
-    actions, which stands before the env.
+    The state is the next state, and :math:`\tau` is the torque of ``action``. The env uses the executed torque, which
+    differs from the commanded one under an effect that alters actions.
 
     Args:
         task: a key of :data:`OBSERVATIONS`.
-        observation: ``(..., 4)`` or ``(..., 3)``, where the transition starts. Neither formula
-            uses it; it is there so that every task's reward is called alike.
-        action: ``(..., 1)``, torque in N·m.
-        next_observation: as ``observation``, the state reached.
+        observation: observation before the transition, (..., 4) or (..., 3). Neither formula uses it; it keeps the
+            signature of a reward function of the data readers.
+        action: torque in N·m, (..., 1).
+        next_observation: observation after the transition, of the same shape.
 
     Returns:
-        ``(...)``, of the kind (NumPy or torch) and dtype of ``next_observation``.
+        The rewards, (...), a NumPy array or torch tensor like ``next_observation``, with its dtype.
 
     Raises:
-        ValueError: for a task that there is not.
+        ValueError: for an unknown task.
 
     Example:
         >>> import numpy as np
@@ -65,7 +65,7 @@ def reward(task: str, observation: Array, action: Array, next_observation: Array
         >>> float(reward("standing_still", upright, np.array([2.0]), pushed))
         24.99
 
-    Source: H2O+ (arXiv 2309.12716), section on the real-world experiments.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, section on the real-world experiments.
     """
     effort = (action * action).sum(-1)
     if task == "standing_still":
@@ -76,36 +76,32 @@ def reward(task: str, observation: Array, action: Array, next_observation: Array
 
 
 def _unknown_task(task: str) -> str:
-    return f"the wheel-legged robot has no task {task!r}; take one of {', '.join(OBSERVATIONS)}"
+    return f"the wheel-legged robot has no task {task!r}; choose one of {', '.join(OBSERVATIONS)}"
 
 
 class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
     r"""The robot as a Gymnasium MuJoCo task: a body on two rigid legs, balancing on two wheels.
 
-    It moves in its sagittal plane. ``theta`` is the pitch (positive: leaning forward), ``x`` the
-    displacement of the axle along the floor and ``v`` its velocity: the turn of the wheels times
-    their radius, with the body's own pitch taken out. (In the log of the real robot this reading
-    fits a little better than the bare turn of the wheels against the body, and the 12 kg and the
-    0.065 m of the paper come out right with it.) The action is the torque of each of the two
-    wheel motors, in N·m; both get the same. The body feels the opposite torque.
+    It moves in its sagittal plane. ``theta`` is the pitch (positive when leaning forward), ``x`` the displacement of
+    the axle along the floor and ``v`` its velocity: the rotation of the wheels times their radius, corrected for the
+    pitch of the body. (This definition fits the log of the real robot slightly better than the rotation of the wheels
+    relative to the body, and it reproduces the 12 kg and 0.065 m of the paper.) The action is the torque of each of
+    the two wheel motors, in N·m; both receive the same. The opposite torque acts on the body.
 
-    The mass distribution was matched to the real robot's log: a planar wheeled pendulum of 12 kg
-    with two motors, fitted to 100 ms windows of the log, has a centre of mass 0.15 m above the
-    axle and falls as :math:`e^{9t}`; a torque of 1 N·m changes ``v`` by 6.8 m/s² and
-    ``theta_dot`` by -32 to -36 rad/s². This model has 0.15 m, :math:`e^{9.0t}`, 6.7 m/s² and
-    -33 rad/s². What else the log shows (late actuation, friction) is left to effects.
+    The mass distribution is matched to the real robot's log. A planar wheeled pendulum of 12 kg with two motors,
+    fitted to 100 ms windows of the log, has its centre of mass 0.15 m above the axle and falls as :math:`e^{9t}`; a
+    torque of 1 N·m changes ``v`` by 6.8 m/s² and ``theta_dot`` by -32 to -36 rad/s². This model has 0.15 m,
+    :math:`e^{9.0t}`, 6.7 m/s² and -33 rad/s². Delay and friction, which the log also shows, are effects.
 
     Args:
         task: ``"standing_still"`` or ``"moving_forward"``; sets observation and reward.
-        reset_noise: an episode starts with pitch (rad) and pitch rate (rad/s) drawn uniformly
-            from plus or minus this.
+        reset_noise: bound of the uniform distribution of the initial pitch (rad) and pitch rate (rad/s).
         render_mode: ``None``, ``"human"``, ``"rgb_array"``, ``"depth_array"``, ``"rgbd_tuple"``.
         **kwargs: further arguments of :class:`gymnasium.envs.mujoco.MujocoEnv`, such as
             ``width`` and ``height``.
 
     Raises:
-        ValueError: for a task that there is not, or a reset noise that is negative or starts
-            episodes lost.
+        ValueError: for an unknown task, or a reset noise that is negative or reaches the pitch of termination.
 
     Example:
         >>> import numpy as np
@@ -120,7 +116,7 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
         "render_fps": 200,
     }
-    #: what the robot does not observe but follows, as its wheels roll without slip: they turn against the body
+    #: unobserved velocities as linear functions of observed ones: the wheels roll without slip relative to the body
     hidden_state: Mapping[str, Mapping[str, float]] = MappingProxyType(
         {"axle_velocity": {"x_velocity": 1.0 / WHEEL_RADIUS, "pitch_velocity": -1.0}}
     )
@@ -137,7 +133,7 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
             raise ValueError(_unknown_task(task))
         if not 0.0 <= reset_noise < MAX_PITCH:
             raise ValueError(
-                f"reset_noise is {reset_noise}; it must lie in [0, pi/6), because at a pitch of pi/6 the robot is lost"
+                f"reset_noise is {reset_noise}; it must lie in [0, pi/6), because episodes terminate at a pitch of pi/6"
             )
         self.task = task
         self.reset_noise = reset_noise
@@ -155,9 +151,9 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         observation = self._get_obs()
         if self.render_mode == "human":
             self.render()
-        # written so that a pitch which is not a number counts as lost
+        # this form also terminates for a NaN pitch
         terminated = not abs(self.data.qpos[2]) <= MAX_PITCH
-        # the observation before the step is not kept: neither reward uses it
+        # the observation before the step is not stored, because neither reward uses it
         value = reward(self.task, observation, action, observation)
         return observation, value, terminated, False, {}
 
@@ -165,7 +161,7 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         pitch, pitch_rate = self.np_random.uniform(-self.reset_noise, self.reset_noise, 2)
         qpos, qvel = self.init_qpos.copy(), self.init_qvel.copy()
         qpos[2] = pitch
-        # the wheels stand on the floor: they turn against the body as it pitches
+        # the wheels rest on the floor, so they turn relative to the body as it pitches
         qvel[2], qvel[3] = pitch_rate, -pitch_rate
         self.set_state(qpos, qvel)
         return self._get_obs()
@@ -178,10 +174,10 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
 
 
 class WheelLeggedEnv(GymWrapper):
-    """The robot as a TorchRL env: :class:`WheelLeggedMujocoEnv` with a time limit, wrapped.
+    """The robot as a TorchRL env: :class:`WheelLeggedMujocoEnv` with a time limit.
 
-    An episode ends, truncated, after ``max_episode_steps``; it is terminated when the robot is
-    lost. It takes effects like any other env: ``TransformedEnv(WheelLeggedEnv(), DynamicsGap(...))``.
+    An episode is truncated after ``max_episode_steps`` and terminated when the robot falls. Effects are added as to
+    any other env: ``TransformedEnv(WheelLeggedEnv(), DynamicsGap(...))``.
 
     Args:
         task: ``"standing_still"``, which observes (theta, theta_dot, x, v), or
@@ -189,8 +185,8 @@ class WheelLeggedEnv(GymWrapper):
         max_episode_steps: steps of 5 ms; the default is 30 s.
         reset_noise: see :class:`WheelLeggedMujocoEnv`.
         render_mode: see :class:`WheelLeggedMujocoEnv`.
-        width: of rendered frames, in pixels.
-        height: of rendered frames, in pixels.
+        width: width of rendered frames, in pixels.
+        height: height of rendered frames, in pixels.
         **kwargs: further arguments of :class:`torchrl.envs.GymWrapper`, such as ``from_pixels``.
 
     Example:
