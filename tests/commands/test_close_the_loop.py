@@ -18,7 +18,7 @@ from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import Gravity, JointDamping
 from torchrl_h2o.envs import WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals import Report, Simulation
-from torchrl_h2o.residuals.report.report import DataSummary, DimensionError, ErrorSummary, FoundEffect
+from torchrl_h2o.residuals.report.contents import DataSummary, DimensionError, ErrorSummary, FoundEffect
 from torchrl_h2o.training.environments import make_simulator
 
 ROOT = Path(__file__).parents[2]

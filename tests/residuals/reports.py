@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from torchrl_h2o.effects import ActionGain, BodyMass, Gravity, JointFrictionLoss, LinearDrag
-from torchrl_h2o.residuals.report.report import (
+from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     DimensionError,
     ErrorSummary,
@@ -14,9 +14,9 @@ from torchrl_h2o.residuals.report.report import (
     IndistinguishableGroup,
     Interval,
     RejectedEffect,
-    Report,
     TwoSample,
 )
+from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 
 DATA = DataSummary("swing_up.csv", 5000, 1500, {"a gap in time": 12, "velocity clipped at ±10 rad/s": 3})

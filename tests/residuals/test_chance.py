@@ -8,7 +8,7 @@ import pytest
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals import residuals
-from torchrl_h2o.residuals.measured.chance import sensor_noise, stand_in
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
 
 SIMULATION = pendulum()
 

@@ -16,8 +16,8 @@ from torchrl_h2o.effects import (
     Gravity,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals import Simulation, close_the_loop, residuals
-from torchrl_h2o.residuals.judge import two_sample
+from torchrl_h2o.residuals import LoopSettings, Simulation, close_the_loop, residuals
+from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -25,14 +25,12 @@ FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1
 ROWS = 5000
 
 
-@pytest.fixture(autouse=True)
-def hasty_classifier(monkeypatch):
-    """What the classifier sees is tested by itself; here it only has to run."""
-    monkeypatch.setattr(two_sample, "_UPDATES", 20)
+# the classifier is tested by itself; here it only has to run
+SETTINGS = LoopSettings(judge=JudgeSettings(classifier_updates=20))
 
 
 def closed(measured, simulation=SIMULATION, catalogue=None, **kwargs):
-    return close_the_loop(simulation, measured, catalogue, progress=False, **kwargs)
+    return close_the_loop(simulation, measured, catalogue, progress=False, settings=SETTINGS, **kwargs)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +100,7 @@ def test_a_torque_on_no_list_is_marked_so_and_explained():
     report = closed(recorded(SIMULATION.with_effects(ripple), ROWS))
     assert [found.declared for found in report.found] == [False]
     assert report.error.after < 0.2 * report.error.before
-    assert report.sentence().startswith("Your simulator lacks: not on any list: torque on joint elbow")
+    assert report.sentence().startswith("Your simulator lacks: outside the catalogue: torque on joint elbow")
 
 
 def test_two_effects_are_found_together():
@@ -148,7 +146,7 @@ def test_too_few_rows_are_no_conclusion_and_it_is_said_why():
 def test_data_in_which_nothing_moves_are_no_conclusion():
     measured = recorded(SIMULATION, 300)
     still = replace(measured, observation=np.zeros((300, 2)), following=np.zeros((300, 2)))
-    assert "nothing moves" in closed(still).conclusion
+    assert "no observed value changes" in closed(still).conclusion
 
 
 def test_a_sensor_that_is_off_is_no_conclusion_and_it_is_said_which():
@@ -166,9 +164,9 @@ def test_a_simulator_that_diverges_is_no_conclusion():
 
 def test_a_progress_bar_is_shown_only_if_asked(capsys):
     measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 300)
-    close_the_loop(SIMULATION, measured, [GRAVITY], progress=False)
+    close_the_loop(SIMULATION, measured, [GRAVITY], progress=False, settings=SETTINGS)
     quiet = capsys.readouterr()
-    close_the_loop(SIMULATION, measured, [GRAVITY], progress=True)
+    close_the_loop(SIMULATION, measured, [GRAVITY], progress=True, settings=SETTINGS)
     shown = capsys.readouterr()
     assert "closing the loop" not in quiet.out + quiet.err
     assert quiet.out == shown.out

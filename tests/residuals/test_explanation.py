@@ -6,7 +6,7 @@ from tqdm import tqdm
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
-from torchrl_h2o.residuals.undeclared.explanation import explain
+from torchrl_h2o.residuals import Evidence, explain
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -18,7 +18,8 @@ RIPPLE = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
 def explained(*truth, simulation=SIMULATION, catalogue=(GRAVITY, FRICTION), rows=2000, noise=0.0):
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     with tqdm(disable=True) as progress:
-        return explain(simulation, measured, catalogue, rng=np.random.default_rng(0), progress=progress)
+        evidence = Evidence(simulation, measured, undisturbed=measured, suspected=())
+        return explain(evidence, catalogue, rng=np.random.default_rng(0), progress=progress)
 
 
 def test_a_force_that_nobody_declared_stands_beside_declared_effects():

@@ -86,5 +86,5 @@ def test_the_floor_is_fitted_without_held_out_rows():
 
 
 def test_too_few_windows_for_a_floor_are_refused():
-    with pytest.raises(ValueError, match=r"cannot tell 21 coefficients.*shorter horizon"):
+    with pytest.raises(ValueError, match=r"too few to fit 21 coefficients.*shorter horizon"):
         linear_floor(linear_system(rows=50), 20)

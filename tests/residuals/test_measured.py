@@ -118,7 +118,7 @@ def test_too_few_rows_are_no_conclusion_and_it_is_said_why():
 def test_where_nothing_moves_is_no_conclusion_and_it_is_said_why():
     still = of(ted())
     still = replace(still, observation=np.ones_like(still.observation), following=np.ones_like(still.observation))
-    assert "nothing moves" in still.why_no_conclusion()
+    assert "no observed value changes" in still.why_no_conclusion()
 
 
 def test_one_dimension_that_stands_still_is_no_conclusion_and_it_is_said_which():

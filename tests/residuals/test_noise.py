@@ -12,7 +12,8 @@ from torchrl_h2o.effects import ActionGain, ActionNoise
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.residual import start_states
-from torchrl_h2o.residuals.trace.action_noise import derivatives, estimate_noise
+from torchrl_h2o.residuals.noise.estimate import estimate_noise
+from torchrl_h2o.residuals.noise.scatter import derivatives
 
 LEVEL = 0.01
 

@@ -13,15 +13,14 @@ from tests.residuals.reports import DATA, full_report, no_conclusion, nothing_mi
 from torchrl_h2o.data import DataError
 from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, ResidualForce, paper_gap
 from torchrl_h2o.envs import DynamicsGap
-from torchrl_h2o.residuals.report.json_file import report_from_json, report_to_json
-from torchrl_h2o.residuals.report.report import (
+from torchrl_h2o.residuals.report.contents import (
     ErrorSummary,
     FoundEffect,
     IndistinguishableGroup,
     RejectedEffect,
-    Report,
     TwoSample,
 )
+from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.words import effect_words, interval
 
 NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])
@@ -57,8 +56,8 @@ def test_the_sentence_names_what_is_lacking_and_what_that_pays():
 def test_the_sentence_names_a_group_as_a_group_and_marks_what_is_on_no_list():
     sentence = full_report().sentence()
     assert "either mass of bodies pole × 1.2 or actuators 0 × 0.83 (these data cannot tell them apart)" in sentence
-    assert "not on any list: dry friction of joints elbow + 0.0412 N·m" in sentence
-    assert sentence.count("not on any list") == 1
+    assert "outside the catalogue: dry friction of joints elbow + 0.0412 N·m" in sentence
+    assert sentence.count("outside the catalogue") == 1
     assert sentence.count("either") == 1
 
 
@@ -72,8 +71,7 @@ def test_the_sentence_counts_what_else_it_could_be_where_naming_all_would_bury_i
 
 def test_a_report_without_effects_says_whether_nothing_is_missing_or_nothing_can_be_said():
     assert nothing_missing().sentence() == (
-        "Nothing is missing: what was tried explains no more than chance would; "
-        "one-step error 0.0041 rad/s, floor 0.004."
+        "Nothing is missing: the effects tried explain no more than chance; one-step error 0.0041 rad/s, floor 0.004."
     )
     assert no_conclusion().sentence() == "No conclusion: 7 rows are too few."
 
@@ -112,7 +110,9 @@ def test_a_force_made_from_the_residual_is_named_by_its_joint_and_told_in_round_
     force = ResidualForce(("torque on elbow: 0.412345 · sin(7.00012 q)",))
     report = Report(simulator="a", data=DATA, found=(FoundEffect(force, False, {"coefficient_1": (0.4, 0.42)}, 0.1),))
     assert report.found[0].name == "ResidualForce[elbow]"
-    assert report.sentence() == ("Your simulator lacks: not on any list: torque on joint elbow: 0.412 N·m · sin(7 q).")
+    assert report.sentence() == (
+        "Your simulator lacks: outside the catalogue: torque on joint elbow: 0.412 N·m · sin(7 q)."
+    )
     assert Report.load(report.save(tmp_path)) == report
 
 
@@ -148,8 +148,8 @@ def test_the_file_is_strict_json_and_reads_back_what_it_was_given(number, option
         two_sample=TwoSample(optional, None),
         wall_s=optional,
     )
-    text = json.dumps(report_to_json(report), allow_nan=False)
-    assert same(report_from_json(json.loads(text)), expected(report))
+    text = json.dumps(report.to_json(), allow_nan=False)
+    assert same(Report.from_json(json.loads(text)), expected(report))
 
 
 def expected(value):
@@ -194,10 +194,10 @@ def test_numpy_numbers_are_written_as_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        ("", "is no report"),
-        ("{", "is no report"),
-        ("[1, 2]", "is no report"),
-        ('{"simulator": "a"}', "it has no 'effects'"),
+        ("", "is not a report"),
+        ("{", "is not a report"),
+        ("[1, 2]", "is not a report"),
+        ('{"simulator": "a"}', "it lacks 'effects'"),
     ],
 )
 def test_a_file_that_is_no_report_is_refused(tmp_path, content, problem):
@@ -220,7 +220,7 @@ def test_a_part_of_a_report_that_lacks_something_is_named(tmp_path):
     entries = json.loads(path.read_text(encoding="utf-8"))
     del entries["data"]["held_out"]
     path.write_text(json.dumps(entries), encoding="utf-8")
-    with pytest.raises(DataError, match="it has no 'held_out'"):
+    with pytest.raises(DataError, match="it lacks 'held_out'"):
         Report.load(path)
 
 
@@ -262,4 +262,4 @@ def test_a_trace_that_does_not_fit_itself_is_refused():
 def test_an_undeclared_effect_is_marked_in_words_and_a_declared_one_is_not():
     effect = JointFrictionLoss(0.1)
     assert FoundEffect(effect, True, {}, 0.1).words == effect.describe()
-    assert FoundEffect(effect, False, {}, 0.1).words == f"not on any list: {effect.describe()}"
+    assert FoundEffect(effect, False, {}, 0.1).words == f"outside the catalogue: {effect.describe()}"

@@ -12,8 +12,8 @@ import pytest
 from tests.residuals.reports import full_report, no_conclusion, nothing_missing, renamed, trace
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.contents import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
 from torchrl_h2o.residuals.report.page import report_page
-from torchrl_h2o.residuals.report.report import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
 
 HOSTILE = "<script>alert(1)</script>\"'$x_1$&{{ 7 * 7 }}"
 
@@ -106,7 +106,7 @@ def test_hostile_texts_are_shown_and_not_obeyed():
     assert not parsed.open
     assert parsed.count("script") == 0
     assert "<script" not in page
-    for place in (f"against {HOSTILE}", f"left out: {HOSTILE}", f"{HOSTILE}elbow angle", f"apart: {HOSTILE}"):
+    for place in (f"against {HOSTILE}", f"left out: {HOSTILE}", f"{HOSTILE}elbow angle", f"record {HOSTILE}"):
         assert place in parsed.text
     labels = [attributes["aria-label"] for tag, attributes in parsed.tags if tag == "svg"]
     assert any(HOSTILE in label for label in labels)
@@ -122,7 +122,7 @@ def test_a_page_without_effects_says_why_and_leaves_out_what_is_not_known(make):
     parsed = Page(report_page(make()))
     assert make().sentence() in parsed.text
     assert parsed.count("svg") == 0
-    for heading in ("What the simulator lacks", "What was tried", "Set aside", "The residual"):
+    for heading in ("What the simulator lacks", "What was tried", "Excluded intervals", "The residual"):
         assert heading not in parsed.text
 
 

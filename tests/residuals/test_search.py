@@ -23,7 +23,8 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import screen
-from torchrl_h2o.residuals.trace.search import Search
+from torchrl_h2o.residuals.trace.simplify import simplify_one
+from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()
 FACTORS = ({"scale": 0.8}, {"scale": 1.25})
@@ -113,15 +114,16 @@ def test_what_was_as_good_once_makes_way_for_what_is_better_now():
     """An effect may be chosen while another is not in yet; of a group the first in the catalogue is."""
     measured = recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(0.03)), 1000)
     catalogue = [DAMPING, FRICTION, GRAVITY]
-    with tqdm(disable=True) as progress:
-        search = Search(Problem.pose(SIMULATION, measured), catalogue, np.random.default_rng(0), progress)
-        known = (Gravity(1.3),)
-        search.rivals[DAMPING.name] = screen(search.problem, known, [DAMPING, FRICTION], search.screened)
-        damped = search._fitted([GRAVITY, DAMPING], [*known, JointDamping(0.01)])
-        entries, best, group = search._simplest([GRAVITY, DAMPING], damped, 1)
-    assert names(entries) == [GRAVITY.name, FRICTION.name]
-    assert best.effects[1].torque == pytest.approx(0.03, rel=0.01)
+    state = SearchState.begin(Problem.pose(SIMULATION, measured), catalogue, np.random.default_rng(0))
+    known = (Gravity(1.3),)
+    leads = screen(state.problem, known, [DAMPING, FRICTION], state.windows.screened)
+    damped = state.refitted([GRAVITY, DAMPING], [*known, JointDamping(0.01)])
+    state = replace(state.with_found([GRAVITY, DAMPING], damped), rivals={DAMPING.name: leads})
+    simplified, group = simplify_one(state, 1)
+    assert names(simplified.entries) == [GRAVITY.name, FRICTION.name]
+    assert simplified.fit.effects[1].torque == pytest.approx(0.03, rel=0.01)
     assert group == ()
+    assert names(state.entries) == [GRAVITY.name, DAMPING.name]
 
 
 def test_what_was_tried_is_told_with_its_loss_and_chance():

@@ -23,7 +23,7 @@ def test_effects_that_differ_at_speed_are_told_apart_there(measured):
 def test_the_size_of_the_difference_is_given_in_its_unit(measured):
     words = separated_by(SIMULATION, measured, (ActionGain(1.0), ActionGain(1.0), ActionGain(0.5)), [])
     assert "where the action of" in words
-    assert " rad/s a step" in words
+    assert " rad/s per step" in words
 
 
 def test_other_effects_stay_in_beside_each_alternative(measured):
@@ -32,17 +32,17 @@ def test_other_effects_stay_in_beside_each_alternative(measured):
     free = separated_by(SIMULATION, measured, alternatives, [])
     dead = separated_by(SIMULATION, measured, alternatives, [ActionGain(0.0)])
     assert "differ" in free
-    assert dead.startswith("nothing that these sensors read")
+    assert dead.startswith("no data of these sensors")
 
 
 def test_other_effects_keep_their_places(measured):
     """A bias before a motor that is dead is not seen, one behind it is."""
     alternatives, dead = (ActionBias(0.1), ActionBias(0.2)), [ActionGain(0.0)]
-    assert separated_by(SIMULATION, measured, alternatives, behind=dead).startswith("nothing that these sensors read")
+    assert separated_by(SIMULATION, measured, alternatives, after=dead).startswith("no data of these sensors")
     assert "differ" in separated_by(SIMULATION, measured, alternatives, before=dead)
 
 
 def test_effects_that_predict_the_same_are_told_apart_by_nothing_that_is_read(measured):
     alternatives = (ActionDelay(0.02), ObservationDelay(0.02))
-    assert separated_by(SIMULATION, measured, alternatives, []).startswith("nothing that these sensors read")
+    assert separated_by(SIMULATION, measured, alternatives, []).startswith("no data of these sensors")
     assert "differ" in separated_by(SIMULATION, measured, (*alternatives, JointFrictionLoss(0.1)), [])

@@ -5,7 +5,7 @@ import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.residuals import residuals
-from torchrl_h2o.residuals.undeclared.undeclared import find_undeclared
+from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 LAWS = {
     "torque ripple": (0.2, lambda q, v, t: np.sin(7.0 * q + 0.5)),

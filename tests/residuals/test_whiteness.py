@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, Gravity
-from torchrl_h2o.residuals.judge.summary import autocorrelation
+from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 
 SIMULATION = pendulum()
 

@@ -1,22 +1,26 @@
-"""Closing the loop with measured data: find the residual, trace it to effects, add them, report."""
+"""Closing the loop with measured data: residual, effects that explain it, held-out errors, report."""
 
-from torchrl_h2o.residuals.close_the_loop import close_the_loop
+from torchrl_h2o.residuals.close_the_loop import close_the_loop, explain
+from torchrl_h2o.residuals.evidence import Evidence, gather_evidence
+from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.error_ahead import horizon_errors, linear_floor
 from torchrl_h2o.residuals.judge.floor import explainable_floor
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.measured.initial_states import estimate_states, smoothed_states
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.report.report import Report
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.settings import LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.simulation.state_map import StateMap
 from torchrl_h2o.residuals.trace.search import trace_effects
-from torchrl_h2o.residuals.undeclared.explanation import Explanation, explain
-from torchrl_h2o.residuals.undeclared.undeclared import find_undeclared
+from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 __all__ = [
+    "Evidence",
     "Explanation",
+    "LoopSettings",
     "Measured",
     "Report",
     "Simulation",
@@ -26,6 +30,7 @@ __all__ = [
     "explain",
     "explainable_floor",
     "find_undeclared",
+    "gather_evidence",
     "horizon_errors",
     "linear_floor",
     "outside_intervals",

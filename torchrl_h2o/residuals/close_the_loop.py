@@ -1,9 +1,13 @@
-"""Closes the loop: find the residual, trace it to effects, add them, report. One call, of four that stand alone."""
+"""Closes the loop: finds what a simulator lacks from measured data, puts it in, and reports the held-out error.
+
+The stages stand alone: each takes the results of those before it and returns a new one.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -11,15 +15,17 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.residuals.judge.summary import DISTURBED, summarise
-from torchrl_h2o.residuals.measured.measured import Measured
-from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows, still_outside
-from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.report.report import DataSummary, Report
+from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report
+from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
+from torchrl_h2o.residuals.explanation import Explanation
+from torchrl_h2o.residuals.judge.judgement import judge
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
+from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.undeclared.explanation import explain
-
-_MAY_DIVERGE = 0.1  # of the transitions: a few are measured in a fall, or wrongly
+from torchrl_h2o.residuals.trace.search import trace_effects
+from torchrl_h2o.residuals.undeclared.beside_or_instead import add_undeclared_force
 
 
 def close_the_loop(
@@ -31,24 +37,26 @@ def close_the_loop(
     held_out: float = 0.3,
     seed: int = 0,
     progress: bool = True,
+    settings: LoopSettings = DEFAULTS,
 ) -> Report:
-    """What a simulator lacks, by measured data: named, fitted, put in, and judged on data that no fit has seen.
+    """Finds what a simulator lacks from measured data, and judges it on data that no fit has seen.
 
     Args:
         simulator: a TorchRL env of a Gymnasium MuJoCo task, with its gaps, or a :class:`Simulation`.
         data: transitions (T,) in TED, as the readers of :mod:`torchrl_h2o.data` return them, or :class:`Measured`.
-        catalogue: the effects to try; those of :meth:`Simulation.catalogue` by default.
-        source: what to call the data.
-        held_out: share of the transitions, the last ones, that no fit sees.
-        seed: of the windows that are screened and of the networks.
+        catalogue: effects to try; those of :meth:`Simulation.catalogue` by default.
+        source: name of the data in the report.
+        held_out: share of the transitions, taken from the end, that is reserved for the judgement.
+        seed: of the screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
+        settings: thresholds and budgets of all stages.
 
     Returns:
         The report; ``DynamicsGap(*report.effects)`` mends the simulator.
 
     Raises:
         DataError: if the data do not fit the simulator.
-        ValueError: if the simulator's state cannot be told from its observations.
+        ValueError: if the simulator's state cannot be computed from its observations.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -63,29 +71,52 @@ def close_the_loop(
     """
     start = time.perf_counter()
     simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
-    measured = (
-        data if isinstance(data, Measured) else Measured.from_ted(data, simulation, source=source, held_out=held_out)
-    )
-    if (reason := measured.why_no_conclusion() or _why_it_diverges(simulation, measured)) is not None:
-        summary = DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out)
-        return Report(simulator=simulation.name, data=summary, conclusion=reason)
+    measured = read_measured(data, simulation, source, held_out, settings)
+    if (reason := why_no_conclusion(simulation, measured)) is not None:
+        return inconclusive_report(simulation, measured, reason)
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
-        suspected = outside_intervals(simulation, measured)
-        calm = measured.without(outside_rows(suspected, len(measured)), DISTURBED)
-        explanation = explain(simulation, calm, entries, rng=np.random.default_rng(seed), progress=bar)
+        evidence = gather_evidence(simulation, measured, settings)
+        explanation = explain(evidence, entries, rng=np.random.default_rng(seed), progress=bar, settings=settings)
         bar.set_description("reporting")
-        disturbed = still_outside(suspected, simulation.with_effects(*explanation.effects), measured)
-        judged = measured.without(outside_rows(disturbed, len(measured)), DISTURBED)
-        return summarise(simulation, judged, explanation, disturbed=disturbed, seed=seed, start=start)
+        judgement = judge(evidence, explanation, seed=seed, settings=settings)
+        wall_s = time.perf_counter() - start
+        return compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings)
 
 
-def _why_it_diverges(simulation: Simulation, measured: Measured) -> str | None:
-    """Why nothing can be said with a simulator that blows up at measured states, None if it does not."""
-    diverged = ~np.isfinite(residuals(simulation, measured, measured.fitted())).all((1, 2))
-    if diverged.mean() <= _MAY_DIVERGE:
-        return None
-    return (
-        f"the simulator diverges within one step of {diverged.mean():.0%} of the measured states; check its timestep, "
-        "the units, and which coordinate each column is"
-    )
+def read_measured(
+    data: TensorDictBase | Measured, simulation: Simulation, source: str, held_out: float, settings: LoopSettings
+) -> Measured:
+    """Measured transitions, checked against the simulation and sampled as the settings demand."""
+    if isinstance(data, Measured):
+        return replace(data, settings=settings.measured)
+    return Measured.from_ted(data, simulation, source=source, held_out=held_out, settings=settings.measured)
+
+
+def explain(
+    evidence: Evidence,
+    catalogue: Sequence[CatalogueEntry],
+    *,
+    rng: np.random.Generator,
+    progress: tqdm,
+    settings: LoopSettings = DEFAULTS,
+) -> Explanation:
+    """Explains the residual: effects of the catalogue, then a force outside it, then action noise.
+
+    Args:
+        evidence: the simulator and the data.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows and synthetic noise.
+        progress: bar that counts screened entries and names the stage.
+        settings: thresholds and budgets.
+
+    Returns:
+        The explanation, without any parts if nothing is missing.
+    """
+    simulation, measured = evidence.simulation, evidence.undisturbed
+    trace = trace_effects(simulation, measured, catalogue, rng=rng, progress=progress, settings=settings)
+    progress.set_description("looking for undeclared forces")
+    declared = Explanation.of(trace)
+    with_force = add_undeclared_force(simulation, measured, declared, rng=rng, settings=settings)
+    progress.set_description("looking for action noise")
+    return add_action_noise(simulation, measured, with_force, settings)

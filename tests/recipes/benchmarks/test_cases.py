@@ -37,13 +37,13 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
 from torchrl_h2o.residuals import Measured, Simulation, residuals
-from torchrl_h2o.residuals.report.report import (
+from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     ErrorSummary,
     FoundEffect,
     IndistinguishableGroup,
-    Report,
 )
+from torchrl_h2o.residuals.report.document import Report
 
 SEED = 5
 

@@ -1,1 +1,1 @@
-"""Errors before and after, on data that no fit has seen, and what they are measured against."""
+"""Held-out errors before and after effects are put in, their floor, and the two-sample test."""

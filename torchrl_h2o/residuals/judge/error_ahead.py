@@ -1,4 +1,4 @@
-"""How far a simulation is off some steps ahead, and how far a linear predictor is: a floor to measure it by."""
+"""Errors of a simulation several steps ahead, and of a linear predictor for comparison."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-_RIDGE = 1e-9  # of each regressor's variance, for those that never change
+_RIDGE = 1e-9  # share of each regressor's variance; makes constant regressors harmless
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorAhead:
-    """The error at the end of windows of one length.
+    """Errors at the end of windows of one length.
 
     Args:
         steps: control steps ahead.
-        rmse: (n), root of the mean square, in units of the observations.
-        median: (n), of the absolute error, in the same units.
-        windows: how many were judged.
-        diverged: how many of them the simulation did not reach the end of; they are not in the figures.
+        rmse: (n), root mean square error, in units of the observations.
+        median: (n), median absolute error, in the same units.
+        windows: number of windows.
+        diverged: number of windows in which the simulation diverged; they are excluded from the errors.
     """
 
     steps: int
@@ -42,18 +42,18 @@ def horizon_errors(
     states: np.ndarray | None = None,
     stride: int = 1,
 ) -> list[ErrorAhead]:
-    """Errors of a simulation at several horizons, each over all windows of usable rows.
+    """Computes the errors of a simulation at several horizons, each over all windows of usable rows.
 
     Args:
-        simulation: to be judged.
+        simulation: the simulator.
         measured: the data.
-        horizons: in control steps.
-        held_out: True for windows of held-out rows alone, False for windows without any, None for all.
-        states: (T, nq + nv), to start from instead of the measured ones.
-        stride: rows from one window to the next.
+        horizons: control steps ahead.
+        held_out: True for windows of held-out rows only, False for windows without any, None for all.
+        states: (T, nq + nv), start states; the measured ones by default.
+        stride: rows from the start of one window to the next.
 
     Returns:
-        One for each horizon. Without any window its figures are NaN.
+        One per horizon; its errors are NaN if there is no window.
     """
     errors = []
     for horizon in horizons:
@@ -66,23 +66,23 @@ def horizon_errors(
 
 
 def linear_floor(measured: Measured, horizon: int, *, recent: int = 0, stride: int = 1) -> ErrorAhead:
-    """The error of a direct linear predictor, fitted to the rows that fits may see and judged on the held-out ones.
+    """Computes the held-out error of a linear predictor that is fitted to the other rows.
 
-    It predicts from the observation and the actions up to the horizon. Where the actions come from a controller that
-    looks at the sensors, the coming ones tell of what is to come (a push, and the reaction to it), which no simulation
-    can know: the floor may lie lower than any simulation gets.
+    It predicts from the observation and the actions up to the horizon. If a controller reacts to the sensors, these
+    actions carry information about later disturbances, which a simulation does not have. Its error may therefore be
+    lower than that of any simulation.
 
     Args:
         measured: the data.
-        horizon: in control steps.
-        recent: how many actions before the observation it sees as well.
-        stride: rows from one window to the next.
+        horizon: control steps ahead.
+        recent: number of actions before the observation that are regressors as well.
+        stride: rows from the start of one window to the next.
 
     Returns:
         The error of the held-out windows.
 
     Raises:
-        ValueError: if there are fewer windows to fit to than coefficients.
+        ValueError: if there are fewer windows to fit than coefficients.
 
     Examples:
         >>> from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
@@ -96,8 +96,8 @@ def linear_floor(measured: Measured, horizon: int, *, recent: int = 0, stride: i
     regressors = _regressors(measured, fitted, horizon, recent)
     if regressors.shape[0] < regressors.shape[1]:
         raise ValueError(
-            f"{regressors.shape[0]} windows of {horizon} steps cannot tell {regressors.shape[1]} coefficients; take a "
-            "shorter horizon or more data"
+            f"{regressors.shape[0]} windows of {horizon} steps are too few to fit {regressors.shape[1]} coefficients; "
+            "choose a shorter horizon or record more data"
         )
     centre, size = regressors.mean(0), regressors.std(0) + 1e-12
     target = measured.following[fitted + horizon - 1] - measured.observation[fitted]
@@ -109,7 +109,7 @@ def linear_floor(measured: Measured, horizon: int, *, recent: int = 0, stride: i
 
 
 def _with_past(measured: Measured, horizon: int, recent: int, stride: int, held_out: bool) -> np.ndarray:
-    """The first rows of windows with so many rows of the same run before them."""
+    """First rows of the windows that have ``recent`` rows of the same run before them."""
     starts = measured.windows(horizon, stride, held_out=held_out)
     starts = starts[starts >= recent]
     return starts[measured.run[starts - recent] == measured.run[starts]]

@@ -1,4 +1,4 @@
-"""The floor of the error: how much of the residual there is to explain, by a small network that may use anything."""
+"""Floor of the error: the residual that remains after a small network has explained what it can."""
 
 from __future__ import annotations
 
@@ -6,49 +6,50 @@ import numpy as np
 import torch
 from torch import nn
 
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_WIDTH = 64
-_BATCH = 128
-_EPOCHS = 60
-_PATIENCE = 12  # epochs without a new best
-_BLOCKS = 20  # of the rows to fit, neighbours together; every fifth stops the training
-_CLIP = 5.0  # standard deviations: outliers are not worth learning
 
 
 def explainable_floor(
-    simulation: Simulation, measured: Measured, *, states: np.ndarray | None = None, seed: int = 0
+    simulation: Simulation,
+    measured: Measured,
+    *,
+    states: np.ndarray | None = None,
+    seed: int = 0,
+    settings: JudgeSettings = DEFAULTS.judge,
 ) -> np.ndarray:
-    """The held-out one-step error that remains when a network has explained what it can of the residual.
+    """Estimates the held-out one-step error that the best possible model would leave.
 
-    A network with two hidden layers maps the observation, the action and the action before to the residual. It is
-    fitted to the rows that may be fitted and stopped early on blocks of them. A dimension in which it does not help
-    there is left alone. It does not see the observation before: with that it would learn to smooth the sensors' noise,
-    which no effect can do for the simulator.
+    A network with two hidden layers predicts the residual from the observation, the action and the action before. It is
+    trained on the rows that are not held out, with early stopping on blocks of them. Its prediction is ignored in
+    dimensions in which it does not help on these blocks. The observation before is not an input, because the network
+    would then learn to smooth the sensors' noise, which no effect in the simulator can do.
 
     Args:
         simulation: the simulator.
         measured: the data.
-        states: (T, nq + nv), to start from instead of the measured ones.
-        seed: of the network's weights and batches; torch's own generator is left alone.
+        states: (T, nq + nv), start states; the measured ones by default.
+        seed: of the network's weights and batches; torch's global generator is not changed.
+        settings: size and training of the network.
 
     Returns:
-        The RMSE of each dimension, (n), in its unit: never above that of the residual itself.
+        RMSE of each dimension, (n), in its unit: at most that of the residual itself.
     """
     fitted, judged = measured.fitted(), measured.judged()
-    inputs = _standard(_inputs(simulation, measured), fitted)
+    inputs = _standard(_inputs(simulation, measured), fitted, settings.floor_clip)
     targets = np.full_like(measured.observation, np.nan)
     for rows in (fitted, judged):
         targets[rows] = residuals(simulation, measured, rows, states=states)[:, 0]
     fitted, judged = (rows[np.isfinite(targets[rows]).all(1)] for rows in (fitted, judged))
     scale = np.maximum(targets[fitted].std(0), 1e-12 + 1e-9 * measured.observation.std(0))
-    stopping = np.arange(len(fitted)) * _BLOCKS // len(fitted) % 5 == 4
+    stopping = np.arange(len(fitted)) * settings.floor_blocks // len(fitted) % 5 == 4
     x, y = (torch.as_tensor(values, dtype=torch.float32) for values in (inputs, np.nan_to_num(targets) / scale))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _trained(x, y.clamp(-_CLIP, _CLIP), fitted[~stopping], fitted[stopping])
+        y = y.clamp(-settings.floor_clip, settings.floor_clip)
+        network = _trained(x, y, fitted[~stopping], fitted[stopping], settings)
     with torch.no_grad():
         explained = network(x).double().numpy() * scale
     rest = targets - explained
@@ -57,29 +58,33 @@ def explainable_floor(
 
 
 def _inputs(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """Observation, with sine and cosine of its angles, action, and action before in the same run, (T, inputs)."""
+    """Observation, sine and cosine of its angles, action, and action before in the same run, (T, inputs)."""
     angles = measured.observation[:, [unit == "rad" for unit in simulation.state_map.units]]
     actions = executed_actions(simulation, measured)
     before = np.concatenate([np.vstack([actions[run][:1], actions[run][:-1]]) for run in measured.runs])
     return np.hstack([measured.observation, np.sin(angles), np.cos(angles), actions, before])
 
 
-def _standard(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _standard(values: np.ndarray, rows: np.ndarray, clip: float) -> np.ndarray:
+    """Values standardised by some rows and clipped, in standard deviations."""
     spread = values[rows].std(0)
-    return np.clip((values - values[rows].mean(0)) / np.where(spread > 0.0, spread, 1.0), -_CLIP, _CLIP)
+    return np.clip((values - values[rows].mean(0)) / np.where(spread > 0.0, spread, 1.0), -clip, clip)
 
 
-def _trained(x: torch.Tensor, y: torch.Tensor, rows: np.ndarray, stopping: np.ndarray) -> nn.Module:
-    """A network fitted to some rows, as it was when it did best on others."""
+def _trained(
+    x: torch.Tensor, y: torch.Tensor, rows: np.ndarray, stopping: np.ndarray, settings: JudgeSettings
+) -> nn.Module:
+    """A network trained on some rows, with the weights of its best epoch on others."""
+    width = settings.floor_width
     network = nn.Sequential(
-        nn.Linear(x.shape[1], _WIDTH), nn.SiLU(), nn.Linear(_WIDTH, _WIDTH), nn.SiLU(), nn.Linear(_WIDTH, y.shape[1])
+        nn.Linear(x.shape[1], width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, y.shape[1])
     )
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3, foreach=True)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _EPOCHS)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.floor_epochs)
     rows, stopping = torch.as_tensor(rows), torch.as_tensor(stopping)
     best, weights, since = torch.inf, network.state_dict(), 0
-    for _ in range(_EPOCHS):
-        for batch in rows[torch.randperm(len(rows))].split(_BATCH):
+    for _ in range(settings.floor_epochs):
+        for batch in rows[torch.randperm(len(rows))].split(settings.floor_batch):
             optimizer.zero_grad()
             nn.functional.mse_loss(network(x[batch]), y[batch]).backward()
             optimizer.step()
@@ -90,7 +95,7 @@ def _trained(x: torch.Tensor, y: torch.Tensor, rows: np.ndarray, stopping: np.nd
         if loss < best:
             best, since = loss, 0
             weights = {name: weight.clone() for name, weight in network.state_dict().items()}
-        if since > _PATIENCE:
+        if since > settings.floor_patience:
             break
     network.load_state_dict(weights)
     return network

@@ -1,4 +1,4 @@
-"""The gap as a classifier sees it, with no model of its cause: held-out AUC, measured against simulated transitions."""
+"""Two-sample test of the dynamics gap: held-out AUC of a classifier of measured against simulated transitions."""
 
 from __future__ import annotations
 
@@ -8,32 +8,37 @@ from sklearn.metrics import roc_auc_score
 from tensordict import TensorDict
 
 from torchrl_h2o.objectives import DynamicsRatioLoss, make_dynamics_ratio_estimator
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.residual import residuals, start_states
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_UPDATES, _BATCH, _CELLS = 600, 256, (64, 64)
 
 
 def two_sample_auc(
-    simulation: Simulation, measured: Measured, *, sensor_std: np.ndarray | None = None, seed: int = 0
+    simulation: Simulation,
+    measured: Measured,
+    *,
+    sensor_std: np.ndarray | None = None,
+    seed: int = 0,
+    settings: JudgeSettings = DEFAULTS.judge,
 ) -> float:
-    """How well real and simulated outcomes of the same state and action can be told apart.
+    """Measures how well a classifier separates measured from simulated outcomes of the same state and action.
 
-    The discriminators of Eq. (9) learn on the fit part and are judged on the held-out part by their log dynamics ratio.
-    They see what a transition changed, each dimension over its spread.
+    The discriminators of Eq. (9) are trained on the fitted part, and their log dynamics ratio is evaluated on the
+    held-out part. Their input is the change of the observation, each dimension in units of its spread.
 
     Args:
         simulation: the simulator.
         measured: the data.
-        sensor_std: (n), noise of the readings, which simulated outcomes then have too, as do the states that they
-            start from.
+        sensor_std: (n), standard deviation of the readings' noise, which is then added to the simulated outcomes and
+            their start states.
         seed: of the networks and the batches.
+        settings: size and training of the networks.
 
     Returns:
-        The area under the ROC curve: 0.5 where no gap can be seen, 1 where every outcome gives itself away.
+        Area under the ROC curve: 0.5 if the gap is undetectable, 1 if every outcome is classified correctly.
 
-    Source: H2O+ (arXiv 2309.12716), Eq. (9).
+    Source: H2O+ (Niu et al., 2023, arXiv 2309.12716), Eq. (9).
     """
     fitted, judged = measured.fitted(), measured.judged()
     with torch.random.fork_rng(devices=[]):
@@ -41,12 +46,16 @@ def two_sample_auc(
         train = _real_and_simulated(simulation, measured, fitted, fitted, sensor_std)
         test = _real_and_simulated(simulation, measured, judged, fitted, sensor_std)
         estimator = make_dynamics_ratio_estimator(
-            measured.observation.shape[1], measured.action.shape[1], _CELLS, logit_bound=None, clamp=None
+            measured.observation.shape[1],
+            measured.action.shape[1],
+            settings.classifier_cells,
+            logit_bound=None,
+            clamp=None,
         )
         loss = DynamicsRatioLoss(estimator)
         optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2)
-        for _ in range(_UPDATES):
-            losses = loss(train[torch.randint(len(train), (_BATCH,))])
+        for _ in range(settings.classifier_updates):
+            losses = loss(train[torch.randint(len(train), (settings.classifier_batch,))])
             optimiser.zero_grad()
             (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
             optimiser.step()
@@ -58,7 +67,7 @@ def two_sample_auc(
 def _real_and_simulated(
     simulation: Simulation, measured: Measured, rows: np.ndarray, like: np.ndarray, sensor_std: np.ndarray | None
 ) -> TensorDict:
-    """Measured transitions and, from the same states and actions, simulated ones: standardised as those of ``like``."""
+    """Measured and simulated transitions of the same states and actions, standardised by the rows ``like``."""
     rng, states = np.random.default_rng(len(rows)), start_states(simulation, measured, rows)
     noise = np.zeros((2, *measured.observation.shape))
     if sensor_std is not None:

@@ -1,1 +1,1 @@
-"""Measured transitions, their residuals, their noise, and the intervals disturbed from outside."""
+"""Measured transitions, their residuals, their sensor noise, and intervals disturbed from outside."""

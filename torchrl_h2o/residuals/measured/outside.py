@@ -1,7 +1,7 @@
-"""What happened from outside, such as a hand that pushes: stretches whose residual is far beyond what is usual there.
+"""Finds intervals disturbed from outside, such as pushes: their residuals are far larger than elsewhere.
 
-A joint limit or a contact that the simulator has wrong makes large residuals too, but again and again, at the same
-states under the same actions: what recurs is physical, and is left to the effects.
+A wrong joint limit or contact in the simulator also causes large residuals, but they recur at the same states under the
+same actions. Recurring residuals are left to the effects.
 """
 
 from __future__ import annotations
@@ -12,27 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, OutsideSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_NEIGHBOURS = 6  # events that began alike
-_APART = 5  # windows: what is nearer in time is the same event
-_QUANTILE = 0.8  # of their sizes: one of them may be a push itself
-_TWICE = 2.0  # as large as what recurs there still counts as the same
-_OFTEN = 0.003  # events a row: what happens more often is no exception, but what the simulator lacks
-_MOST = 0.1  # of the windows, for the same reason
-_ROUNDING = 1e-5  # of a dimension's spread: a residual within it is none
 
 
 @dataclass(frozen=True)
 class OutsideInterval:
-    """A stretch of the data that something from outside disturbed.
+    """An interval of the data that was disturbed from outside.
 
     Args:
-        start: its first row.
-        stop: the row behind its last.
-        size: the largest residual in it, in multiples of the usual one.
+        start: first row.
+        stop: row after the last.
+        size: largest residual, in multiples of the usual one.
     """
 
     start: int
@@ -44,37 +37,38 @@ def outside_intervals(
     simulation: Simulation,
     measured: Measured,
     *,
-    horizon: int = 8,
-    threshold: float = 12.0,
+    settings: OutsideSettings = DEFAULTS.outside,
     states: np.ndarray | None = None,
 ) -> list[OutsideInterval]:
-    """Finds what happened from outside.
+    """Finds intervals disturbed from outside.
 
-    The residual at the end of short windows is compared with the usual one, and with that of the windows that began in
-    similar states under similar actions at other times. It is sharper the less the simulator lacks: ask once before
-    tracing, and once more with the mended simulator.
+    The residual at the end of short windows is compared with the usual one, and with the residuals of windows that
+    began in similar states under similar actions at other times. The test is more sensitive the better the simulator
+    is, so it is worth repeating with the mended simulator.
 
     Args:
         simulation: the simulator, with all effects known so far.
         measured: the data.
-        horizon: control steps of the windows, shorter than what is looked for.
-        threshold: how many times the usual residual is no longer usual.
-        states: (T, nq + nv), to start from instead of the measured ones.
+        settings: window length and thresholds.
+        states: (T, nq + nv), start states; the measured ones by default.
 
     Returns:
-        The intervals, in order, each with a margin of one window on either side; none where large residuals are no
-        exception.
+        The intervals in order, each with a margin of one window on either side; none where large residuals are
+        frequent.
     """
-    starts = measured.windows(horizon)
-    if len(starts) <= _NEIGHBOURS:
+    starts = measured.windows(settings.horizon)
+    if len(starts) <= settings.neighbours:
         return []
-    size = _sizes(simulation, measured, starts, horizon, states)
-    surprising = np.flatnonzero(size > threshold)
-    if not _exceptional(starts[surprising], horizon, len(starts)):
+    size = _sizes(simulation, measured, starts, settings, states)
+    surprising = np.flatnonzero(size > settings.threshold)
+    if not _exceptional(starts[surprising], len(starts), settings):
         return []
-    recurring = _recurring_sizes(_beginnings(simulation, measured, starts, horizon), starts, horizon, size, surprising)
-    outside = surprising[size[surprising] > threshold * np.maximum(1.0, recurring / _TWICE)]
-    return _intervals(starts[outside], size[outside], horizon, measured)
+    recurring = _recurring_sizes(
+        _beginnings(simulation, measured, starts, settings), starts, size, surprising, settings
+    )
+    limit = settings.threshold * np.maximum(1.0, recurring / settings.recurring_factor)
+    outside = surprising[size[surprising] > limit]
+    return _intervals(starts[outside], size[outside], settings.horizon, measured)
 
 
 def still_outside(
@@ -82,90 +76,93 @@ def still_outside(
     simulation: Simulation,
     measured: Measured,
     *,
-    horizon: int = 8,
-    threshold: float = 12.0,
+    settings: OutsideSettings = DEFAULTS.outside,
 ) -> list[OutsideInterval]:
-    """Of intervals found with a poorer simulator, those that the mended one does not explain either.
+    """Selects the intervals that the mended simulator does not explain either.
 
     Args:
-        intervals: as :func:`outside_intervals` found them.
+        intervals: result of :func:`outside_intervals` with the simulator before it was mended.
         simulation: the mended simulator.
-        measured: the data, with no interval left out.
-        horizon: as for :func:`outside_intervals`.
-        threshold: as for :func:`outside_intervals`.
+        measured: the data, with no interval excluded.
+        settings: as for :func:`outside_intervals`.
 
     Returns:
-        The intervals that remain, with the sizes that they have now.
+        The remaining intervals, with their sizes under the mended simulator.
     """
-    starts = measured.windows(horizon)
+    starts = measured.windows(settings.horizon)
     if not intervals or not len(starts):
         return []
-    size = _sizes(simulation, measured, starts, horizon, None)
+    size = _sizes(simulation, measured, starts, settings, None)
     remaining = []
     for interval in intervals:
         inside = (starts >= interval.start) & (starts < interval.stop)
         largest = float(size[inside].max(initial=0.0))
-        if largest > threshold:
+        if largest > settings.threshold:
             remaining.append(replace(interval, size=largest))
     return remaining
 
 
 def outside_rows(intervals: Sequence[OutsideInterval], rows: int) -> np.ndarray:
-    """A mask, (rows), of the rows in the intervals: what :meth:`Measured.without` takes."""
+    """Mask, (rows), of the rows in the intervals, for :meth:`Measured.without`."""
     mask = np.zeros(rows, bool)
     for interval in intervals:
         mask[interval.start : interval.stop] = True
     return mask
 
 
-def _exceptional(surprising: np.ndarray, horizon: int, windows: int) -> bool:
-    """Whether windows with these first rows are few enough, and in few enough events, to be exceptions."""
-    events = 1 + np.count_nonzero(np.diff(surprising) > horizon)
-    return 0 < len(surprising) <= _MOST * windows and events <= max(2.0, _OFTEN * windows)
+def _exceptional(surprising: np.ndarray, windows: int, settings: OutsideSettings) -> bool:
+    """Whether the windows with these first rows, and the events they form, are rare."""
+    events = 1 + np.count_nonzero(np.diff(surprising) > settings.horizon)
+    few_events = events <= max(2.0, settings.max_event_rate * windows)
+    return 0 < len(surprising) <= settings.max_share * windows and few_events
 
 
 def _sizes(
-    simulation: Simulation, measured: Measured, starts: np.ndarray, horizon: int, states: np.ndarray | None
+    simulation: Simulation,
+    measured: Measured,
+    starts: np.ndarray,
+    settings: OutsideSettings,
+    states: np.ndarray | None,
 ) -> np.ndarray:
-    return _in_usual_sizes(residuals(simulation, measured, starts, horizon, states=states)[:, -1], measured)
-
-
-def _in_usual_sizes(residual: np.ndarray, measured: Measured) -> np.ndarray:
-    """The size, (W), of the worst dimension of residuals (W, n), each in robust standard deviations."""
+    """Residual at the end of each window, (W): its largest dimension, in robust standard deviations."""
+    residual = residuals(simulation, measured, starts, settings.horizon, states=states)[:, -1]
     usual = np.nanmedian(np.abs(residual), axis=0) / 0.6745
-    usual = np.maximum(usual, _ROUNDING * measured.observation.std(0) + 1e-12)
+    usual = np.maximum(usual, settings.rounding * measured.observation.std(0) + 1e-12)
     size = (np.abs(residual) / usual).max(1)
-    return np.where(np.isfinite(size), size, 0.0)  # what diverges says nothing of a push
+    return np.where(np.isfinite(size), size, 0.0)  # a divergence is no evidence of a push
 
 
-def _beginnings(simulation: Simulation, measured: Measured, starts: np.ndarray, horizon: int) -> np.ndarray:
-    """What windows begin with, (W, k): the state, the mean action, the action before; each in its own spread."""
+def _beginnings(
+    simulation: Simulation, measured: Measured, starts: np.ndarray, settings: OutsideSettings
+) -> np.ndarray:
+    """Start of each window, (W, k): observation, mean action and previous action, each in its own spread."""
     action = executed_actions(simulation, measured)
-    mean = action[starts[:, None] + np.arange(horizon)].mean(1)
+    mean = action[starts[:, None] + np.arange(settings.horizon)].mean(1)
     features = np.hstack([measured.observation[starts], mean, action[np.maximum(starts - 1, 0)]])
     spread = np.concatenate([measured.observation.std(0), action.std(0), action.std(0)])
     return features[:, spread > 0.0] / spread[spread > 0.0]
 
 
 def _recurring_sizes(
-    beginnings: np.ndarray, starts: np.ndarray, horizon: int, size: np.ndarray, chosen: np.ndarray
+    beginnings: np.ndarray, starts: np.ndarray, size: np.ndarray, chosen: np.ndarray, settings: OutsideSettings
 ) -> np.ndarray:
-    """How large residuals are, for each chosen window, in the events that began most like it at other times."""
+    """Residual, for each chosen window, of the events at other times whose start was most similar, (chosen)."""
+    horizon, apart = settings.horizon, settings.events_apart
     tree = cKDTree(beginnings)
-    asked = min(len(starts), _NEIGHBOURS * (_APART + 1) * horizon)
+    asked = min(len(starts), settings.neighbours * (apart + 1) * horizon)
     recurring = np.zeros(len(chosen))
     for position, window in enumerate(chosen):
         nearest = tree.query(beginnings[window], k=asked)[1]
-        nearest = nearest[np.abs(starts[nearest] - starts[window]) > _APART * horizon]
-        # of windows that overlap, the one that began most alike
+        nearest = nearest[np.abs(starts[nearest] - starts[window]) > apart * horizon]
+        # of overlapping windows, keep the one with the most similar start
         _, first = np.unique(starts[nearest] // horizon, return_index=True)
-        events = nearest[np.sort(first)[:_NEIGHBOURS]]
-        recurring[position] = np.quantile(size[events], _QUANTILE) if len(events) else 0.0
+        events = nearest[np.sort(first)[: settings.neighbours]]
+        recurring[position] = np.quantile(size[events], settings.recurring_quantile) if len(events) else 0.0
     return recurring
 
 
 def _intervals(starts: np.ndarray, size: np.ndarray, horizon: int, measured: Measured) -> list[OutsideInterval]:
-    """Windows with their margins, merged where they touch, cut at the ends of their runs."""
+    """Windows with margins of one window, merged where they touch and cut at the ends of their runs."""
     merged: list[OutsideInterval] = []
     for start, its_size in zip(starts.tolist(), size.tolist(), strict=True):
         in_run = np.flatnonzero(measured.run == measured.run[start])

@@ -1,13 +1,11 @@
-"""The residual: what was measured minus what the simulator makes of the same state and the same actions."""
+"""The residual: the measured observation minus the simulated one, from the same state and the same actions."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.measured import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_SETTLING = 12  # control steps in which what is hidden follows from what is not
 
 
 def residuals(
@@ -20,16 +18,16 @@ def residuals(
     applied: np.ndarray | None = None,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Residuals over windows that each start from their own measured state.
+    """Computes residuals over windows, each simulated from its own start state.
 
     Args:
         simulation: the simulator.
         measured: the data.
-        starts: (W), the first row of each window.
-        horizon: control steps a window.
-        states: (T, nq + nv), to start from instead of the measured ones.
-        applied: (W, H, nv), generalised forces in N or N·m beside those of the effects.
-        rng: draws the noise of random effects of the action, which are left out without it.
+        starts: (W), first row of each window.
+        horizon: control steps per window.
+        states: (T, nq + nv), start states; the measured ones by default.
+        applied: (W, H, nv), generalised forces in N or N·m in addition to those of the effects.
+        rng: generator for random action effects, which are left out without it.
 
     Returns:
         (W, H, n), in the units of the observations; NaN where the simulation diverges.
@@ -44,9 +42,12 @@ def residuals(
 
 
 def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | None = None) -> np.ndarray:
-    """The measured states, (T, nq + nv): observations through the state map, what is hidden carried along.
+    """Measured states, (T, nq + nv): observed coordinates from the state map, unobserved ones from simulation.
 
-    What is hidden takes steps to follow. It is right in all rows, or in those that are asked for.
+    Args:
+        simulation: simulator with the state map and the observation effects to undo.
+        measured: the data.
+        rows: (W), rows in which unobserved coordinates are needed; all by default.
     """
     state_map = simulation.state_map
     true = np.concatenate([simulation.true_observations(measured.observation[run]) for run in measured.runs])
@@ -58,14 +59,18 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
 
 
 def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """What is hidden in some rows, (W, hidden): simulated from steps before, with all else as measured at each."""
+    """Unobserved coordinates in some rows, (W, hidden).
+
+    They are simulated from ``settling_steps`` rows before, with the observed coordinates reset to the measured values
+    at every step.
+    """
     hidden = list(simulation.state_map.hidden)
     actions = executed_actions(simulation, measured)
-    first = np.maximum(rows - _SETTLING, 0)
-    # where a run begins, its first row is repeated
+    first = np.maximum(rows - measured.settings.settling_steps, 0)
+    # before the start of a run, its first row is repeated
     begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])[rows]
     carried = states[np.ix_(rows, hidden)]
-    for step in range(_SETTLING):
+    for step in range(measured.settings.settling_steps):
         row = np.maximum(first + step, begins)
         now = states[row]
         now[:, hidden] = carried
@@ -74,12 +79,12 @@ def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, row
 
 
 def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:
-    """What is executed of the measured actions, (T, nu), run by run; without a generator, of random effects nothing."""
+    """Actions after the action effects, (T, nu), run by run; random effects are left out without a generator."""
     return np.concatenate([simulation.executed(measured.action[run], rng) for run in measured.runs])
 
 
 def _undelayed(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """The following observations, (T, n), at the time at which they were true."""
+    """Following observations, (T, n), with the delays of the sensors undone."""
     observation, following = measured.observation, measured.following
     return np.concatenate(
         [simulation.undelayed(np.vstack([observation[run][:1], following[run]]))[1:] for run in measured.runs]

@@ -1,5 +1,5 @@
-"""The report: its data, its words, its JSON file and its page."""
+"""The report of closing the loop: its contents, its sentence, its JSON file and its page."""
 
-from torchrl_h2o.residuals.report.report import Report
+from torchrl_h2o.residuals.report.document import Report
 
 __all__ = ["Report"]

@@ -1,17 +1,17 @@
-"""Writes and reads ``report.json``: strict JSON, in which a number that is not finite is null."""
+"""Writes and reads ``report.json``: strict JSON in which numbers that are not finite are null."""
 
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
-from torchrl_h2o.residuals.report.report import (
+from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     DimensionError,
     ErrorSummary,
@@ -20,18 +20,20 @@ from torchrl_h2o.residuals.report.report import (
     IndistinguishableGroup,
     Interval,
     RejectedEffect,
-    Report,
+    ReportContents,
     TwoSample,
 )
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.sentence import sentence
 from torchrl_h2o.residuals.report.words import effect_name
 
 FILE = "report.json"
 _ARRAYS = ("before", "after", "states")
+Read = TypeVar("Read")
 
 
-def write_report(report: Report, folder: str | Path) -> Path:
-    """Writes ``report.json`` into a folder, which is made where it does not exist; returns its path."""
+def write_json(report: ReportContents, folder: str | Path) -> Path:
+    """Writes ``report.json`` into a folder, which is created if it does not exist, and returns the file's path."""
     path = Path(folder) / FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(report_to_json(report), ensure_ascii=False, allow_nan=False, indent=1)
@@ -39,30 +41,34 @@ def write_report(report: Report, folder: str | Path) -> Path:
     return path
 
 
-def read_report(path: str | Path) -> Report:
-    """Reads a report from its file, or from the folder that holds it.
+def read_json(path: str | Path, build: Callable[[Mapping[str, Any]], Read]) -> Read:
+    """Reads a report from its file, or from the folder that contains it.
+
+    Args:
+        path: of the file or the folder.
+        build: makes a report from the entries of the file.
 
     Raises:
-        DataError: if there is no such file, or it is no report.
+        DataError: if there is no such file, or it is not a report.
     """
     path = Path(path)
     path = path / FILE if path.is_dir() else path
     remedy = "give the report.json that Report.save wrote, or its folder"
     try:
-        return report_from_json(json.loads(path.read_text(encoding="utf-8")))
+        return build(json.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", remedy, source=path) from error
     except KeyError as error:
-        raise DataError(f"is no report: it has no {error}", remedy, source=path) from error
+        raise DataError(f"is not a report: it lacks {error}", remedy, source=path) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        raise DataError(f"is no report: {error}", remedy, source=path) from error
+        raise DataError(f"is not a report: {error}", remedy, source=path) from error
 
 
-def report_to_json(report: Report) -> dict[str, Any]:
-    """The report as what the file holds; see :meth:`Report.to_json`."""
+def report_to_json(report: ReportContents) -> dict[str, Any]:
+    """The entries of the file."""
     return _plain(
         {
-            "sentence": report.sentence(),
+            "sentence": sentence(report),
             "simulator": report.simulator,
             "effects": [_effect_to_json(found.effect, found) for found in report.found],
             "rejected": [_effect_to_json(rejected.effect, rejected) for rejected in report.rejected],
@@ -88,32 +94,32 @@ def report_to_json(report: Report) -> dict[str, Any]:
     )
 
 
-def report_from_json(entries: Mapping[str, Any]) -> Report:
-    """The report that :func:`report_to_json` was given.
+def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of the report from which :func:`report_to_json` made some entries, by name.
 
     Raises:
-        KeyError, TypeError, ValueError, AttributeError, IndexError: if it was given none.
+        KeyError, TypeError, ValueError, AttributeError, IndexError: if the entries are not those of a report.
     """
-    return Report(
-        simulator=entries["simulator"],
-        found=tuple(_found(entry) for entry in entries["effects"]),
-        rejected=tuple(
+    return {
+        "simulator": entries["simulator"],
+        "found": tuple(_found(entry) for entry in entries["effects"]),
+        "rejected": tuple(
             _read(RejectedEffect, entry, effect=effect_from_dict(entry["effect"])) for entry in entries["rejected"]
         ),
-        indistinguishable=tuple(_group(entry) for entry in entries["indistinguishable"]),
-        error=None if entries["error"] is None else _error(entries["error"]),
-        two_sample=_read(TwoSample, entries["two_sample"]),
-        unexplained_intervals=tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
-        data=_read(DataSummary, entries["data"]),
-        stop_test=entries["stop_test"],
-        conclusion=entries["conclusion"],
-        wall_s=entries["wall_s"],
-        trace=None if entries["trace"] is None else _trace(entries["trace"]),
-    )
+        "indistinguishable": tuple(_group(entry) for entry in entries["indistinguishable"]),
+        "error": None if entries["error"] is None else _error(entries["error"]),
+        "two_sample": _read(TwoSample, entries["two_sample"]),
+        "unexplained_intervals": tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
+        "data": _read(DataSummary, entries["data"]),
+        "stop_test": entries["stop_test"],
+        "conclusion": entries["conclusion"],
+        "wall_s": entries["wall_s"],
+        "trace": None if entries["trace"] is None else _trace(entries["trace"]),
+    }
 
 
 def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict[str, Any]:
-    """What was tried, with the effect itself in words, in numbers and as what rebuilds it."""
+    """An effect with its description, its parameters, its other figures, and the entry that rebuilds it."""
     rest = {field.name: getattr(tried, field.name) for field in dataclasses.fields(tried)}
     ci95 = rest.pop("ci95", {})
     return {
@@ -128,7 +134,7 @@ def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict
 
 
 def _trace_to_json(trace: ResidualTrace) -> dict[str, Any]:
-    """The trace, thinned, to six digits: it is there to be looked at."""
+    """The trace, thinned and rounded to six digits, as it serves pictures only."""
     trace = trace.thinned()
     arrays = {name: [_rounded(row) for row in getattr(trace, name)] for name in _ARRAYS}
     return {
@@ -145,7 +151,7 @@ def _rounded(row: np.ndarray) -> list[float]:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON knows: arrays become lists, NumPy's numbers Python's, what is not finite None."""
+    """A value in JSON's types: arrays become lists, NumPy's numbers Python's, numbers that are not finite None."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -164,9 +170,9 @@ def _floats(entries: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
-    """An instance of a dataclass: what was read already, and the rest as it stands in the entry.
+    """An instance of a dataclass from the fields read already and, for the others, the entry's values.
 
-    An earlier version's entry may lack what has a default.
+    Fields with a default may be missing, as in files of earlier versions.
     """
     there = {**entry, **read}
     values = {}

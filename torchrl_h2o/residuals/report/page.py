@@ -1,4 +1,4 @@
-"""Writes ``report.html``: one file that a browser opens without a network."""
+"""Writes ``report.html``: a single file without references to other resources."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +9,8 @@ from typing import Any
 import jinja2
 
 from torchrl_h2o.residuals.report import plots
-from torchrl_h2o.residuals.report.report import FoundEffect, Report
+from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
+from torchrl_h2o.residuals.report.sentence import sentence
 from torchrl_h2o.residuals.report.words import (
     change,
     interval,
@@ -24,7 +25,7 @@ _TEMPLATE = "report.html.jinja"
 
 @dataclass(frozen=True)
 class _Tried:
-    """A line of the ranking."""
+    """A row of the ranking."""
 
     words: str
     error: float
@@ -33,22 +34,22 @@ class _Tried:
     found: bool
 
 
-def write_page(report: Report, folder: str | Path) -> Path:
-    """Writes ``report.html`` into a folder, which is made where it does not exist; returns its path."""
+def write_page(report: ReportContents, folder: str | Path) -> Path:
+    """Writes ``report.html`` into a folder, which is created if it does not exist, and returns the file's path."""
     path = Path(folder) / FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(report_page(report), encoding="utf-8")
     return path
 
 
-def report_page(report: Report) -> str:
-    """The report as a page.
+def report_page(report: ReportContents) -> str:
+    """Renders the report as a page.
 
     Args:
-        report: the report; what it does not hold, the page leaves out.
+        report: the report; sections without contents are left out.
 
     Returns:
-        HTML with its style and its pictures in it. It asks for nothing from outside.
+        HTML with its style and pictures embedded, without references to other resources.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -60,6 +61,7 @@ def report_page(report: Report) -> str:
     environment.filters |= {"number": number, "quantity": quantity}
     return environment.get_template(_TEMPLATE).render(
         report=report,
+        sentence=sentence(report),
         change=change,
         parameters=_parameters,
         ranking=_ranking(report),
@@ -69,7 +71,7 @@ def report_page(report: Report) -> str:
 
 
 def _parameters(found: FoundEffect) -> list[tuple[str, str, str]]:
-    """Name, value with unit and interval of each parameter of an effect."""
+    """Name, value with unit, and interval of each parameter of an effect."""
     rows = []
     for name, parameter in found.effect.parameters.items():
         low, high = found.ci95.get(name, (float("nan"), float("nan")))
@@ -78,19 +80,19 @@ def _parameters(found: FoundEffect) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _ranking(report: Report) -> list[_Tried]:
-    """Everything that was tried: what was put in, in order, then the rest from the best to the worst."""
+def _ranking(report: ReportContents) -> list[_Tried]:
+    """The effects put in, in order, then the rejected ones in ascending order of their error."""
     found = [
         _Tried(f.words, f.error_after, None, "put in" if k == 0 else "put in, with those above", True)
         for k, f in enumerate(report.found)
     ]
     rejected = [_Tried(r.words, r.error_after, r.p_value, r.reason, False) for r in report.rejected]
-    # a NaN, of what diverged, has no place of its own in an order
+    # NaN, the error of a divergence, sorts last
     return found + sorted(rejected, key=lambda tried: (number(tried.error) == "–", tried.error))
 
 
-def _pictures(report: Report) -> Mapping[str, list[str]]:
-    """The pictures, as SVG, by the section that they stand in."""
+def _pictures(report: ReportContents) -> Mapping[str, list[str]]:
+    """The pictures as SVG, by section of the page."""
     pictures: dict[str, Any] = {"dimensions": [], "horizons": [], "time": [], "states": []}
     if report.error is not None:
         by_unit = sorted(report.error.per_dimension, key=lambda dimension: dimension.unit)

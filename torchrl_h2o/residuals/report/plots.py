@@ -1,6 +1,6 @@
-"""The pictures of a report, as SVG that takes its colours from the page it stands in.
+"""Pictures of a report as SVG whose colours are variables of the page.
 
-Each is small, for a grid that folds on a phone. Needs matplotlib, which nothing else of the report does.
+They are small, so that they fit a grid on a phone as well.
 """
 
 import html
@@ -14,20 +14,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from torchrl_h2o.residuals.report.report import DimensionError, HorizonError, Interval
+from torchrl_h2o.residuals.report.contents import DimensionError, HorizonError, Interval
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.words import number
 
-# drawn in the colour on the left, which the page then sets by the variable on the right
+# placeholder colours, and the page variables that replace them
 _INK, _MUTED, _SHADE, _FLOOR, _ASIDE = "#010101", "#020202", "#030303", "#040404", "#050505"
 _VARIABLES = {_INK: "--ink", _MUTED: "--muted", _SHADE: "--shade", _FLOOR: "--floor", _ASIDE: "--aside"}
-# points are drawn as an image: two colours that can be read on light and on dark
+# points are an image, so their colours are fixed: legible on light and dark pages
 BEFORE, AFTER = "#d9730d", "#2a7de1"
 
 _STYLE = {
     "svg.fonttype": "none",
-    "svg.hashsalt": "report",  # the same report gives the same page
-    "text.parse_math": False,  # a column may be named $x
+    "svg.hashsalt": "report",  # makes the page reproducible
+    "text.parse_math": False,  # column names may contain a dollar sign
     "font.family": "sans-serif",
     "font.size": 9,
     "axes.spines.top": False,
@@ -41,7 +41,7 @@ _STYLE = {
 
 
 def error_bars(dimensions: Sequence[DimensionError]) -> str:
-    """The error before and after, and the floor, of the dimensions of one unit, on a log scale."""
+    """Draws the errors before and after, and the floor, of dimensions with the same unit on a logarithmic scale."""
     with matplotlib.rc_context(_STYLE):
         figure, axes = _figure(height=0.75 + 0.42 * len(dimensions))
         rows = np.arange(len(dimensions))
@@ -57,7 +57,7 @@ def error_bars(dimensions: Sequence[DimensionError]) -> str:
 
 
 def horizon_lines(horizons: Sequence[HorizonError], dimension: DimensionError) -> str:
-    """The error of one dimension against how far ahead it is predicted."""
+    """Draws the error of one dimension against the prediction horizon."""
     with matplotlib.rc_context(_STYLE):
         figure, axes = _figure()
         horizons = [horizon for horizon in horizons if dimension.name in horizon.before]
@@ -74,7 +74,7 @@ def horizon_lines(horizons: Sequence[HorizonError], dimension: DimensionError) -
 
 
 def residual_in_time(trace: ResidualTrace, dimension: int, aside: Sequence[Interval] = ()) -> str:
-    """The residual of one dimension in time; what was held out and what was set aside is shaded."""
+    """Draws the residual of one dimension over time; held-out and excluded intervals are shaded."""
     with matplotlib.rc_context(_STYLE):
         figure, axes = _figure()
         span = {"transform": axes.get_xaxis_transform(), "linewidth": 0}
@@ -89,7 +89,7 @@ def residual_in_time(trace: ResidualTrace, dimension: int, aside: Sequence[Inter
 
 
 def residual_against_state(trace: ResidualTrace, dimension: int, state: int, aside: Sequence[Interval] = ()) -> str:
-    """The residual of one dimension against one state, without what was set aside."""
+    """Draws the residual of one dimension against one state, without excluded intervals."""
     with matplotlib.rc_context(_STYLE):
         figure, axes = _figure()
         fitted = _fitted(trace, aside)
@@ -100,14 +100,14 @@ def residual_against_state(trace: ResidualTrace, dimension: int, state: int, asi
 
 
 def telling_pairs(trace: ResidualTrace, pictures: int = 12) -> list[tuple[int, int]]:
-    """For each state the dimensions whose residual, before, depends on it the most.
+    """Selects, for each state, the dimensions whose residual before depends on it most.
 
     Args:
         trace: the residual.
-        pictures: about how many pairs; at least one for each state.
+        pictures: approximate number of pairs; there is at least one per state.
 
     Returns:
-        Pairs of a dimension and a state, state by state.
+        Pairs (dimension, state), ordered by state.
     """
     n = len(trace.names)
     each = min(n, max(1, pictures // max(n, 1)))
@@ -119,7 +119,7 @@ def telling_pairs(trace: ResidualTrace, pictures: int = 12) -> list[tuple[int, i
 
 
 def _explained(state: np.ndarray, residual: np.ndarray, groups: int = 12) -> float:
-    """The share of the residual's variance that its means over groups of like states explain."""
+    """Share of the residual's variance that is explained by its means over groups of similar states."""
     finite = np.isfinite(state) & np.isfinite(residual)
     state, residual = state[finite], residual[finite]
     if len(residual) < 4 * groups or residual.std() == 0.0 or state.std() == 0.0:
@@ -129,7 +129,7 @@ def _explained(state: np.ndarray, residual: np.ndarray, groups: int = 12) -> flo
 
 
 def _fitted(trace: ResidualTrace, aside: Sequence[Interval]) -> np.ndarray:
-    """Marks the rows that lie in no interval that was set aside, (T,)."""
+    """Mask, (T,), of the rows outside the excluded intervals."""
     fitted = np.ones(len(trace.time), dtype=bool)
     for interval in aside:
         fitted &= (trace.time < interval.start) | (trace.time > interval.end)
@@ -137,7 +137,7 @@ def _fitted(trace: ResidualTrace, aside: Sequence[Interval]) -> np.ndarray:
 
 
 def _points(axes: Axes, x: np.ndarray, trace: ResidualTrace, dimension: int, framed: np.ndarray) -> None:
-    """Points as an image, which stays small, in a frame that holds all but the outliers of the framed rows."""
+    """Draws points as an image, to keep the file small; the frame covers the framed rows without outliers."""
     for residual, colour in ((trace.before, BEFORE), (trace.after, AFTER)):
         axes.plot(x, residual[:, dimension], ".", color=colour, alpha=0.6, markersize=3, mew=0, rasterized=True)
     sizes = np.abs([trace.before[framed, dimension], trace.after[framed, dimension]])
@@ -153,7 +153,7 @@ def _points(axes: Axes, x: np.ndarray, trace: ResidualTrace, dimension: int, fra
 
 
 def _figure(width: float = 4.0, height: float = 2.4) -> tuple[Figure, Axes]:
-    """A figure that pyplot does not know of, in inches."""
+    """A figure outside pyplot's registry; sizes in inches."""
     figure = Figure((width, height), layout="constrained")
     figure.patch.set_alpha(0.0)
     axes = figure.subplots()
@@ -162,7 +162,7 @@ def _figure(width: float = 4.0, height: float = 2.4) -> tuple[Figure, Axes]:
 
 
 def _log_scale(axes: Axes, name: str, values: Sequence[float | None]) -> None:
-    """A log scale around the values, with ticks in plain numbers."""
+    """Sets a logarithmic scale around the values, with ticks in plain numbers."""
     finite = [value for value in map(_positive, values) if np.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.1, 1.0)
     axes.set(**{f"{name}scale": "log", f"{name}lim": (low / 2.0, high * 1.5)})
@@ -176,7 +176,7 @@ def _log_scale(axes: Axes, name: str, values: Sequence[float | None]) -> None:
 
 
 def _positive(value: float | None) -> float:
-    """The value, or NaN, which is not drawn, for one that has no place on a log scale."""
+    """The value, or NaN, which is not drawn, if it is not positive."""
     return value if value is not None and np.isfinite(value) and value > 0.0 else np.nan
 
 
@@ -185,13 +185,13 @@ def _unit(unit: str) -> str:
 
 
 def _svg(figure: Figure, label: str) -> str:
-    """The figure as an SVG element for an HTML page, described by its label to those who cannot see it."""
+    """The figure as an SVG element for an HTML page, with a label for screen readers."""
     file = StringIO()
     figure.savefig(file, format="svg", dpi=160, metadata={"Date": None})
     text = file.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids are one to a page, and nothing refers to these
+    text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids would repeat on the page, and nothing refers to them
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, f"var({variable})")
     return text.replace("<svg ", f'<svg role="img" aria-label="{html.escape(label)}" ', 1)

@@ -1,4 +1,4 @@
-"""The one-step residual in time, before and after the effects were put in, for a report's pictures."""
+"""The one-step residual over time, before and after the effects are put in, for the pictures of a report."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,16 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class ResidualTrace:
-    """The one-step residual in time.
+    """The one-step residual over time.
 
     Args:
-        time: (T,), in s, not decreasing: episodes stand one after another.
-        names: the names of the n dimensions.
+        time: (T,), in s, not decreasing; episodes follow one another.
+        names: names of the n dimensions.
         units: their units.
-        before: the residual without the effects, (T, n); NaN where there is none.
-        after: the residual with them, (T, n).
-        states: the measured state before each step, (T, n).
-        held_out: which rows no fit has seen, (T,).
+        before: (T, n), residual without the effects; NaN where it is not defined.
+        after: (T, n), residual with the effects.
+        states: (T, n), measured state before each step.
+        held_out: (T,), True for rows that no fit has seen.
 
     Raises:
         ValueError: if the shapes do not agree or time decreases.
@@ -39,22 +39,22 @@ class ResidualTrace:
     def __post_init__(self):
         rows, n = len(self.time), len(self.names)
         if len(self.units) != n:
-            raise ValueError(f"the trace has {n} names and {len(self.units)} units; give one for each")
+            raise ValueError(f"the trace has {n} names and {len(self.units)} units; give one unit per name")
         for name in ("before", "after", "states"):
             self._set(name, float, (rows, n))
         self._set("time", float, (rows,))
         self._set("held_out", bool, (rows,))
         if not np.all(np.diff(self.time) >= 0):
-            raise ValueError("the trace's time decreases; let episodes stand one after another in time")
+            raise ValueError("the trace's time decreases; shift the episodes so that they follow one another")
 
     def _set(self, name: str, dtype: type, shape: tuple[int, ...]) -> None:
         array = np.asarray(getattr(self, name), dtype=dtype)
         if array.shape != shape:
-            raise ValueError(f"the trace's {name} has the shape {array.shape}; its times and names need {shape}")
+            raise ValueError(f"the trace's {name} has the shape {array.shape}; its times and names require {shape}")
         object.__setattr__(self, name, array)
 
     def thinned(self, points: int = 1500) -> "ResidualTrace":
-        """At most so many rows, evenly spread."""
+        """The trace reduced to at most ``points`` evenly spread rows."""
         rows = np.unique(np.linspace(0, len(self.time) - 1, min(points, len(self.time))).round().astype(int))
         return ResidualTrace(
             time=self.time[rows],

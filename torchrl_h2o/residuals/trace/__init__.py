@@ -1,1 +1,1 @@
-"""From a residual to the effects of a catalogue that cause it."""
+"""Search for effects of the catalogue that explain the residual: screening, fits, tests, alternatives."""

@@ -1,4 +1,4 @@
-"""Fits the parameters of effects to residuals: bounded least squares with a robust loss, by ``mujoco.sysid``."""
+"""Fits the parameters of effects to residuals: bounded robust least squares with ``mujoco.sysid``."""
 
 from __future__ import annotations
 
@@ -13,24 +13,21 @@ import numpy as np
 from mujoco import sysid
 
 from torchrl_h2o.effects import Effect, Parameter
-from torchrl_h2o.residuals.trace.problem import WORST, Problem, losses
+from torchrl_h2o.residuals.settings import DEFAULTS, FitSettings
+from torchrl_h2o.residuals.trace.problem import Problem, losses
 
-Free = tuple[str, ...]  # the names of the parameters of one effect that a fit may move
-
-_ORIGIN = 10.0  # a fit's variables start here, so that relative steps are steps of their own size
-_FARTHEST = 50.0  # steps of its own size that one fit may move a variable
-_STEP = 1e-5  # relative, of finite differences: 1e-4 of a parameter's typical size
+Free = tuple[str, ...]  # names of the parameters of one effect that a fit may move
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A list of effects, fitted.
+    """Result of a joint fit.
 
     Args:
-        effects: with their values.
-        free: the parameters of each that were moved.
-        loss: mean robust loss over the windows that were fitted.
-        half_widths: of the 95 % interval of each moved parameter, by effect and name.
+        effects: effects with their fitted values.
+        free: names of each effect's fitted parameters.
+        loss: mean robust loss over the fitted windows.
+        half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
     """
 
     effects: tuple[Effect, ...]
@@ -39,7 +36,7 @@ class Fit:
     half_widths: tuple[dict[str, float], ...]
 
     def ci95(self, index: int) -> dict[str, tuple[float, float]]:
-        """The 95 % intervals of the parameters of one effect."""
+        """95 % intervals (low, high) of one effect's fitted parameters, in their units."""
         parameters = self.effects[index].parameters
         return {
             name: (float(parameters[name].value - half), float(parameters[name].value + half))
@@ -53,22 +50,26 @@ def fit(
     free: Sequence[Free],
     starts: np.ndarray,
     *,
-    max_evaluations: int = 25,
+    max_evaluations: int | None = None,
+    settings: FitSettings = DEFAULTS.fit,
 ) -> Fit:
-    """Moves the free parameters of effects, from the values that they have, to the least robust loss.
+    """Minimises the robust loss over the free parameters of effects, starting from their present values.
 
     Args:
-        problem: what to explain.
-        effects: in the order in which they compose.
-        free: the parameters to move, for each effect.
+        problem: simulation, data and scales of the residuals.
+        effects: effects in the order of their composition.
+        free: names of the parameters to move, for each effect.
         starts: (W), first rows of the windows to fit.
-        max_evaluations: of the residual, not counting finite differences.
+        max_evaluations: evaluations of the residual, not counting finite differences; those of the settings by default.
+        settings: scaling of the variables and tolerances.
 
     Returns:
         The fit.
     """
     variables = [
-        _Variable(index, name, effect.parameters[name]) for index, effect in enumerate(effects) for name in free[index]
+        _Variable(index, name, effect.parameters[name], settings)
+        for index, effect in enumerate(effects)
+        for name in free[index]
     ]
 
     def put(z: np.ndarray) -> list[Effect]:
@@ -80,11 +81,15 @@ def fit(
     def residual(z: np.ndarray, _: sysid.ParameterDict) -> tuple:
         try:
             return [problem.residual(put(z), starts).ravel()], None, None
-        except ValueError:  # values that the model cannot have, such as damping below zero
-            return [np.full(len(starts) * problem.horizon * problem.scale.shape[-1], WORST)], None, None
+        except ValueError:  # values that the model rejects, such as negative damping
+            return (
+                [np.full(len(starts) * problem.horizon * problem.scale.shape[-1], problem.settings.worst)],
+                None,
+                None,
+            )
 
     unknown = sysid.ParameterDict(
-        {str(i): sysid.Parameter(str(i), _ORIGIN, *variable.bounds) for i, variable in enumerate(variables)}
+        {str(i): sysid.Parameter(str(i), settings.origin, *variable.bounds) for i, variable in enumerate(variables)}
     )
     with _quiet():
         best, result = sysid.optimize(
@@ -92,11 +97,11 @@ def fit(
             residual,
             "scipy",
             verbose=False,
-            max_iters=max_evaluations,
+            max_iters=settings.max_evaluations if max_evaluations is None else max_evaluations,
             loss="soft_l1",
-            diff_step=_STEP,
-            ftol=1e-5,
-            xtol=1e-7,
+            diff_step=settings.difference_step,
+            ftol=settings.loss_tolerance,
+            xtol=settings.variable_tolerance,
         )
     fitted = put(best.as_vector())
     widths = [{} for _ in effects]
@@ -108,7 +113,7 @@ def fit(
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps ``mujoco.sysid`` quiet: it prints every iteration, whatever it is told, and warns of starts at a bound."""
+    """Silences ``mujoco.sysid``: it prints iterations even with ``verbose=False`` and warns of starts at a bound."""
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -120,14 +125,11 @@ def _quiet() -> Iterator[None]:
 
 
 def _half_widths(problem: Problem, result) -> np.ndarray:
-    """Half of the 95 % interval of each variable, from the curvature and from how windows differ (a sandwich).
-
-    Residuals of one window belong together, so they count as one observation.
-    """
+    """Half-widths of the variables' 95 % intervals, by a sandwich estimate with each window as one observation."""
     jacobian, residual = result.jac, result.fun
     size = problem.horizon * problem.scale.shape[-1]
     curvature = np.linalg.pinv(jacobian.T @ jacobian)
-    # scipy returns the Jacobian of the robust loss, scaled by (1 + r²)^(-3/4); the pull of a residual is r / √(1 + r²)
+    # scipy scales the Jacobian by (1 + r²)^(-3/4) for the robust loss; the derivative of the loss is r / √(1 + r²)
     pull = (1.0 + residual**2) ** 0.75 * residual / np.sqrt(1.0 + residual**2)
     pulls = (jacobian * pull[:, None]).reshape(-1, size, jacobian.shape[1]).sum(1)
     covariance = curvature @ (pulls.T @ pulls) @ curvature
@@ -136,11 +138,12 @@ def _half_widths(problem: Problem, result) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Variable:
-    """A parameter as the optimiser moves it: about 10, a step of 1 is a step of the parameter's own size."""
+    """A parameter as a scaled variable: it starts at ``settings.origin``, and a step of 1 is one typical size."""
 
     effect: int
     name: str
     parameter: Parameter
+    settings: FitSettings
 
     @property
     def logarithmic(self) -> bool:
@@ -153,8 +156,8 @@ class _Variable:
     def value(self, z: float) -> float:
         low, high = self.parameter.bounds
         if self.logarithmic:
-            return float(np.clip(self.parameter.value * 2.0 ** (z - _ORIGIN), low, high))
-        return float(np.clip(self.parameter.value + self.size * (z - _ORIGIN), low, high))
+            return float(np.clip(self.parameter.value * 2.0 ** (z - self.settings.origin), low, high))
+        return float(np.clip(self.parameter.value + self.size * (z - self.settings.origin), low, high))
 
     def slope(self, z: float) -> float:
         return self.value(z) * math.log(2.0) if self.logarithmic else self.size
@@ -166,11 +169,11 @@ class _Variable:
             ends = np.log2(np.array([low, high]) / self.parameter.value)
         else:
             ends = (np.array([low, high]) - self.parameter.value) / self.size
-        return tuple(_ORIGIN + np.clip(ends, -_FARTHEST, _FARTHEST))
+        return tuple(self.settings.origin + np.clip(ends, -self.settings.max_move, self.settings.max_move))
 
 
 def typical_size(parameter: Parameter) -> float:
-    """How large a change of a parameter is, from the value that a fit starts from."""
+    """Typical change of a parameter, from the value at which a fit starts, in the parameter's unit."""
     if not math.isfinite(parameter.neutral):
         return abs(parameter.value) or 1.0
     return abs(parameter.value - parameter.neutral) or max(0.1 * abs(parameter.neutral), 1e-3)

@@ -1,4 +1,4 @@
-"""Screening: what every entry of a catalogue could explain of a residual, from one or two simulations each."""
+"""Screens a catalogue: estimates what each entry could explain of a residual from one simulation per trial."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchrl_h2o.residuals.trace.problem import Problem, losses
 
 @dataclass(frozen=True)
 class Lead:
-    """An entry that may explain something.
+    """Result of screening one entry.
 
     Args:
-        entry: of the catalogue.
-        effect: with the values from which a fit should start.
-        promise: the share of the loss that it would explain if the residual were linear in it.
-        trial: of the entry, by which that is seen.
-        change: of the residual in scales, (W · H · n), from neutral to the effect, if it were linear.
+        entry: entry of the catalogue.
+        effect: effect with the values at which a fit should start.
+        promise: share of the loss that the effect would explain if the residual were linear in it.
+        trial: the entry's trial with the highest promise.
+        change: linear change of the scaled residual from neutral to the effect, (W · H · n).
     """
 
     entry: CatalogueEntry
@@ -33,12 +33,12 @@ class Lead:
 
     @property
     def free(self) -> Free:
-        """The parameters that a fit may move."""
+        """Names of the parameters that a fit may move."""
         return free_parameters(self.entry)
 
 
 def free_parameters(entry: CatalogueEntry) -> Free:
-    """The parameters of an entry that any of its trials moves."""
+    """Names of the parameters that any trial of an entry moves."""
     return tuple(dict.fromkeys(name for trial in entry.trials for name in trial))
 
 
@@ -49,20 +49,20 @@ def screen(
     starts: np.ndarray,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Lead]:
-    """What each entry promises beside the effects that are known, the best first.
+    """Estimates what each entry explains in addition to known effects.
 
     Each trial of an entry is simulated once. The residual is then taken as linear between neutral and the trial, and
-    the entry's promise is the robust loss that the best point on that line, or the trial itself, would take away.
+    the entry's promise is the reduction of the robust loss at the best point on that line, or at the trial itself.
 
     Args:
-        problem: what to explain.
-        known: effects that are in already.
-        entries: to be screened; those that the model cannot have are passed over.
-        starts: (W), first rows of the windows to look at.
+        problem: simulation, data and scales of the residuals.
+        known: effects that are put in already.
+        entries: entries to screen; random effects and those that the model rejects are skipped.
+        starts: (W), first rows of the windows to simulate.
         advance: called after each entry.
 
     Returns:
-        A lead an entry.
+        One lead per entry, in descending order of the promise.
     """
     before = problem.residual(known, starts)
     loss = losses(before).mean()
@@ -88,7 +88,7 @@ def _lead(
         effect = entry.effect.with_parameters(trial)
         try:
             after = problem.residual([*known, effect], starts)
-        except ValueError:  # less damping than the joint has, and the like
+        except ValueError:  # a value that the model rejects, such as negative total damping
             continue
         share, explained = _along(before, after - before)
         reached = 1.0 - losses(after).mean() / max(loss, 1e-300)
@@ -103,7 +103,7 @@ def _lead(
 
 
 def _along(before: np.ndarray, change: np.ndarray) -> tuple[float, float]:
-    """How far to go along a change of the residual, and the share of the robust loss that it takes away."""
+    """Best step along a change of the residual, between -1 and 2, and the share of the robust loss it removes."""
     weight = 1.0 / np.sqrt(1.0 + before**2)
     square = float((weight * change**2).sum())
     if square == 0.0:
@@ -114,7 +114,7 @@ def _along(before: np.ndarray, change: np.ndarray) -> tuple[float, float]:
 
 
 def is_possible(problem: Problem, effects: Sequence[Effect]) -> bool:
-    """Whether the model can have the effects: no less damping than none, and the like."""
+    """Whether the model accepts the effects; it rejects, for example, negative total damping."""
     try:
         return problem.simulation.with_effects(*effects).model is not None
     except ValueError:
@@ -124,20 +124,21 @@ def is_possible(problem: Problem, effects: Sequence[Effect]) -> bool:
 def promising_sets(
     problem: Problem, known: Sequence[Effect], leads: Sequence[Lead], size: int, starts: np.ndarray, keep: int
 ) -> list[tuple[Lead, ...]]:
-    """The sets of so many leads that together promise most, all sets being looked at.
+    """Ranks all sets of leads of one size by what they promise together, in a linear least-squares model.
 
-    One effect that stands for two others, a little of each, can hide both from a search that adds one at a time.
+    Sets are needed where one wrong effect imitates a mixture of two right ones: a search that adds one effect at a time
+    would take the wrong one.
 
     Args:
-        problem: what to explain.
-        known: effects that are in already, as when the leads were screened.
-        leads: to choose from.
-        size: of the sets.
-        starts: (W), the windows that were screened.
-        keep: how many sets to return.
+        problem: simulation, data and scales of the residuals.
+        known: effects that are put in already, as during the screening.
+        leads: leads to combine.
+        size: leads per set.
+        starts: (W), first rows of the screened windows.
+        keep: number of sets to return.
 
     Returns:
-        The sets, the best first.
+        The sets with the highest promise, in descending order.
     """
     before = problem.residual(known, starts).ravel()
     weight = 1.0 / np.sqrt(1.0 + before**2)
@@ -151,8 +152,8 @@ def promising_sets(
     return [tuple(leads[i] for i in sets[best]) for best in np.argsort(-gain)[:keep]]
 
 
-def _towards(effect: Effect, trial: dict[str, float], share: float) -> Effect:
-    """The effect part of the way to a trial, or the other way, but far enough to see which way is down."""
+def _towards(effect: Effect, trial: Mapping[str, float], share: float) -> Effect:
+    """The effect at a share of the way to a trial, at least 5 % so that a fit sees a gradient."""
     share = np.copysign(max(abs(share), 0.05), share)
     values = {}
     for name, target in trial.items():

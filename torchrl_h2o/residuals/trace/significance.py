@@ -1,4 +1,4 @@
-"""Whether one explanation beats another by more than chance would: a paired test on held-out data."""
+"""Paired one-sided tests of whether one explanation has a lower held-out loss than another."""
 
 from __future__ import annotations
 
@@ -6,27 +6,32 @@ import numpy as np
 from scipy.stats import t as student
 from scipy.stats import wilcoxon
 
-BLOCKS = 30  # of neighbouring windows, whose residuals depend on each other
-_MOST_ODDS = 100.0  # to one, that one block may give
-_NOTHING = 1e-6  # of the mean loss
-IN_WORDS = (
-    f"one-sided tests (Student's t, Wilcoxon's, and the odds of the losses) on the held-out loss, paired over {BLOCKS} "
-    "blocks of neighbouring windows, at 1 % divided by the number of effects tried; where sensors are noisy, also four "
-    "times the share of the loss that the same effect would explain if nothing but noise were there"
-)
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, SignificanceSettings
 
 
-def p_value(gain: np.ndarray) -> float:
-    """The chance to see such a gain where there is none.
+def stop_test(settings: LoopSettings) -> str:
+    """Description of the test by which the search for effects stops."""
+    test = settings.significance
+    return (
+        "one-sided tests (Student's t, Wilcoxon's signed ranks, and a bet on the ratio of the losses) on the held-out "
+        f"loss, paired over {test.blocks} blocks of neighbouring windows, at a level of {100.0 * test.level:g} % "
+        "divided by the number of effects tried; where sensors are noisy, an effect must also explain "
+        f"{settings.trace.beyond_noise:g} times the share of the loss that it explains in data with sensor noise alone"
+    )
+
+
+def p_value(gain: np.ndarray, settings: SignificanceSettings = DEFAULTS.significance) -> float:
+    """Tests whether the mean gain exceeds zero.
 
     Args:
-        gain: (W), how much lower the loss of each held-out window is, in their order in time.
+        gain: (W), decrease of each held-out window's loss, in order of time.
+        settings: number of blocks.
 
     Returns:
-        The p-value of two one-sided tests on the means of blocks, the better of them counted twice: Student's t, which
-        sees what is rare and large, and Wilcoxon's signed ranks, which see what is small and everywhere.
+        The smaller p-value of two one-sided tests on block means, doubled: Student's t test, which detects large and
+        rare gains, and Wilcoxon's signed-rank test, which detects small and widespread ones.
     """
-    blocks = np.array([part.mean() for part in np.array_split(gain, min(BLOCKS, len(gain))) if len(part)])
+    blocks = np.array([part.mean() for part in np.array_split(gain, min(settings.blocks, len(gain))) if len(part)])
     spread = blocks.std(ddof=1) / np.sqrt(len(blocks))
     if spread == 0.0:
         return 0.0 if blocks.mean() > 0.0 else 1.0
@@ -35,25 +40,29 @@ def p_value(gain: np.ndarray) -> float:
     return float(min(1.0, 2.0 * min(by_size, by_rank)))
 
 
-def p_value_of_losses(before: np.ndarray, after: np.ndarray) -> float:
-    """The chance to see losses fall so where there is nothing that makes them fall.
+def p_value_of_losses(
+    before: np.ndarray, after: np.ndarray, settings: SignificanceSettings = DEFAULTS.significance
+) -> float:
+    """Tests whether losses decrease from one explanation to another.
 
-    What acts now and then, such as the end of a joint's range, may show in three blocks of thirty, too few for tests on
-    means however large it is. But what changes residuals by chance hardly ever makes them vanish: that one shrinks to a
-    part of 1/c has a chance of about 1/c. So who bets on it is paid, in each block, the square root of the ratio of the
-    losses, and breaks even at best; such a stake grows a hundredfold once in a hundred times (Ville's inequality).
+    An effect that acts rarely, such as a joint limit, may change three blocks of thirty, too few for a test on means.
+    A third test therefore bets on vanishing residuals: by chance a residual shrinks to the fraction 1/c with a
+    probability of about 1/c, so a bet that pays the square root of the ratio of the losses in each block has an
+    expected return of at most one. By Ville's inequality the product of the payoffs exceeds c with a probability of at
+    most 1/c.
 
     Args:
-        before: (W), the loss of each held-out window without an effect, in their order in time.
-        after: (W), the same with it.
+        before: (W), loss of each held-out window with the first explanation, in order of time.
+        after: (W), the same with the second explanation.
+        settings: blocks, bounds of the bet.
 
     Returns:
-        The p-value of three tests, those of :func:`p_value` and this bet, the best of them counted three times.
+        The smallest p-value of the three tests (two of :func:`p_value`, and the bet), tripled.
     """
-    blocks = [part for part in np.array_split(np.arange(len(before)), min(BLOCKS, len(before))) if len(part)]
+    blocks = [part for part in np.array_split(np.arange(len(before)), min(settings.blocks, len(before))) if len(part)]
     b, a = (np.array([loss[part].mean() for part in blocks]) for loss in (before, after))
-    usual = max(np.median(a), _NOTHING * b.mean())
+    usual = max(np.median(a), settings.loss_floor * b.mean())
     if usual == 0.0:
         return 1.0
-    odds = np.minimum(0.5 * np.log((usual + b) / (usual + a)), np.log(_MOST_ODDS)).sum()
-    return float(min(1.0, 1.5 * p_value(before - after), 3.0 * np.exp(-max(odds, 0.0))))
+    odds = np.minimum(0.5 * np.log((usual + b) / (usual + a)), np.log(settings.max_odds)).sum()
+    return float(min(1.0, 1.5 * p_value(before - after, settings), 3.0 * np.exp(-max(odds, 0.0))))

@@ -1,1 +1,1 @@
-"""Forces that no catalogue holds, found in the residual by sparse regression."""
+"""Forces outside the catalogue: inverse dynamics of the residual, sparse regression, and the comparison."""

@@ -1,4 +1,4 @@
-"""The residual as a generalised force: which force on a degree of freedom would make the simulator step as measured."""
+"""Inverse dynamics of the residual: the generalised force that makes the simulator reproduce the measured step."""
 
 from __future__ import annotations
 
@@ -6,25 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, RegressionSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_TAILS = 4.0  # degrees of freedom of the residuals' t-distribution: contacts and outliers make its tails heavy
-_ITERATIONS = 15
-_SHRINKAGE = 0.01  # of the scatter towards its diagonal, so that its inverse exists without noise
-_NUDGE = 0.1  # of the typical force, for finite differences
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualForces:
-    """The residual of each transition, read as a force on one degree of freedom at a time.
+    """The residual of each transition as a force on one degree of freedom at a time.
 
     Args:
         force: (W, nv), in N or N·m, constant over the control step: the force on this degree of freedom alone that
-            comes closest to the measured step.
-        weight: (W, nv), one over the force's variance; zero where the step does not tell of it: nothing that is
-            observed moves with it, or a stop or dry friction holds it.
+            reproduces the measured step best.
+        weight: (W, nv), inverse variance of the force; zero where the observation does not depend on it, or a stop or
+            dry friction holds the joint.
     """
 
     force: np.ndarray
@@ -38,30 +34,32 @@ def residual_forces(
     *,
     residual: np.ndarray | None = None,
     response: np.ndarray | None = None,
+    settings: RegressionSettings = DEFAULTS.regression,
 ) -> ResidualForces:
-    """The force that makes the simulator reproduce the measured step, for each degree of freedom by itself.
+    """Computes the force that makes the simulator reproduce the measured step, for each degree of freedom alone.
 
-    Solving for the forces on all degrees of freedom at once would be exact, but where one of them is hardly observed it
-    turns noise into large forces on all. One at a time needs no such inversion, and what a regression of these forces
-    with these weights explains is just what the force explains of the residual (generalised least squares).
+    Solving for the forces on all degrees of freedom at once would be exact, but where one of them is hardly observed,
+    noise would become large forces on all. One at a time needs no such inversion. A regression of these forces with
+    these weights is a generalised least-squares regression of the residual.
 
     Args:
         simulation: the simulator.
         measured: the data.
         starts: (W), the transitions.
-        residual: (W, n), to explain; the simulation's own by default.
-        response: (W, n, nv), of what is observed to the forces; :func:`force_response` by default.
+        residual: (W, n), residual to convert; that of the simulation by default.
+        response: (W, n, nv), derivative of the observation by the forces; :func:`force_response` by default.
+        settings: scatter of the residuals and finite differences.
 
     Returns:
-        The forces and what they weigh.
+        The forces and their weights.
     """
     if residual is None:
         residual = residuals(simulation, measured, starts)[:, 0]
     if response is None:
-        response = force_response(simulation, measured, starts)
+        response = force_response(simulation, measured, starts, settings=settings)
     finite = np.isfinite(residual).all(1) & np.isfinite(response).all((1, 2))
     residual, response = np.where(finite[:, None], residual, 0.0), np.where(finite[:, None, None], response, 0.0)
-    precision, rows = _precision(residual, finite)
+    precision, rows = _precision(residual, finite, settings)
     towards = np.einsum("wnv,nm->wmv", response, precision)
     weight = np.einsum("wmv,wmv->wv", towards, response)
     force = np.einsum("wmv,wm->wv", towards, residual) / np.where(weight > 0.0, weight, 1.0)
@@ -69,12 +67,17 @@ def residual_forces(
 
 
 def force_response(
-    simulation: Simulation, measured: Measured, starts: np.ndarray, *, states: np.ndarray | None = None
+    simulation: Simulation,
+    measured: Measured,
+    starts: np.ndarray,
+    *,
+    states: np.ndarray | None = None,
+    settings: RegressionSettings = DEFAULTS.regression,
 ) -> np.ndarray:
-    """How what is observed after a control step changes with the generalised forces, (W, n, nv), per N or N·m.
+    """Derivative of the observation after a control step by the generalised forces, (W, n, nv), per N or N·m.
 
-    By finite differences, with steps of the size of the forces that move the data: across dry friction and soft
-    contacts the derivative at a point would say little.
+    Finite differences with steps of the size of the typical force, because a derivative at a point would be misleading
+    across dry friction and soft contacts.
     """
     model, state_map = simulation.model, simulation.state_map
     states = start_states(simulation, measured, starts) if states is None else states
@@ -82,7 +85,7 @@ def force_response(
     states, actions = states[starts], executed_actions(simulation, measured)[starts][:, None]
     change = np.nanstd(missed @ state_map.restore.T, axis=0)[model.nq :]
     change = np.maximum(change, 1e-6 + 1e-4 * np.nanstd(states[:, model.nq :], axis=0))
-    size = _NUDGE * model.dof_M0 * change / simulation.control_step
+    size = settings.force_nudge * model.dof_M0 * change / simulation.control_step
     columns = []
     for dof in range(model.nv):
         push = np.zeros((len(starts), 1, model.nv))
@@ -97,7 +100,7 @@ def force_response(
 
 @dataclass(frozen=True, eq=False)
 class StepPath:
-    """The states that a transition passes through, at the start of every physics step.
+    """States and controls of each transition at the start of every physics step.
 
     Args:
         qpos: (W, S, nq).
@@ -115,7 +118,7 @@ class StepPath:
 def step_path(
     simulation: Simulation, measured: Measured, starts: np.ndarray, *, states: np.ndarray | None = None
 ) -> StepPath:
-    """The path of each transition: as simulated, bent to where it was measured to end."""
+    """Simulated path of each transition, corrected linearly in time so that it ends at the measured state."""
     model, steps = simulation.model, simulation.frame_skip
     states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0] @ simulation.state_map.restore.T
@@ -129,14 +132,14 @@ def step_path(
     return StepPath(path[..., : model.nq], path[..., model.nq :], actions, moments)
 
 
-def _precision(residual: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse of the residuals' scatter, (n, n), and each row's weight, (W), by a multivariate t-distribution."""
+def _precision(residual: np.ndarray, finite: np.ndarray, settings: RegressionSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse scatter of the residuals, (n, n), and weight of each row, (W), under a multivariate t-distribution."""
     size = residual.shape[1]
     rows = finite.astype(float)
-    for _ in range(_ITERATIONS):
+    for _ in range(settings.scatter_iterations):
         scatter = (rows[:, None] * residual).T @ residual / max(finite.sum(), 1)
         floor = np.maximum(np.diag(scatter), 1e-12 * scatter.trace() + 1e-30)
-        precision = np.linalg.inv((1.0 - _SHRINKAGE) * scatter + _SHRINKAGE * np.diag(floor))
+        precision = np.linalg.inv((1.0 - settings.shrinkage) * scatter + settings.shrinkage * np.diag(floor))
         distance = np.einsum("wn,nm,wm->w", residual, precision, residual)
-        rows = finite * (_TAILS + size) / (_TAILS + distance)
+        rows = finite * (settings.tails + size) / (settings.tails + distance)
     return precision, rows

@@ -1,4 +1,4 @@
-"""Sparse regression of a force on a library of terms: as few terms as explain it, chosen on blocks held back."""
+"""Sparse regression of a force on a library of terms, selected by cross-validation over blocks of rows."""
 
 from __future__ import annotations
 
@@ -9,23 +9,17 @@ from pysindy.optimizers import FROLS
 from scipy.stats import f
 
 from torchrl_h2o.effects.force.term import ForceTerm
+from torchrl_h2o.residuals.settings import RegressionSettings
 from torchrl_h2o.residuals.undeclared.terms import Factors, TermLibrary
-
-_MOST_TERMS = 3  # on one degree of freedom, in one go
-_BLOCKS = 10  # neighbours in time are held back together
-_FOLDS = 5
-_LEVEL = 1e-4  # of the F-test of a term, for a whole library
-_PAYS = 0.01  # share of what is unexplained that a term must explain
-_STILL = 1e-9  # norm, relative, of a column that the others explain
 
 
 @dataclass(frozen=True)
 class SparseForce:
-    """A force on one degree of freedom as a sum of few terms.
+    """A force on one degree of freedom as a sum of a few terms.
 
     Args:
         terms: the terms.
-        gain: what they explain on blocks held back, as a reduction of the weighted sum of squares.
+        gain: decrease of the weighted sum of squares on blocks held back.
     """
 
     terms: tuple[ForceTerm, ...] = ()
@@ -33,58 +27,59 @@ class SparseForce:
 
 
 def sparse_force(library: TermLibrary, force: np.ndarray, weight: np.ndarray) -> SparseForce:
-    """The few terms of a library that explain a force.
+    """Selects the terms of a library that explain a force.
 
     Terms are added by forward regression with orthogonal least squares (FROLS). A term is kept if it lowers the error
-    on blocks of neighbours that the regression has not seen, by a share worth a word, and by more than chance would:
-    an F-test whose level is divided by the number of terms to choose from.
+    on blocks of rows held back, by a minimum share and significantly: an F-test whose level is divided by the number of
+    terms in the library.
 
     Args:
-        library: of the degree of freedom.
+        library: terms on the degree of freedom.
         force: (W), in N or N·m.
-        weight: (W), one over its variance; rows without any weight are left out.
+        weight: (W), inverse variance of the force; rows of zero weight are left out.
 
     Returns:
-        The terms, none if none pays.
+        The terms; none if none passes.
     """
+    settings = library.settings
     known = weight > 0.0
-    if known.sum() < 10 * _BLOCKS or not force[known].any():
+    if known.sum() < 10 * settings.blocks or not force[known].any():
         return SparseForce()
     candidates = list(dict.fromkeys([*library.fixed(), *library.scanned(force, weight)]))
     columns = np.stack([library.column(factors) for factors in candidates], axis=1)
     root = np.sqrt(weight[known])
     design, target = root[:, None] * columns[known], root * force[known]
     size = np.linalg.norm(design, axis=0)
-    moving = np.flatnonzero(size > _STILL * size.max())
+    moving = np.flatnonzero(size > settings.negligible * size.max())
     candidates, design = [candidates[i] for i in moving], design[:, moving] / size[moving]
-    chosen, gain = _chosen(design, target)
+    chosen, gain = _chosen(design, target, settings)
     values = np.linalg.lstsq(design[:, chosen], target, rcond=None)[0] / size[moving][chosen]
     return SparseForce(
         tuple(_term(library, candidates[i], value) for i, value in zip(chosen, values, strict=True)), gain
     )
 
 
-def _chosen(design: np.ndarray, target: np.ndarray) -> tuple[list[int], float]:
-    """The columns that pay, and what they explain of blocks held back."""
+def _chosen(design: np.ndarray, target: np.ndarray, settings: RegressionSettings) -> tuple[list[int], float]:
+    """Indices of the selected columns, and the decrease of the sum of squares on blocks held back."""
     rows, choices = design.shape
-    chance = f.isf(_LEVEL / choices, 1, rows)
+    chance = f.isf(settings.level / choices, 1, rows)
     before = left = float(target @ target)
     chosen = []
-    steps = FROLS(max_iter=_MOST_TERMS, alpha=1e-9, unbias=False).fit(design, target[:, None]).history_[1:]
-    for coefficients in steps:
+    regression = FROLS(max_iter=settings.max_terms, alpha=1e-9, unbias=False).fit(design, target[:, None])
+    for coefficients in regression.history_[1:]:
         support = np.flatnonzero(coefficients).tolist()
-        loss = _held_back_loss(design[:, support], target)
-        if left - loss < max(_PAYS * before, chance * loss / rows):
+        loss = _held_back_loss(design[:, support], target, settings)
+        if left - loss < max(settings.min_gain * before, chance * loss / rows):
             break
         chosen, left = support, loss
     return chosen, before - left
 
 
-def _held_back_loss(design: np.ndarray, target: np.ndarray) -> float:
-    """The sum of squares of what regressions on all other blocks leave of each block."""
-    fold = np.arange(len(target)) * _BLOCKS // len(target) % _FOLDS
+def _held_back_loss(design: np.ndarray, target: np.ndarray, settings: RegressionSettings) -> float:
+    """Cross-validated sum of squares: each fold is predicted by a regression on the others."""
+    fold = np.arange(len(target)) * settings.blocks // len(target) % settings.folds
     loss = 0.0
-    for k in range(_FOLDS):
+    for k in range(settings.folds):
         seen = fold != k
         solution = np.linalg.lstsq(design[seen], target[seen], rcond=None)[0]
         loss += float(((target[~seen] - design[~seen] @ solution) ** 2).sum())

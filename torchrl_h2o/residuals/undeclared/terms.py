@@ -1,6 +1,6 @@
-"""The library of terms that a force may be made of, and what they come to on the measured transitions.
+"""Library of the terms that a force may consist of, evaluated on the measured transitions.
 
-Frequencies, phases and starting times are not tried from a list alone: they are scanned for and then refined.
+Frequencies, phases and starting times of terms are scanned over a range and then refined.
 """
 
 from __future__ import annotations
@@ -13,52 +13,47 @@ from scipy.optimize import minimize_scalar
 
 from torchrl_h2o.effects.force.residual_force import DegreeOfFreedom, coordinate
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
+from torchrl_h2o.residuals.settings import DEFAULTS, RegressionSettings
 from torchrl_h2o.residuals.undeclared.inverse_force import StepPath
 
 Factors = tuple[Factor, ...]
 
-_MOST_WAVES = 15.0  # over the range of a position; more could not be told from noise
-_MOST_HARMONIC = 30.0  # of a hinge's turn: the ripple of motors with many poles
-_SPACING = 0.8  # of scanned frequencies, in rad over the range
-_MOST_SCANNED = 1500  # frequencies
-_SCANNED_VALUES = 5000  # positions that frequencies are scanned on, before the best is refined on all
-_LEAST_PERIODS = 1.5  # of a wave in time: one that is seen only in part cannot be told from a trend
-_LEAST_SHARE = 0.03  # of the rows, on either side of a step
-_STILL = 1e-9  # spread, relative, of a column that is constant
-
 
 @dataclass(frozen=True, eq=False)
 class TermLibrary:
-    """The terms of a force on one degree of freedom.
+    """Terms of a force on one degree of freedom.
 
     Args:
         freedom: the degree of freedom.
-        path: what the transitions pass through.
-        observed: (nq + nv), whether a coordinate of the state is observed.
+        path: states and controls within the transitions.
+        observed: (nq + nv), True for observed coordinates of the state.
+        settings: range and resolution of the scans.
     """
 
     freedom: DegreeOfFreedom
     path: StepPath
     observed: np.ndarray
+    settings: RegressionSettings = DEFAULTS.regression
 
     @property
     def _coordinates(self) -> tuple[bool, bool]:
-        """Whether the position and the velocity are observed, as one number each, and vary."""
+        """Whether position and velocity are scalar, observed and not constant."""
+        still = self.settings.negligible
         position, nq = self.freedom.position, self.path.qpos.shape[-1]
-        has_q = position is not None and bool(self.observed[position]) and np.ptp(self._values("q")) > _STILL
-        return has_q, bool(self.observed[nq + self.freedom.velocity]) and np.ptp(self._values("v")) > _STILL
+        has_q = position is not None and bool(self.observed[position]) and np.ptp(self._values("q")) > still
+        return has_q, bool(self.observed[nq + self.freedom.velocity]) and np.ptp(self._values("v")) > still
 
     def _values(self, name: str) -> np.ndarray:
         path = self.path
         return coordinate(name, self.freedom, path.qpos, path.qvel, path.ctrl, path.time)
 
     def column(self, factors: Factors) -> np.ndarray:
-        """The mean of a term of coefficient 1 over each control step, (W), as the force is one over it too."""
+        """Mean over each control step, (W), of a term with coefficient 1; the residual force is such a mean as well."""
         shape = ForceTerm(self.freedom.name, 1.0, factors).shape(self._values)
         return np.broadcast_to(shape, self.path.time.shape).mean(1)
 
     def fixed(self) -> Iterator[Factors]:
-        """The terms without numbers to be found: polynomials, signs and products."""
+        """Terms without parameters to scan: polynomials, signs and products."""
         has_q, has_v = self._coordinates
         q, v, sign = Factor("power", "q"), Factor("power", "v"), Factor("sign", "v")
         yield ()
@@ -77,11 +72,11 @@ class TermLibrary:
             yield from ((a, other) for other, there in ((q, has_q), (v, has_v)) if there)
 
     def scanned(self, force: np.ndarray, weight: np.ndarray) -> Iterator[Factors]:
-        """The waves and steps that explain most of a force.
+        """Waves and steps that explain most of a force, after regressions on different simple terms.
 
         Args:
             force: (W), in N or N·m.
-            weight: (W), one over its variance.
+            weight: (W), inverse variance of the force.
         """
         has_q, has_v = self._coordinates
         simple = [(Factor("power", name),) for name, there in (("q", has_q), ("v", has_v)) if there]
@@ -95,41 +90,43 @@ class TermLibrary:
             yield from self._step(rest, weight)
 
     def _wave(self, force: np.ndarray, weight: np.ndarray, carrier: Factors) -> Factors:
-        """The best ``carrier · sin(k q + phase)``."""
+        """The best ``carrier · sin(k q + phase)``, from a scan of k and a refinement."""
         q = self._values("q")
         scale = np.broadcast_to(ForceTerm(self.freedom.name, 1.0, carrier).shape(self._values), q.shape)
         span = np.ptp(q)
-        most = 2.0 * np.pi * _MOST_WAVES / span
-        least, most = np.pi / span, most if self.freedom.sliding else max(most, _MOST_HARMONIC)
-        spacing = max(_SPACING / span, (most - least) / _MOST_SCANNED)
-        k, phase = _best_wave(force, weight, q, scale, np.arange(least, most, spacing))
+        rules = self.settings
+        most = 2.0 * np.pi * rules.max_waves / span
+        least, most = np.pi / span, most if self.freedom.sliding else max(most, rules.max_harmonic)
+        spacing = max(rules.scan_spacing / span, (most - least) / rules.max_scanned)
+        k, phase = _best_wave(force, weight, q, scale, np.arange(least, most, spacing), rules.scanned_values)
         return (*carrier, Factor("sin", "q", numbers=(k, phase)))
 
     def _wave_in_time(self, force: np.ndarray, weight: np.ndarray) -> Iterator[Factors]:
-        """The best ``sin(omega t + phase)``: the peak of a periodogram, refined."""
+        """The best ``sin(omega t + phase)``, from the peak of a periodogram and a refinement."""
         time = self.path.time.mean(1)
         span = np.ptp(time)
         step = np.median(np.diff(np.unique(time)))
         place = np.round((time - time.min()) / step).astype(int)
-        if place.max() > 50 * len(place):  # recorded on very different days
+        if place.max() > 50 * len(place):  # runs recorded on different days: the periodogram would be too long
             return
         power = np.abs(np.fft.rfft(np.bincount(place, weight * force), 4 * (place.max() + 1))) ** 2
         omega = 2.0 * np.pi * np.arange(len(power)) / (4 * (place.max() + 1) * step)
-        legal = (omega >= 2.0 * np.pi * _LEAST_PERIODS / span) & (omega < 0.9 * np.pi / step)
+        legal = (omega >= 2.0 * np.pi * self.settings.min_periods / span) & (omega < 0.9 * np.pi / step)
         if not legal.any():
             return
         peak = omega[legal][power[legal].argmax()]
-        grid = peak + np.array([-1.0, 0.0, 1.0]) * _SPACING / span
-        found = _best_wave(force, weight, self.path.time - time.min(), np.ones_like(self.path.time), grid)
+        grid = peak + np.array([-1.0, 0.0, 1.0]) * self.settings.scan_spacing / span
+        moments, values = self.path.time - time.min(), self.settings.scanned_values
+        found = _best_wave(force, weight, moments, np.ones_like(moments), grid, values)
         frequency, phase = found[0], found[1] - found[0] * time.min()
         yield (Factor("sin", "t", numbers=(frequency, _wrapped(phase))),)
 
     def _step(self, force: np.ndarray, weight: np.ndarray) -> Iterator[Factors]:
-        """The best ``step(t - start)``: the two means that differ most, for their spread."""
+        """The best ``step(t - start)``: the split in time that explains most."""
         time = self.path.time[:, 0]
         order = np.argsort(time, kind="stable")
         mass, moment = np.cumsum(weight[order]), np.cumsum((weight * force)[order])
-        few = max(1, int(_LEAST_SHARE * len(order)))
+        few = max(1, int(self.settings.min_step_share * len(order)))
         before, total = mass[few:-few], mass[-1]
         if len(before) == 0 or before[0] <= 0.0 or before[-1] >= total:
             return
@@ -138,19 +135,28 @@ class TermLibrary:
 
 
 def without(values: np.ndarray, weight: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """What a weighted regression on columns (W, m) leaves of values (W)."""
+    """Residual of a weighted regression of values (W) on columns (W, m)."""
     root = np.sqrt(weight)
     solution = np.linalg.lstsq(root[:, None] * columns, root * values, rcond=None)[0]
     return values - columns @ solution
 
 
 def _best_wave(
-    force: np.ndarray, weight: np.ndarray, x: np.ndarray, scale: np.ndarray, grid: np.ndarray
+    force: np.ndarray, weight: np.ndarray, x: np.ndarray, scale: np.ndarray, grid: np.ndarray, scanned: int
 ) -> tuple[float, float]:
-    """The frequency and the phase of the wave in x (W, S), times a scale (W, S), that explains most of a force (W)."""
+    """Frequency and phase of the wave in x (W, S), times a scale (W, S), that explains most of a force (W).
+
+    Args:
+        force: (W), in N or N·m.
+        weight: (W), inverse variance of the force.
+        x: (W, S), position or time within each transition.
+        scale: (W, S), factor of the wave.
+        grid: frequencies to scan, in rad per unit of x.
+        scanned: values of x in the scan; the refinement uses all.
+    """
 
     def fitted(k: float, every: int = 1) -> tuple[float, float]:
-        """What a wave of this frequency explains of every so many rows, and its phase."""
+        """Explained sum of squares and phase of a wave of frequency k, on every ``every``-th row."""
         angle, size = k * x[::every], scale[::every]
         design = np.stack([(size * np.sin(angle)).mean(1), (size * np.cos(angle)).mean(1)], axis=1)
         weighted = weight[::every, None] * design
@@ -158,7 +164,7 @@ def _best_wave(
         amplitudes = np.linalg.lstsq(weighted.T @ design, projection, rcond=1e-10)[0]
         return float(projection @ amplitudes), float(np.arctan2(amplitudes[1], amplitudes[0]))
 
-    few = 1 + x.size // _SCANNED_VALUES
+    few = 1 + x.size // scanned
     gains = [fitted(k, few)[0] for k in grid]
     best = grid[int(np.argmax(gains))]
     width = grid[1] - grid[0]

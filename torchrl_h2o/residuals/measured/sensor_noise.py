@@ -1,7 +1,7 @@
-"""What sensor noise alone would make of a fit: data as they would be if nothing were missing but noise.
+"""Sensor noise of measured data, and synthetic data in which this noise is the only difference from a simulator.
 
-States read from noisy sensors bias every fit: noise looks like damping, and contacts, which answer it one way only,
-like a force. So an explanation has to do better on the data than on such stand-ins for them.
+Start states read from noisy sensors bias every fit: noise imitates damping, and contacts, which respond in one
+direction only, turn it into a force. An explanation must therefore do better on the data than on such synthetic data.
 """
 
 from __future__ import annotations
@@ -11,18 +11,15 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.residuals.measured.initial_states import noise_levels
-from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-ENOUGH = 2000  # transitions, to estimate noise from
-NOISELESS = 1e-4  # of a dimension's spread: less noise biases nothing that could be seen
 
 
 def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
-    """The standard deviations of the sensors' noise, (n), in their units; None where it could bias nothing."""
-    std = noise_levels(simulation, measured.part(slice(0, ENOUGH))).sensor
-    return std if (std > NOISELESS * measured.observation.std(0)).any() else None
+    """Standard deviation of each sensor's noise, (n), in its unit; None where all of them are negligible."""
+    std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
+    return std if (std > measured.settings.noiseless * measured.observation.std(0)).any() else None
 
 
 def stand_in(
@@ -33,18 +30,18 @@ def stand_in(
     horizon: int = 1,
     states: np.ndarray | None = None,
 ) -> Measured:
-    """Data in which nothing is missing from a simulation: its own windows, read by noisy sensors.
+    """Data that the simulation itself produced in the measured windows, read through noisy sensors.
 
     Args:
-        simulation: with the effects found so far.
-        measured: where windows start, and what is done in them.
-        sensor_std: (n), noise of each reading, in its unit.
-        rng: draws the noise.
-        horizon: control steps of the windows.
-        states: (T, nq + nv), that windows start from, instead of the measured ones.
+        simulation: the simulator with the effects found so far.
+        measured: source of the windows' start states and actions.
+        sensor_std: (n), standard deviation of each reading's noise, in its unit.
+        rng: generator of the noise.
+        horizon: control steps per window.
+        states: (T, nq + nv), start states of the windows; the measured ones by default.
 
     Returns:
-        The data, right in windows of this horizon that do not overlap.
+        The data; they are consistent within non-overlapping windows of this horizon.
     """
     if states is None:
         states = start_states(simulation, measured)

@@ -1,4 +1,4 @@
-"""Measured transitions as tracing reads them: float64 arrays, cut into runs, without the rows that say nothing."""
+"""Measured transitions as float64 arrays, cut into unbroken runs, with masks for usable and held-out rows."""
 
 from __future__ import annotations
 
@@ -10,26 +10,25 @@ from tensordict import TensorDictBase
 
 from torchrl_h2o.data import DataError
 from torchrl_h2o.data.readers.ted import require_ted
+from torchrl_h2o.residuals.settings import DEFAULTS, MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_ENOUGH = 3500  # windows: more make a fit slower and hardly better
-MIN_TRANSITIONS = 200  # below, held-out data cannot tell an effect from chance
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measured transitions, in the order in which they happened.
+    """Measured transitions in the order of their recording.
 
     Args:
         observation: (T, n), before the action.
-        action: (T, nu), as asked for.
-        following: (T, n), the observation after the action.
-        run: (T), the number of the unbroken run that a transition belongs to.
-        time: (T), of the observation, in s, from the start of the data.
-        usable: (T), whether a transition may be fitted and judged.
-        held_out: (T), which transitions no fit sees.
-        left_out: how many rows were left out, by reason.
-        source: where they come from.
+        action: (T, nu), as commanded.
+        following: (T, n), observation after the action.
+        run: (T), index of the unbroken run that each transition belongs to.
+        time: (T), of the observation, in s from the start of the data.
+        usable: (T), True for transitions that may be fitted and judged.
+        held_out: (T), True for transitions that are reserved for the judgement.
+        left_out: number of excluded rows by reason.
+        source: name of the data in reports and errors.
+        settings: sampling of windows, noise estimation and state estimation.
     """
 
     observation: np.ndarray
@@ -41,6 +40,7 @@ class Measured:
     held_out: np.ndarray
     left_out: dict[str, int]
     source: str
+    settings: MeasuredSettings = DEFAULTS.measured
 
     @classmethod
     def from_ted(
@@ -50,17 +50,19 @@ class Measured:
         *,
         source: str = "transitions",
         held_out: float = 0.3,
+        settings: MeasuredSettings = DEFAULTS.measured,
     ) -> Measured:
-        """Transitions of a TED TensorDict, checked against the simulation.
+        """Converts a TED TensorDict and checks its widths against the simulation.
 
         Args:
             data: batch size (T,), as the readers of :mod:`torchrl_h2o.data` return it.
-            simulation: that they are to be compared with.
-            source: what to call them in reports and errors.
-            held_out: share of the transitions, the last ones, that no fit sees.
+            simulation: simulator that the data will be compared with.
+            source: name of the data in reports and errors.
+            held_out: share of the transitions, taken from the end, that is reserved for the judgement.
+            settings: sampling of windows, noise estimation and state estimation.
 
         Raises:
-            DataError: if the data do not fit the simulation.
+            DataError: if observations or actions do not have the simulation's width.
         """
         require_ted(data, source=source)
         observation, action = _float64(data["observation"]), _float64(data["action"])
@@ -83,6 +85,7 @@ class Measured:
             judged,
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
+            settings,
         )
 
     def __len__(self) -> int:
@@ -90,18 +93,18 @@ class Measured:
 
     @property
     def runs(self) -> list[slice]:
-        """The rows of each unbroken run."""
+        """Rows of each unbroken run."""
         edges = np.flatnonzero(np.diff(self.run)) + 1
         starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(self)]
         return [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
 
     def windows(self, horizon: int, stride: int = 1, *, held_out: bool | None = None) -> np.ndarray:
-        """The first rows of all windows of so many usable transitions of one run.
+        """First rows, (W), of all windows that consist of usable transitions of a single run.
 
         Args:
-            horizon: transitions a window.
-            stride: rows from one window to the next.
-            held_out: True for windows of held-out transitions alone, False for windows without any, None for all.
+            horizon: transitions per window.
+            stride: rows from the start of one window to the next.
+            held_out: True for windows of held-out transitions only, False for windows without any, None for all.
         """
         good = self.usable.copy()
         if held_out is not None:
@@ -112,44 +115,44 @@ class Measured:
         return starts[whole & (self.run[starts] == self.run[starts + horizon - 1])]
 
     def fitted(self, horizon: int = 1) -> np.ndarray:
-        """The first rows of the windows that fits see: they do not overlap, and are enough, evenly spread."""
-        return thinned(self.windows(horizon, horizon, held_out=False), _ENOUGH)
+        """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``settings.max_windows``."""
+        return thinned(self.windows(horizon, horizon, held_out=False), self.settings.max_windows)
 
     def judged(self, horizon: int = 1) -> np.ndarray:
-        """The first rows of the windows that no fit sees: they do not overlap, and are enough, evenly spread."""
-        return thinned(self.windows(horizon, horizon, held_out=True), _ENOUGH)
+        """First rows, (W), of the held-out windows: not overlapping, evenly thinned to ``settings.max_windows``."""
+        return thinned(self.windows(horizon, horizon, held_out=True), self.settings.max_windows)
 
     def part(self, rows: slice) -> Measured:
-        """Some of the transitions, neighbours in time."""
+        """A contiguous part of the transitions."""
         arrays = ("observation", "action", "following", "run", "time", "usable", "held_out")
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
     def without(self, rows: np.ndarray, reason: str) -> Measured:
-        """The same data with more rows, a mask (T), left out for a reason."""
+        """The data with further rows, a mask (T), excluded and counted under a reason."""
         left_out = dict(self.left_out)
         left_out[reason] = left_out.get(reason, 0) + int((rows & self.usable).sum())
         return replace(self, usable=self.usable & ~rows, left_out=left_out)
 
     def why_no_conclusion(self) -> str | None:
-        """Why these data can say nothing of a simulator, None if they can."""
-        if self.usable.sum() < MIN_TRANSITIONS:
+        """Reason why these data allow no conclusion about a simulator; None if they do."""
+        if self.usable.sum() < self.settings.min_transitions:
             return (
                 f"{int(self.usable.sum())} usable transitions are too few to tell an effect from chance; record at "
-                f"least {MIN_TRANSITIONS}"
+                f"least {self.settings.min_transitions}"
             )
         still = np.flatnonzero(np.ptp(self.observation[self.usable], axis=0) == 0.0)
         if len(still) == self.observation.shape[1]:
-            return "nothing moves in these data; record some motion"
+            return "no observed value changes in these data; record some motion"
         if len(still):
             return (
-                f"the observation's entries {', '.join(map(str, still))} never change, as of sensors that are off: "
-                "what they say would be explained by effects that are not there; mend them or leave them out"
+                f"the observation's entries {', '.join(map(str, still))} never change, as if their sensors were off: "
+                "a fit would explain them by effects that do not exist; repair these sensors or leave the columns out"
             )
         return None
 
 
 def thinned(starts: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the windows, evenly spread."""
+    """At most ``most`` of the windows, evenly spread."""
     return starts[np.unique(np.linspace(0, len(starts) - 1, min(most, len(starts))).round().astype(int))]
 
 
@@ -161,7 +164,7 @@ def _require_width(values: np.ndarray, names: Sequence[str], what: str, source: 
     if values.shape[1] != len(names):
         raise DataError(
             f"the data have {values.shape[1]} entries, the simulator has {len(names)} ({', '.join(names)})",
-            "give the simulator that the data belong to, or name the columns in the simulator's order",
+            "choose the simulator that matches the data, or name the columns in the simulator's order",
             source=source,
             column=what,
         )

@@ -1,0 +1,102 @@
+"""Composes the report from an explanation and its judgement: figures with words."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from torchrl_h2o.residuals.evidence import DISTURBED, Evidence
+from torchrl_h2o.residuals.explanation import Explanation
+from torchrl_h2o.residuals.judge.judgement import Judgement
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.contents import (
+    DataSummary,
+    FoundEffect,
+    IndistinguishableGroup,
+    Interval,
+    RejectedEffect,
+)
+from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.report.words import UNDECLARED, effect_words
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.significance import stop_test
+
+
+def compose_report(
+    evidence: Evidence,
+    explanation: Explanation,
+    judgement: Judgement,
+    *,
+    wall_s: float | None = None,
+    settings: LoopSettings = DEFAULTS,
+) -> Report:
+    """Composes the report.
+
+    Args:
+        evidence: the simulator and the data.
+        explanation: the effects.
+        judgement: their held-out figures.
+        wall_s: duration of the whole run, in s.
+        settings: for the description of the test.
+    """
+    simulation, measured = evidence.simulation, judgement.measured
+    names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
+    words = partial(effect_words, names=names)
+    return Report(
+        simulator=simulation.name,
+        data=_data_summary(measured),
+        error=judgement.error,
+        found=tuple(
+            FoundEffect(
+                part.effect,
+                part.declared,
+                part.ci95,
+                error_after,
+                words(part.effect) if part.declared else f"{UNDECLARED}: {words(part.effect)}",
+            )
+            for part, error_after in zip(explanation.parts, judgement.errors_after, strict=True)
+        ),
+        rejected=_rejected(explanation, judgement, words),
+        indistinguishable=tuple(
+            IndistinguishableGroup(group.effects, group.errors, group.separated_by, tuple(map(words, group.effects)))
+            for group in judgement.alternatives
+        ),
+        two_sample=judgement.two_sample,
+        unexplained_intervals=_intervals(judgement),
+        stop_test=stop_test(settings),
+        wall_s=wall_s,
+        trace=judgement.trace,
+    )
+
+
+def inconclusive_report(simulation: Simulation, measured: Measured, reason: str) -> Report:
+    """The report of data or a simulator that allow no conclusion."""
+    return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
+
+
+def _data_summary(measured: Measured) -> DataSummary:
+    return DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out)
+
+
+def _rejected(explanation: Explanation, judgement: Judgement, words) -> tuple[RejectedEffect, ...]:
+    """The attempts that are not part of the explanation, each with the reason."""
+    alike = {attempt.entry.name for group in explanation.trace.groups for attempt in group}
+    reasons = {
+        True: "explains the data as well as an effect that was put in",
+        False: "explains less than an effect that was put in, or no more than chance",
+    }
+    return tuple(
+        RejectedEffect(
+            attempt.effect, error, attempt.p_value, reasons[attempt.entry.name in alike], words(attempt.effect)
+        )
+        for attempt, error in judgement.rejected
+    )
+
+
+def _intervals(judgement: Judgement) -> tuple[Interval, ...]:
+    """The remaining disturbances with their times, in s."""
+    time = judgement.measured.time
+    return tuple(
+        Interval(float(time[found.start]), float(time[found.stop - 1]), found.stop - found.start, found.size, DISTURBED)
+        for found in judgement.disturbed
+    )

@@ -1,0 +1,58 @@
+"""The data that the search uses: measured transitions without intervals that were disturbed from outside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_intervals, outside_rows
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+DISTURBED = "disturbed from outside"
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A simulator and the data that it is compared with.
+
+    Args:
+        simulation: the simulator.
+        measured: all transitions.
+        undisturbed: the same with suspected disturbances excluded, for fits.
+        suspected: intervals that may have been disturbed from outside.
+    """
+
+    simulation: Simulation
+    measured: Measured
+    undisturbed: Measured
+    suspected: tuple[OutsideInterval, ...]
+
+
+def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
+    """Reason why data and simulator allow no conclusion; None if they do."""
+    if (reason := measured.why_no_conclusion()) is not None:
+        return reason
+    diverged = ~np.isfinite(residuals(simulation, measured, measured.fitted())).all((1, 2))
+    if diverged.mean() <= measured.settings.max_diverged:
+        return None
+    return (
+        f"the simulator diverges within one step of {diverged.mean():.0%} of the measured states; check its timestep, "
+        "the units, and the coordinate that each column stands for"
+    )
+
+
+def gather_evidence(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> Evidence:
+    """Excludes the intervals that may have been disturbed from outside.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        settings: thresholds of a disturbance.
+    """
+    suspected = outside_intervals(simulation, measured, settings=settings.outside)
+    undisturbed = measured.without(outside_rows(suspected, len(measured)), DISTURBED)
+    return Evidence(simulation, measured, undisturbed, tuple(suspected))

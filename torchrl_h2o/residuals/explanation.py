@@ -1,0 +1,62 @@
+"""An explanation of a residual: the effects that account for it, with their values and intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from torchrl_h2o.effects import ActionNoise, Effect
+from torchrl_h2o.residuals.trace.outcome import Trace
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One effect of an explanation.
+
+    Args:
+        effect: the effect with its fitted values.
+        declared: True if it is an entry of the catalogue.
+        ci95: 95 % interval (low, high) of each fitted parameter, in its unit.
+        alike: alternatives that explain the data as well in its place.
+    """
+
+    effect: Effect
+    declared: bool
+    ci95: Mapping[str, tuple[float, float]]
+    alike: tuple[Effect, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The effects that explain a residual.
+
+    Args:
+        parts: the effects in the order of their composition; none if nothing is missing.
+        trace: the search over the catalogue.
+    """
+
+    parts: tuple[Part, ...]
+    trace: Trace
+
+    @classmethod
+    def of(cls, trace: Trace) -> Explanation:
+        """The explanation by effects of the catalogue alone."""
+        parts = (
+            Part(effect, True, trace.fit.ci95(index), tuple(attempt.effect for attempt in trace.groups[index]))
+            for index, effect in enumerate(trace.fit.effects)
+        )
+        return cls(tuple(parts), trace)
+
+    def with_parts(self, parts: Iterable[Part]) -> Explanation:
+        """The explanation with other parts."""
+        return replace(self, parts=tuple(parts))
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects with their fitted values."""
+        return tuple(part.effect for part in self.parts)
+
+
+def adds_noise(effect: Effect) -> bool:
+    """Whether an effect adds random noise to the actions: a single draw of it brings no prediction closer."""
+    return isinstance(effect, ActionNoise) and effect.std > 0.0

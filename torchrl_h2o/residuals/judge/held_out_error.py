@@ -1,0 +1,76 @@
+"""Held-out errors before and after effects are put in: overall, by dimension, and several steps ahead."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.residuals.judge.floor import explainable_floor
+from torchrl_h2o.residuals.judge.whiteness import autocorrelation
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.contents import DimensionError, ErrorSummary, HorizonError
+from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+METRIC = "held-out one-step RMSE, each dimension divided by the standard deviation of its one-step change"
+
+
+def error_summary(
+    simulation: Simulation, mended: Simulation, measured: Measured, settings: JudgeSettings = DEFAULTS.judge
+) -> ErrorSummary:
+    """Summarises the held-out errors of two simulations.
+
+    Args:
+        simulation: the simulator before the effects are put in.
+        mended: the simulator with them.
+        measured: the data.
+        settings: horizons, and the network of the floor.
+    """
+    names, units = simulation.state_map.names, simulation.state_map.units
+    before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
+    floor = explainable_floor(mended, measured, settings=settings)
+    whiteness = autocorrelation(mended, measured, settings)
+    columns = (values.tolist() for values in (before, after, floor, whiteness))
+    return ErrorSummary(
+        metric=METRIC,
+        unit="1",
+        before=overall_error(simulation, measured),
+        after=overall_error(mended, measured),
+        floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
+        per_dimension=tuple(map(DimensionError, names, units, *columns)),
+        horizons=_horizons(simulation, mended, measured, settings),
+    )
+
+
+def overall_error(simulation: Simulation, measured: Measured) -> float:
+    """Held-out one-step RMSE over all dimensions, each in units of its :func:`spread`."""
+    return float(np.sqrt(np.mean((_rmse(simulation, measured, 1) / spread(measured)) ** 2)))
+
+
+def spread(measured: Measured) -> np.ndarray:
+    """Standard deviation of each dimension's one-step change, (n), over the rows that are not held out."""
+    change = (measured.following - measured.observation)[measured.usable & ~measured.held_out]
+    return np.maximum(change.std(0), 1e-12)
+
+
+def _horizons(
+    simulation: Simulation, mended: Simulation, measured: Measured, settings: JudgeSettings
+) -> tuple[HorizonError, ...]:
+    """Errors at each horizon with at least two held-out windows."""
+    names, found = simulation.state_map.names, []
+    for steps in settings.horizons:
+        if len(measured.judged(steps)) < 2:
+            break
+        ahead = [
+            dict(zip(names, _rmse(which, measured, steps).tolist(), strict=True)) for which in (simulation, mended)
+        ]
+        found.append(HorizonError(steps, steps * simulation.control_step, *ahead))
+    return tuple(found)
+
+
+def _rmse(simulation: Simulation, measured: Measured, horizon: int) -> np.ndarray:
+    """Held-out RMSE at the end of windows, (n), in units of the observations."""
+    starts = measured.judged(horizon)
+    # the simulator's own action noise is drawn, because it is part of its error
+    missed = residuals(simulation, measured, starts, horizon, rng=np.random.default_rng(0))[:, -1]
+    return np.sqrt(np.nanmean(missed**2, axis=0))

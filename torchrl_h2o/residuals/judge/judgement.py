@@ -1,0 +1,160 @@
+"""Judges an explanation on held-out data: errors, alternatives, the two-sample test, remaining disturbances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.evidence import DISTURBED, Evidence
+from torchrl_h2o.residuals.explanation import Explanation, adds_noise
+from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
+from torchrl_h2o.residuals.judge.separation import separated_by
+from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
+from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_rows, still_outside
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.contents import ErrorSummary, TwoSample
+from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.outcome import Attempt
+
+
+@dataclass(frozen=True, eq=False)
+class Alternatives:
+    """An effect and those that explain the data as well in its place.
+
+    Args:
+        effects: the effects; the first is the one put in.
+        errors: held-out error with each of them.
+        separated_by: description of the data that would tell them apart.
+    """
+
+    effects: tuple[Effect, ...]
+    errors: tuple[float, ...]
+    separated_by: str
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """Held-out figures of an explanation.
+
+    Args:
+        measured: the data without the remaining disturbances.
+        disturbed: the remaining disturbances.
+        error: errors before and after.
+        errors_after: for each part, the error with the effects up to and including it.
+        rejected: attempts that are not part of the explanation, and the error with each of them alone.
+        alternatives: for each part that has any.
+        two_sample: AUC of a classifier before and after.
+        trace: the residual over time.
+    """
+
+    measured: Measured
+    disturbed: tuple[OutsideInterval, ...]
+    error: ErrorSummary
+    errors_after: tuple[float, ...]
+    rejected: tuple[tuple[Attempt, float], ...]
+    alternatives: tuple[Alternatives, ...]
+    two_sample: TwoSample
+    trace: ResidualTrace
+
+
+def judge(
+    evidence: Evidence, explanation: Explanation, *, seed: int = 0, settings: LoopSettings = DEFAULTS
+) -> Judgement:
+    """Judges an explanation on data that no fit has seen.
+
+    Args:
+        evidence: the simulator without the effects, and the data.
+        explanation: the effects.
+        seed: of the classifiers.
+        settings: horizons, networks and list lengths.
+    """
+    simulation, effects = evidence.simulation, explanation.effects
+    disturbed = _remaining_disturbances(evidence, explanation, settings)
+    measured = evidence.measured.without(outside_rows(disturbed, len(evidence.measured)), DISTURBED)
+    mended = simulation.with_effects(*_without_noise(effects))
+    return Judgement(
+        measured=measured,
+        disturbed=tuple(disturbed),
+        error=error_summary(simulation, mended, measured, settings.judge),
+        errors_after=tuple(
+            overall_error(simulation.with_effects(*_without_noise(effects[: index + 1])), measured)
+            for index in range(len(effects))
+        ),
+        rejected=_rejected(simulation, measured, explanation, settings),
+        alternatives=tuple(
+            _alternatives(simulation, measured, effects, index, part.alike, settings)
+            for index, part in enumerate(explanation.parts)
+            if part.alike
+        ),
+        two_sample=_two_sample(simulation, mended, measured, seed, settings),
+        trace=_residual_trace(simulation, mended, measured),
+    )
+
+
+def _remaining_disturbances(
+    evidence: Evidence, explanation: Explanation, settings: LoopSettings
+) -> list[OutsideInterval]:
+    """The suspected disturbances that the mended simulator does not explain."""
+    mended = evidence.simulation.with_effects(*explanation.effects)
+    return still_outside(evidence.suspected, mended, evidence.measured, settings=settings.outside)
+
+
+def _without_noise(effects: tuple[Effect, ...]) -> list[Effect]:
+    return [effect for effect in effects if not adds_noise(effect)]
+
+
+def _rejected(
+    simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
+) -> tuple[tuple[Attempt, float], ...]:
+    trace = explanation.trace
+    found = {entry.name for entry in trace.entries}
+    listed = [attempt for attempt in trace.attempts[: settings.judge.max_rejected] if attempt.entry.name not in found]
+    return tuple((attempt, overall_error(simulation.with_effects(attempt.effect), measured)) for attempt in listed)
+
+
+def _alternatives(
+    simulation: Simulation,
+    measured: Measured,
+    effects: tuple[Effect, ...],
+    index: int,
+    others: tuple[Effect, ...],
+    settings: LoopSettings,
+) -> Alternatives:
+    """An effect and its alternatives, each judged together with the remaining effects."""
+    alike, before, after = (effects[index], *others), effects[:index], effects[index + 1 :]
+    errors = (overall_error(simulation.with_effects(*before, other, *after), measured) for other in alike)
+    where = separated_by(
+        simulation, measured, alike, _without_noise(before), _without_noise(after), settings=settings.judge
+    )
+    return Alternatives(alike, tuple(errors), where)
+
+
+def _two_sample(
+    simulation: Simulation, mended: Simulation, measured: Measured, seed: int, settings: LoopSettings
+) -> TwoSample:
+    sensor_std = sensor_noise(mended, measured)
+    return TwoSample(
+        *(
+            two_sample_auc(which, measured, sensor_std=sensor_std, seed=seed, settings=settings.judge)
+            for which in (simulation, mended)
+        )
+    )
+
+
+def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:
+    """One-step residuals of both simulations at all usable rows."""
+    rows = measured.windows(1)
+    before, after = (residuals(which, measured, rows)[:, 0] for which in (simulation, mended))
+    return ResidualTrace(
+        time=rows * simulation.control_step,
+        names=simulation.state_map.names,
+        units=simulation.state_map.units,
+        before=before,
+        after=after,
+        states=measured.observation[rows],
+        held_out=measured.held_out[rows],
+    )

@@ -1,0 +1,38 @@
+"""Autocorrelation of the held-out residual: about zero if white, positive where the simulator lacks something."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import rankdata
+
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+
+def autocorrelation(simulation: Simulation, measured: Measured, settings: JudgeSettings = DEFAULTS.judge) -> np.ndarray:
+    """Rank correlation of successive held-out one-step residuals, (n).
+
+    About 0 for white residuals. Sensor noise makes it negative, down to -0.5, because each reading enters two
+    successive residuals with opposite signs. Remaining errors of the simulator make it positive.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        settings: size below which a residual counts as rounding.
+
+    Returns:
+        Spearman's correlation, which single contacts do not dominate; NaN where the residual is within rounding.
+    """
+    rows = measured.windows(2, held_out=True)
+    first, second = (residuals(simulation, measured, rows + later)[:, 0] for later in (0, 1))
+    change = (measured.following - measured.observation)[measured.usable & ~measured.held_out]
+    least = settings.rounding * np.maximum(change.std(0), 1e-12)
+    left = np.abs(first).mean(0) > least if len(rows) > 1 else np.zeros(first.shape[1], bool)
+    return np.array(
+        [
+            np.corrcoef(rankdata(a), rankdata(b))[0, 1] if some else np.nan
+            for a, b, some in zip(first.T, second.T, left, strict=True)
+        ]
+    )

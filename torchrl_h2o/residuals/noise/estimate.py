@@ -1,0 +1,84 @@
+"""Estimates the noise of the executed action from the covariance of one-step residuals.
+
+Such noise leaves the mean residual unchanged, so a fit of effects cannot find it. It scatters residuals along the
+actuators' directions, whereas sensor noise scatters them along the directions of the start state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_h2o.residuals.measured.initial_states import noise_levels
+from torchrl_h2o.residuals.measured.sensor_noise import stand_in
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.noise.scatter import Scatter
+from torchrl_h2o.residuals.noise.variances import fitted_variances, log_likelihood
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, NoiseSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.significance import p_value
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseEstimate:
+    """Estimated noise of the executed action.
+
+    Args:
+        action_std: standard deviation of the executed action about the commanded one, in units of the action, the same
+            for all actuators.
+        half_width: half-width of its 95 % interval.
+        p_value: p-value of the gain in held-out likelihood; 1 if the estimate is implausible.
+    """
+
+    action_std: float
+    half_width: float
+    p_value: float
+
+
+def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> NoiseEstimate:
+    r"""Separates the noise of the executed action from sensor noise by the covariance of one-step residuals.
+
+    With the simulator's derivatives :math:`F` by the observation and :math:`G` by the action, a residual is
+    :math:`e = n' - F n + G\nu` with covariance
+    :math:`\Sigma + F\Sigma F^\top + G\,\mathrm{E}[\nu\nu^\top] G^\top`. The variances are fitted to the squared
+    residuals and judged by the held-out likelihood with and without :math:`\nu`. MuJoCo clamps the control near its
+    limits and with it the noise; :math:`\mathrm{E}[\nu\nu^\top]` is the second moment after clamping.
+
+    Args:
+        simulation: the simulator with all effects found so far, and without action noise of its own.
+        measured: the data.
+        settings: thresholds and numerics.
+
+    Returns:
+        The estimate.
+    """
+    rules = settings.noise
+    fitted = Scatter.of(simulation, measured, measured.fitted(), settings=rules)
+    judged = Scatter.of(simulation, measured, measured.judged(), fitted.scale, settings=rules)
+    # noise that enters successive residuals with opposite signs is the sensors', even if the action could explain it
+    sensor_std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
+    estimate, left_out = fitted_variances(fitted, sensor_std, rules)
+    silent, _ = fitted_variances(fitted.without_action(), sensor_std, rules)
+    std = float(np.sqrt(estimate[0]))
+    half_width = float(1.96 * np.sqrt(rules.blocks - 1) * np.std(np.sqrt(left_out)))
+    if not _plausible(simulation, measured, std, half_width, rules):
+        return NoiseEstimate(std, half_width, 1.0)
+    sensors_alone = stand_in(simulation, measured, sensor_std, np.random.default_rng(0))
+    scatter_alone = Scatter.of(simulation, sensors_alone, measured.fitted(), settings=rules)
+    by_sensors, _ = fitted_variances(scatter_alone, sensor_std, rules)
+    if std < rules.beyond_sensors * np.sqrt(by_sensors[0]):
+        return NoiseEstimate(std, half_width, 1.0)
+    gain = log_likelihood(estimate, judged, rules) - log_likelihood(silent, judged.without_action(), rules)
+    return NoiseEstimate(std, half_width, p_value(gain, settings.significance))
+
+
+def _plausible(
+    simulation: Simulation, measured: Measured, std: float, half_width: float, settings: NoiseSettings
+) -> bool:
+    """Whether an estimate is neither negligible, nor uncertain, nor larger than the actions themselves."""
+    low, high = simulation.model.actuator_ctrlrange.T
+    reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
+    asked = float(np.sqrt((measured.action**2).mean()))
+    least = max(settings.min_share * reach, settings.min_half_widths * half_width)
+    return bool(least < std < settings.max_share * asked)

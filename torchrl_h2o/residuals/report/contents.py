@@ -1,0 +1,232 @@
+"""Contents of a report as plain data: the effects that a simulator lacks, their intervals, and the held-out errors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_words
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect that the simulator lacks.
+
+    Args:
+        effect: the effect at its fitted values.
+        declared: True if it is an entry of the catalogue, False if it was derived from the residual.
+        ci95: 95 % interval of each parameter by name, (low, high) in the parameter's unit.
+        error_after: held-out error with the effects up to and including this one, in the summary's unit.
+        words: description with units; by default that of the effect, without the simulator's names of sensors and
+            actuators, and with a mark if it is undeclared.
+    """
+
+    effect: Effect
+    declared: bool
+    ci95: Mapping[str, tuple[float, float]]
+    error_after: float
+    words: str = ""
+
+    def __post_init__(self):
+        if not self.words:
+            words = effect_words(self.effect)
+            object.__setattr__(self, "words", words if self.declared else f"{UNDECLARED}: {words}")
+
+    @property
+    def name(self) -> str:
+        """The effect's class and what it acts on: ``"BodyMass[torso]"``."""
+        return effect_name(self.effect)
+
+
+@dataclass(frozen=True)
+class RejectedEffect:
+    """An effect that was fitted and not put in.
+
+    Args:
+        effect: the effect at its best fit.
+        error_after: held-out error with this effect alone, in the summary's unit; not finite if it diverged.
+        p_value: p-value of its gain on held-out data; None if no test was made.
+        reason: reason why it was not put in, such as "explains no more than chance".
+        words: description with units; by default that of the effect.
+    """
+
+    effect: Effect
+    error_after: float
+    p_value: float | None
+    reason: str
+    words: str = ""
+
+    def __post_init__(self):
+        if not self.words:
+            object.__setattr__(self, "words", effect_words(self.effect))
+
+    @property
+    def name(self) -> str:
+        """The effect's class and what it acts on."""
+        return effect_name(self.effect)
+
+
+@dataclass(frozen=True)
+class IndistinguishableGroup:
+    """Effects that these data cannot tell apart.
+
+    Args:
+        effects: the effects, each at its best fit; the first is the one put in.
+        errors: held-out error with each of them in place of the first, in the summary's unit.
+        separated_by: description of the data that would tell them apart.
+        words: description of each effect with units; by default those of the effects.
+
+    Raises:
+        ValueError: if the numbers of effects and errors differ.
+    """
+
+    effects: tuple[Effect, ...]
+    errors: tuple[float, ...]
+    separated_by: str
+    words: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if len(self.effects) != len(self.errors):
+            raise ValueError(f"a group of {len(self.effects)} effects has {len(self.errors)} errors; give one for each")
+        if not self.words:
+            object.__setattr__(self, "words", tuple(map(effect_words, self.effects)))
+
+
+@dataclass(frozen=True)
+class DimensionError:
+    """Held-out one-step error of one dimension.
+
+    Args:
+        name: name of the dimension.
+        unit: unit of the errors.
+        before: error without the effects.
+        after: error with all of them.
+        floor: estimated error of the best possible model; None if there is no estimate.
+        autocorrelation: of the remaining residual, from one transition to the next: about 0 for white residuals, down
+            to -0.5 for sensor noise alone, above 0 where the simulator still lacks something; None if not computed.
+    """
+
+    name: str
+    unit: str
+    before: float
+    after: float
+    floor: float | None = None
+    autocorrelation: float | None = None
+
+
+@dataclass(frozen=True)
+class HorizonError:
+    """Held-out error some control steps ahead, of each dimension by name, in the dimension's unit."""
+
+    steps: int
+    seconds: float
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Held-out error before and after the effects are put in.
+
+    Args:
+        metric: name of the error, such as "held-out one-step RMSE, each dimension divided by its spread".
+        unit: unit of ``before``, ``after`` and ``floor``, ``"1"`` for a pure number.
+        before: error without the effects.
+        after: error with all of them.
+        floor: estimated error of the best possible model; None if there is no estimate.
+        per_dimension: errors of each dimension.
+        horizons: errors several steps ahead.
+    """
+
+    metric: str
+    unit: str
+    before: float
+    after: float
+    floor: float | None = None
+    per_dimension: tuple[DimensionError, ...] = ()
+    horizons: tuple[HorizonError, ...] = ()
+
+
+@dataclass(frozen=True)
+class TwoSample:
+    """Held-out AUC of a classifier of measured against simulated transitions; 0.5 if the gap is undetectable."""
+
+    auc_before: float | None = None
+    auc_after: float | None = None
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An interval of the data that no effect explains and that was excluded from fits and errors.
+
+    Args:
+        start: start time, in s.
+        end: end time, in s.
+        rows: number of transitions.
+        size: largest residual, in multiples of the usual one.
+        set_aside: reason, such as "a push from outside".
+    """
+
+    start: float
+    end: float
+    rows: int
+    size: float
+    set_aside: str
+
+
+@dataclass(frozen=True)
+class DataSummary:
+    """Source of the measured data, and numbers of transitions: all, held out, and excluded by reason."""
+
+    source: str
+    transitions: int
+    held_out: int
+    left_out: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportContents:
+    """What closing the loop found, as plain data.
+
+    Args:
+        simulator: name of the simulator.
+        data: the measured data.
+        error: errors before and after; None if they could not be computed.
+        found: effects that the simulator lacks, in the order in which they were put in.
+        rejected: effects that were fitted and not put in.
+        indistinguishable: effects that these data cannot tell apart.
+        two_sample: AUC of a classifier of measured against simulated transitions.
+        unexplained_intervals: intervals that were excluded as disturbed.
+        stop_test: description of the test by which the search stopped.
+        wall_s: duration in s; None if not timed.
+        conclusion: reason why there is no conclusion; None where effects were found or nothing is missing.
+        trace: residual over time, for the pictures; None for a report without them. It is ignored by ``==``.
+
+    Raises:
+        ValueError: if effects are given together with a reason for no conclusion.
+    """
+
+    simulator: str
+    data: DataSummary
+    error: ErrorSummary | None = None
+    found: tuple[FoundEffect, ...] = ()
+    rejected: tuple[RejectedEffect, ...] = ()
+    indistinguishable: tuple[IndistinguishableGroup, ...] = ()
+    two_sample: TwoSample = TwoSample()
+    unexplained_intervals: tuple[Interval, ...] = ()
+    stop_test: str = ""
+    wall_s: float | None = None
+    conclusion: str | None = None
+    trace: ResidualTrace | None = field(default=None, compare=False)
+
+    def __post_init__(self):
+        if self.found and self.conclusion is not None:
+            raise ValueError(
+                f"a report with {len(self.found)} effects has a reason for no conclusion ({self.conclusion!r}); "
+                "set conclusion=None, or leave out the effects"
+            )
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects that mend the simulator, at their fitted values, in order."""
+        return tuple(found.effect for found in self.found)

@@ -1,0 +1,81 @@
+"""The report as a document: its sentence, its JSON file and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_h2o.residuals.report.contents import ReportContents
+from torchrl_h2o.residuals.report.json_file import entries_from_json, read_json, report_to_json, write_json
+from torchrl_h2o.residuals.report.page import write_page
+from torchrl_h2o.residuals.report.sentence import sentence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(ReportContents):
+    """What closing the loop found; ``DynamicsGap(*report.effects)`` mends the simulator.
+
+    The fields are those of :class:`ReportContents`.
+
+    Examples:
+        >>> from torchrl_h2o.effects import Gravity
+        >>> from torchrl_h2o.residuals.report.contents import DataSummary, ErrorSummary, FoundEffect
+        >>> found = FoundEffect(Gravity(0.5), declared=True, ci95={"scale": (0.49, 0.51)}, error_after=0.004)
+        >>> report = Report(
+        ...     simulator="pendulum.xml",
+        ...     data=DataSummary("swing.csv", transitions=5000, held_out=1500),
+        ...     error=ErrorSummary("held-out one-step RMSE", "rad/s", before=0.031, after=0.004, floor=0.003),
+        ...     found=(found,),
+        ... )
+        >>> report.sentence()
+        'Your simulator lacks: gravity × 0.5; one-step error 0.031 → 0.004 rad/s (−87 %), floor 0.003.'
+        >>> report.effects
+        (Gravity(scale=0.5),)
+    """
+
+    def sentence(self) -> str:
+        """The whole report in one sentence."""
+        return sentence(self)
+
+    def to_json(self) -> dict[str, Any]:
+        """The contents of ``report.json``; numbers that are not finite become None."""
+        return report_to_json(self)
+
+    @classmethod
+    def from_json(cls, entries: Mapping[str, Any]) -> Report:
+        """The report whose :meth:`to_json` returned these entries.
+
+        Raises:
+            KeyError, TypeError, ValueError, AttributeError, IndexError: if the entries are not those of a report.
+        """
+        return cls(**entries_from_json(entries))
+
+    def save(self, folder: str | Path) -> Path:
+        """Writes ``report.json`` and ``report.html``.
+
+        Args:
+            folder: created if it does not exist.
+
+        Returns:
+            The path of ``report.json``.
+        """
+        path = write_json(self, folder)
+        write_page(self, folder)
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Report:
+        """Reads a report.
+
+        Args:
+            path: ``report.json``, or the folder that contains it.
+
+        Returns:
+            The report with its trace thinned; numbers that were not finite are None or NaN.
+
+        Raises:
+            DataError: if there is no such file, or it is not a report.
+        """
+        return read_json(path, cls.from_json)

@@ -1,0 +1,330 @@
+"""Thresholds and budgets of closing the loop: one frozen dataclass per stage, all held by :class:`LoopSettings`.
+
+Shares lie between 0 and 1; a spread is the standard deviation of an observed dimension over the data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class MeasuredSettings:
+    """How measured transitions are checked, sampled, and turned into states and noise levels."""
+
+    min_transitions: int = 200
+    """Usable transitions below which no conclusion is drawn: held-out data could not tell an effect from chance."""
+    max_windows: int = 3500
+    """Windows that a fit or a judgement uses at most; more are slower and hardly more precise."""
+    max_diverged: float = 0.1
+    """Share of transitions at which the simulator may diverge within one step, such as falls and faulty rows."""
+    settling_steps: int = 12
+    """Control steps after which unobserved coordinates follow from the observed ones."""
+    state_nudge: float = 1e-3
+    """Step of the finite differences by the observation, in spreads."""
+    noise_rows: int = 2000
+    """Transitions from which the sensors' noise is estimated."""
+    noiseless: float = 1e-4
+    """Sensor noise, in spreads, up to which a dimension counts as free of noise: it biases no fit visibly."""
+    noise_clip: float = 4.0
+    """Robust standard deviations at which residuals are clipped before the sensors' noise is estimated."""
+    filter_surprise: float = 4.0
+    """Normalised squared innovation beyond which the Kalman filter follows the measurement."""
+    variance_floor: float = 1e-12
+    """Smallest variance in the filter, in squared spreads."""
+
+
+@dataclass(frozen=True)
+class OutsideSettings:
+    """What counts as a disturbance from outside, such as a push."""
+
+    horizon: int = 8
+    """Control steps of the windows, shorter than the disturbances to find."""
+    threshold: float = 12.0
+    """Residual, in multiples of the usual one, beyond which a window is surprising."""
+    neighbours: int = 6
+    """Events with a similar start that a surprising window is compared with."""
+    events_apart: int = 5
+    """Windows between two events; windows closer in time belong to the same event."""
+    recurring_quantile: float = 0.8
+    """Quantile of the neighbours' residuals that is taken as recurring; one neighbour may be a push itself."""
+    recurring_factor: float = 2.0
+    """Multiple of the recurring residual that still counts as the same recurring cause."""
+    max_event_rate: float = 0.003
+    """Events per window beyond which large residuals are a fault of the simulator, not disturbances."""
+    max_share: float = 0.1
+    """Share of surprising windows beyond which the same holds."""
+    rounding: float = 1e-5
+    """Residual, in spreads, that counts as zero."""
+
+
+@dataclass(frozen=True)
+class ResidualSettings:
+    """How residuals are scaled before they are fitted."""
+
+    worst: float = 1e3
+    """Bound on a scaled residual, also used where the simulation diverges."""
+    rounding: float = 2e-7
+    """Relative rounding error of the data, which are single precision."""
+    noise_draws: int = 4
+    """Draws of sensor noise from which its effect on each window is estimated."""
+
+
+@dataclass(frozen=True)
+class SignificanceSettings:
+    """The paired tests on held-out losses."""
+
+    level: float = 0.01
+    """Significance level of a whole search; a search over a catalogue divides it by the number of entries."""
+    blocks: int = 30
+    """Blocks of neighbouring windows that are treated as independent."""
+    max_odds: float = 100.0
+    """Odds, to one, that a single block may contribute."""
+    loss_floor: float = 1e-6
+    """Smallest typical loss of a block, as a share of the mean loss."""
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """The bounded least-squares fit."""
+
+    origin: float = 10.0
+    """Start of every scaled variable, so that relative steps are steps of the parameter's own size."""
+    max_move: float = 50.0
+    """Steps of a parameter's own size that one fit may move it."""
+    difference_step: float = 1e-5
+    """Relative step of the finite differences: 1e-4 of a parameter's own size."""
+    loss_tolerance: float = 1e-5
+    """Relative change of the loss at which the optimiser stops."""
+    variable_tolerance: float = 1e-7
+    """Relative change of the variables at which the optimiser stops."""
+    max_evaluations: int = 25
+    """Evaluations of the residual in a full fit, finite differences not counted."""
+
+
+@dataclass(frozen=True)
+class HorizonSettings:
+    """The choice of the window length for the search."""
+
+    horizons: tuple[int, ...] = (1, 5, 20)
+    """Window lengths to choose from, in control steps, ascending."""
+    windows: int = 60
+    """Windows that are screened at each length; longer windows are considered only with at least as many."""
+    entries_followed: int = 60
+    """Most promising entries that are screened again at the next length."""
+    clear_promise: float = 0.5
+    """Share of the loss that one entry promises to explain, beyond which no longer window is tried."""
+    longer_gain: float = 1.3
+    """Factor by which the promise must grow to justify a longer window, which costs more and amplifies contacts."""
+
+
+@dataclass(frozen=True)
+class TraceSettings:
+    """The search for effects of the catalogue."""
+
+    min_gain: float = 0.002
+    """Share of the held-out loss that an addition must explain."""
+    min_gain_under_noise: float = 0.02
+    """The same with noisy sensors, whose start states may imitate an effect."""
+    min_share: float = 0.003
+    """Share of all that the search has explained that each added effect must contribute."""
+    beyond_noise: float = 4.0
+    """Multiple of what the same addition explains in data that differ from the simulator by sensor noise alone."""
+    max_effects: int = 6
+    """Effects in one explanation."""
+    rounds: int = 3
+    """Rounds of growing and simplifying."""
+    screened_steps: int = 400
+    """Control steps, over all windows, that entries are screened on."""
+    min_screened: int = 100
+    """Windows that entries are screened on at least."""
+    fitted_steps: int = 1200
+    """Control steps, over all windows, that a fit during the search sees."""
+    min_fitted: int = 200
+    """Windows that a fit during the search sees at least."""
+    leads_combined: int = 60
+    """Most promising leads that sets are formed of."""
+    set_sizes: tuple[tuple[int, int], ...] = ((1, 12), (2, 4), (3, 4))
+    """Pairs (size of a set, number of sets of this size that are sketched)."""
+    finalists: int = 3
+    """Sketched sets of one size that are fitted on all windows of the search."""
+    sketch_evaluations: int = 6
+    """Evaluations of the residual in a sketch of an addition."""
+    rival_evaluations: int = 20
+    """Evaluations of the residual in a sketch of an alternative, whose partners may have far to move."""
+    nearest_rivals: int = 12
+    """Alternatives tried in an effect's place whose promise was closest to its own."""
+    top_rivals: int = 6
+    """Alternatives tried in an effect's place whose promise was highest."""
+    rival_min_sketch: float = 0.5
+    """Share of an effect's gain that an alternative must reach in its sketch to be fitted."""
+    same_loss: float = 1e-6
+    """Difference between alternatives, as a share of the effect's gain, that counts as rounding."""
+    alike_loss: float = 0.1
+    """Difference, as a share of the effect's gain, beyond which an alternative is ruled out."""
+
+
+@dataclass(frozen=True)
+class UndeclaredSettings:
+    """The search for a force outside the catalogue, and its comparison with the catalogue's effects."""
+
+    min_gain: float = 0.01
+    """Share of the held-out loss that all terms of the force must explain."""
+    min_term_gain: float = 0.002
+    """Share of the loss that a round must explain, and that removing a term may cost."""
+    rounds: int = 6
+    """Rounds of adding terms."""
+    further_steps: int = 5
+    """Control steps ahead at which the force must also pay; a bias from sensor noise pays one step ahead only."""
+    max_terms: int = 6
+    """Terms of the whole force."""
+    negligible: float = 1e-6
+    """Residual, in spreads, that counts as rounding."""
+    min_gain_over_catalogue: float = 0.05
+    """Share of the held-out loss that a force must explain beside or instead of the catalogue's effects."""
+    min_share: float = 0.01
+    """Share of all that is explained that the force must contribute."""
+    beyond_noise: float = 2.0
+    """Multiple of what a force explains in data that differ from the simulator by sensor noise alone."""
+
+
+@dataclass(frozen=True)
+class RegressionSettings:
+    """The sparse regression of a force on a library of terms."""
+
+    tails: float = 4.0
+    """Degrees of freedom of the residuals' t-distribution; contacts and outliers make its tails heavy."""
+    scatter_iterations: int = 15
+    """Iterations of the scatter estimate."""
+    shrinkage: float = 0.01
+    """Shrinkage of the scatter towards its diagonal, so that it can be inverted without noise."""
+    force_nudge: float = 0.1
+    """Step of the finite differences by the force, as a share of the typical force."""
+    max_terms: int = 3
+    """Terms on one degree of freedom per round."""
+    blocks: int = 10
+    """Blocks of neighbouring rows that are held back together."""
+    folds: int = 5
+    """Folds of the cross-validation."""
+    level: float = 1e-4
+    """Significance level of the F-test of a term, for a whole library."""
+    min_gain: float = 0.01
+    """Share of the unexplained sum of squares that a term must explain."""
+    negligible: float = 1e-9
+    """Relative spread or norm at which a coordinate or column counts as constant."""
+    max_waves: float = 15.0
+    """Periods of a wave over the range of a position; more cannot be told from noise."""
+    max_harmonic: float = 30.0
+    """Largest harmonic of a hinge's turn, such as the torque ripple of a motor with many poles."""
+    scan_spacing: float = 0.8
+    """Spacing of scanned frequencies, in rad over the range."""
+    max_scanned: int = 1500
+    """Scanned frequencies."""
+    scanned_values: int = 5000
+    """Positions that frequencies are scanned on before the best one is refined on all."""
+    min_periods: float = 1.5
+    """Periods of a wave in time that the data must hold; less cannot be told from a trend."""
+    min_step_share: float = 0.03
+    """Share of the rows on either side of a step in time."""
+
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """The estimate of action noise from the scatter of the residuals."""
+
+    blocks: int = 10
+    """Blocks of the data that are left out in turn for the interval."""
+    iterations: int = 8
+    """Iterations of the Fisher scoring."""
+    nudge: float = 1e-4
+    """Step of the finite differences, in spreads or in shares of the largest action."""
+    variance_floor: float = 1e-3
+    """Variance added to every dimension, as a share of the mean residual's square: the derivatives' own precision."""
+    usual: float = 0.995
+    """Quantile of normal residuals beyond which a residual is clipped; contacts cause outliers."""
+    tails: float = 4.0
+    """Degrees of freedom of the t-distribution in the held-out likelihood; contacts cause outliers."""
+    min_share: float = 1e-3
+    """Smallest reported standard deviation, as a share of the control range."""
+    max_share: float = 2.0
+    """Largest plausible standard deviation, in root mean squares of the actions; more comes from filtered sensors."""
+    min_half_widths: float = 3.0
+    """Half-widths of its interval that the estimate must exceed; blocks share their systematic errors."""
+    beyond_sensors: float = 3.0
+    """Multiple of the estimate from data whose only noise is the sensors'."""
+    min_change: float = 0.1
+    """Smallest reported change, as a share of the variance of the simulator's own action noise."""
+
+
+@dataclass(frozen=True)
+class JudgeSettings:
+    """The held-out errors, the floor, the two-sample test, and the lists of the report."""
+
+    horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
+    """Control steps ahead at which errors are reported."""
+    max_rejected: int = 30
+    """Rejected effects that the report lists."""
+    rounding: float = 1e-5
+    """Residual, in spreads of the one-step change, below which no autocorrelation is computed."""
+    classifier_updates: int = 600
+    """Updates of the discriminators in the two-sample test."""
+    classifier_batch: int = 256
+    """Batch size of these updates."""
+    classifier_cells: tuple[int, ...] = (64, 64)
+    """Hidden layers of the discriminators."""
+    floor_width: int = 64
+    """Width of the two hidden layers of the network that estimates the floor."""
+    floor_batch: int = 128
+    """Batch size of its updates."""
+    floor_epochs: int = 60
+    """Epochs of its training."""
+    floor_patience: int = 12
+    """Epochs without a new best after which its training stops."""
+    floor_blocks: int = 20
+    """Blocks of neighbouring rows; every fifth stops the training."""
+    floor_clip: float = 5.0
+    """Standard deviations at which its inputs and targets are clipped."""
+    separation_share: float = 0.05
+    """Share of the transitions, those where the predictions differ most, that describe how to tell effects apart."""
+    separation_negligible: float = 1e-6
+    """Difference of predictions, in spreads, that no data would show."""
+    separation_factor: float = 1.5
+    """Factor by which a coordinate must differ from its usual size to be named as the place to record."""
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """The settings of :func:`close_the_loop`, stage by stage.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> strict = LoopSettings(trace=TraceSettings(min_gain=0.01))
+        >>> replace(strict, judge=JudgeSettings(horizons=(1, 10))).judge.horizons
+        (1, 10)
+    """
+
+    measured: MeasuredSettings = MeasuredSettings()
+    """Reading and sampling of the data, states and sensor noise."""
+    outside: OutsideSettings = OutsideSettings()
+    """Disturbances from outside."""
+    residual: ResidualSettings = ResidualSettings()
+    """Scaling of residuals, in every fit."""
+    significance: SignificanceSettings = SignificanceSettings()
+    """Paired tests, in every search."""
+    fit: FitSettings = FitSettings()
+    """Least-squares fits, in every search."""
+    horizon: HorizonSettings = HorizonSettings()
+    """Choice of the window length."""
+    trace: TraceSettings = TraceSettings()
+    """Search over the catalogue."""
+    undeclared: UndeclaredSettings = UndeclaredSettings()
+    """Search for a force outside the catalogue."""
+    regression: RegressionSettings = RegressionSettings()
+    """Terms of that force."""
+    noise: NoiseSettings = NoiseSettings()
+    """Action noise."""
+    judge: JudgeSettings = JudgeSettings()
+    """Held-out errors and the report."""
+
+
+DEFAULTS = LoopSettings()

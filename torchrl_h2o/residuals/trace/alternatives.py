@@ -1,0 +1,105 @@
+"""Finds alternatives: other entries that explain the data as well in the place of an effect."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
+from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
+    """Finds the entries that explain the held-out data as well as one of the effects found, in its place.
+
+    An alternative with fewer parameters gets the benefit of the doubt: it is tested with residuals scaled by their size
+    with the effect instead of without it, and counts as equivalent if the difference is small as well.
+
+    Args:
+        state: effects found.
+        index: position of the effect.
+
+    Returns:
+        The state with residuals scaled by their size without the effect, and the alternatives, in ascending order of
+        their loss.
+    """
+    kept = [effect for i, effect in enumerate(state.fit.effects) if i != index]
+    state = state.rescaled(state.posed_at(kept))
+    with_it = state.held_out_losses(state.fit.effects)
+    explained = state.held_out_losses(kept).mean() - with_it.mean()
+    if explained <= 0.0:
+        return state, ()  # any entry would be as good as an effect without a gain
+    attempts = [_attempt(state, index, rival, with_it) for rival in _sketched_rivals(state, index)]
+    as_good = [attempt for attempt in attempts if _is_equivalent(state, attempt, with_it.mean(), explained)]
+    return state, tuple(sorted(as_good, key=lambda attempt: attempt.loss))
+
+
+def p_value_between(state: SearchState, problem: Problem, worse: Fit, better: Fit) -> float:
+    """p-value of the difference between two fits on held-out windows, with residuals scaled as in a problem."""
+    judged = state.windows.judged
+    before, after = (losses(problem.residual(fitted.effects, judged)) for fitted in (worse, better))
+    return state.p_value(before, after)
+
+
+def _rivals(state: SearchState, index: int) -> list[Lead]:
+    """Leads whose promise was highest, or closest to the effect's own, when the effect was added."""
+    rules, own = state.settings.trace, state.entries[index].name
+    leads = state.rivals[own]
+    names = {entry.name for entry in state.entries}
+    promise = next(lead.promise for lead in leads if lead.entry.name == own)
+    others = [lead for lead in leads if lead.entry.name not in names]
+    nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[: rules.nearest_rivals]
+    return list({lead.entry.name: lead for lead in (*nearest, *others[: rules.top_rivals])}.values())
+
+
+def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
+    """Rivals that come near the effect in a quick fit of all parameters, with the effects of that fit."""
+    rules, effects, screened = state.settings.trace, state.fit.effects, state.windows.screened
+    kept = [effect for i, effect in enumerate(effects) if i != index]
+    few_with_it, few_without = (losses(state.problem.residual(e, screened)).mean() for e in (effects, kept))
+    near = []
+    for lead in _rivals(state, index):
+        instead = [*kept[:index], lead.effect, *kept[index:]]
+        if not is_possible(state.problem, instead):
+            continue
+        free = [free_parameters(entry) for entry in _entries_with(state, index, lead)]
+        sketch = state.sketched(instead, free, rules.rival_evaluations)
+        if few_without - sketch.loss >= rules.rival_min_sketch * (few_without - few_with_it):
+            near.append((lead, sketch))
+    return near
+
+
+def _entries_with(state: SearchState, index: int, lead: Lead) -> list:
+    return [lead.entry if i == index else entry for i, entry in enumerate(state.entries)]
+
+
+def _attempt(state: SearchState, index: int, rival: tuple[Lead, Fit], with_it: np.ndarray) -> Attempt:
+    """A rival fitted in the effect's place, with the p-value of being worse than the effect."""
+    lead, sketch = rival
+    candidate = state.refitted(_entries_with(state, index, lead), sketch.effects)
+    after = state.held_out_losses(candidate.effects)
+    p = state.p_value(after, with_it)
+    simpler = len(lead.free) < len(free_parameters(state.entries[index]))
+    if p <= state.settings.significance.level and simpler:
+        p = max(p, _p_value_of_loss_gap(state, candidate, state.fit))
+    return Attempt(lead.entry, candidate, index, float(after.mean()), p)
+
+
+def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explained: float) -> bool:
+    """Whether an attempt misses a negligible share of the effect's gain, or a small and insignificant one."""
+    rules, worse = state.settings.trace, (attempt.loss - with_it) / explained
+    significant = attempt.p_value <= state.settings.significance.level
+    return bool(worse < rules.same_loss or (worse < rules.alike_loss and not significant))
+
+
+def _p_value_of_loss_gap(state: SearchState, worse: Fit, better: Fit) -> float:
+    """p-value of the loss gap, rescaled by the better fit; 0 above the reporting threshold."""
+    at_first = [state.first.held_out_loss(fitted.effects) for fitted in (worse, better)]
+    if matters(state.first_loss, *at_first, state.settings.trace.min_share):
+        return 0.0
+    rescaled = replace(state.posed_at(better.effects), simulation=state.problem.simulation)
+    return p_value_between(state, rescaled, worse, better)

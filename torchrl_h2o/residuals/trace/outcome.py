@@ -1,0 +1,51 @@
+"""Result of the search for effects: the effects found, the others tried, and equivalent alternatives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.trace.fit import Fit
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """A catalogue entry that was fitted together with the other effects.
+
+    Args:
+        entry: entry of the catalogue.
+        fit: joint fit of this entry and the other effects.
+        index: position of this entry's effect in the fit.
+        loss: mean robust loss on held-out windows.
+        p_value: of its gain, or of its difference to the effect whose place it takes.
+    """
+
+    entry: CatalogueEntry
+    fit: Fit
+    index: int
+    loss: float
+    p_value: float
+
+    @property
+    def effect(self) -> Effect:
+        """The entry's effect at its fitted values."""
+        return self.fit.effects[self.index]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Result of a search over a catalogue.
+
+    Args:
+        entries: entries of the effects found, in the order in which they were added.
+        fit: joint fit of these effects.
+        attempts: other entries that were fitted, in ascending order of their loss.
+        groups: for each effect found, alternatives with an equivalent loss, in ascending order of their loss.
+        exact: True if the remaining residual is within the rounding of single-precision data.
+    """
+
+    entries: tuple[CatalogueEntry, ...]
+    fit: Fit
+    attempts: tuple[Attempt, ...]
+    groups: tuple[tuple[Attempt, ...], ...]
+    exact: bool

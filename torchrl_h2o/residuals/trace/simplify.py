@@ -1,0 +1,60 @@
+"""Replaces each effect by the simplest one with an equivalent held-out loss, and records the alternatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
+from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.screening import free_parameters
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+def simplify(state: SearchState) -> SearchState:
+    """Simplifies the effects found one by one; the state's groups then hold the alternatives of each."""
+    state = replace(state, groups=())
+    for index in range(len(state.entries)):
+        state, group = simplify_one(state, index)
+        state = replace(state, groups=(*state.groups, group))
+    return state
+
+
+def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
+    """Replaces one effect by the equivalent one with the fewest parameters.
+
+    Args:
+        state: effects found so far.
+        index: position of the effect.
+
+    Returns:
+        The state, with residuals scaled by their size without the effect, and the other equivalent effects.
+    """
+    state, as_good = _with_better_alternative(state, index)
+    own_loss = float(state.held_out_losses(state.fit.effects).mean())
+    group = [Attempt(state.entries[index], state.fit, index, own_loss, 1.0), *as_good]
+    place = {entry.name: position for position, entry in enumerate(state.catalogue)}
+    simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), place[a.entry.name]))
+    rest = tuple(attempt for attempt in group if attempt is not simplest)
+    return _replaced(state, index, simplest), rest
+
+
+def _with_better_alternative(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
+    """Takes significantly better alternatives until there is none, and returns the equivalent ones of the last.
+
+    An effect may have been chosen before others were found, and no longer be the best in its place.
+    """
+    level, seen = state.settings.significance.level, set()
+    while True:
+        seen.add(state.entries[index].name)
+        state, as_good = alternatives(state, index)
+        better = [a for a in as_good if p_value_between(state, state.problem, state.fit, a.fit) < level]
+        if not better or better[0].entry.name in seen:
+            return state, as_good
+        state = _replaced(state, index, better[0])
+
+
+def _replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:
+    """The state with an attempt in an effect's place; it takes over the effect's rivals."""
+    entries = tuple(attempt.entry if i == index else entry for i, entry in enumerate(state.entries))
+    rivals = {**state.rivals, attempt.entry.name: state.rivals[state.entries[index].name]}
+    return replace(state, entries=entries, fit=attempt.fit, rivals=rivals)

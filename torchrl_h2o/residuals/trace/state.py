@@ -1,0 +1,145 @@
+"""State of the search for effects, and the fits and losses that its steps share.
+
+A step of the search takes a :class:`SearchState` and returns a new one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.measured.transitions import thinned
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.trace.fit import Fit, Free, fit
+from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.screening import Lead, free_parameters
+from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+
+
+@dataclass(frozen=True, eq=False)
+class SearchWindows:
+    """First rows of the windows that a search uses.
+
+    Args:
+        all: windows for the final fit.
+        fitted: part of them, for fits during the search.
+        screened: part of ``fitted``, for screening and sketches.
+        judged: held-out windows.
+    """
+
+    all: np.ndarray
+    fitted: np.ndarray
+    screened: np.ndarray
+    judged: np.ndarray
+
+    @classmethod
+    def draw(cls, problem: Problem, rng: np.random.Generator, settings: LoopSettings) -> SearchWindows:
+        """Chooses the windows of a problem; the screened ones are drawn at random."""
+        rules, horizon = settings.trace, problem.horizon
+        every, judged = problem.measured.fitted(horizon), problem.measured.judged(horizon)
+        fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon))
+        few = min(max(rules.min_screened, rules.screened_steps // horizon), len(fitted))
+        return cls(every, fitted, np.sort(rng.choice(fitted, few, replace=False)), judged)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """Effects that a search has found so far, and what its next steps need.
+
+    Args:
+        entries: entries of the effects found, in the order of their composition.
+        fit: joint fit of these effects.
+        problem: residuals, scaled by the size that they have with these effects.
+        catalogue: all entries, each with the trials that are still worth screening.
+        first: the problem before the first effect was found.
+        first_loss: mean held-out loss of ``first`` without any effects.
+        windows: the windows of the search.
+        settings: thresholds and budgets.
+        attempts: entries that were sketched in addition to the effects found, by name.
+        rivals: leads at the time when an entry was added, by the entry's name.
+        groups: for each effect found, alternatives with an equivalent loss.
+        exact: True if the residual is within the rounding of single-precision data.
+    """
+
+    entries: tuple[CatalogueEntry, ...]
+    fit: Fit
+    problem: Problem
+    catalogue: tuple[CatalogueEntry, ...]
+    first: Problem
+    first_loss: float
+    windows: SearchWindows
+    settings: LoopSettings
+    attempts: Mapping[str, Attempt] = field(default_factory=dict)
+    rivals: Mapping[str, Sequence[Lead]] = field(default_factory=dict)
+    groups: tuple[tuple[Attempt, ...], ...] = ()
+    exact: bool = False
+
+    @classmethod
+    def begin(
+        cls,
+        problem: Problem,
+        catalogue: Sequence[CatalogueEntry],
+        rng: np.random.Generator,
+        settings: LoopSettings = DEFAULTS,
+    ) -> SearchState:
+        """State of a search that has found nothing yet."""
+        windows = SearchWindows.draw(problem, rng, settings)
+        nothing = _no_effects(problem, windows.fitted)
+        return cls((), nothing, problem, tuple(catalogue), problem, problem.held_out_loss(()), windows, settings)
+
+    @property
+    def others(self) -> tuple[CatalogueEntry, ...]:
+        """Entries of the catalogue that are not among the effects found."""
+        names = {entry.name for entry in self.entries}
+        return tuple(entry for entry in self.catalogue if entry.name not in names)
+
+    def with_found(self, entries: Sequence[CatalogueEntry], fitted: Fit) -> SearchState:
+        """The state with other effects found."""
+        return replace(self, entries=tuple(entries), fit=fitted)
+
+    def refitted(
+        self, entries: Sequence[CatalogueEntry], start: Sequence[Effect], rows: np.ndarray | None = None
+    ) -> Fit:
+        """Joint fit of entries from given values, on the windows of the search or on others."""
+        rows = self.windows.fitted if rows is None else rows
+        if not entries:
+            return _no_effects(self.problem, rows)
+        free = [free_parameters(entry) for entry in entries]
+        return fit(self.problem, start, free, rows, settings=self.settings.fit)
+
+    def sketched(self, effects: Sequence[Effect], free: Sequence[Free], max_evaluations: int) -> Fit:
+        """Quick fit of some parameters on the screened windows."""
+        return fit(
+            self.problem,
+            effects,
+            free,
+            self.windows.screened,
+            max_evaluations=max_evaluations,
+            settings=self.settings.fit,
+        )
+
+    def held_out_losses(self, effects: Sequence[Effect]) -> np.ndarray:
+        """Robust loss of each held-out window, (W), with effects put in."""
+        return losses(self.problem.residual(effects, self.windows.judged))
+
+    def p_value(self, before: np.ndarray, after: np.ndarray) -> float:
+        """p-value of a decrease of held-out losses, (W) each."""
+        return p_value_of_losses(before, after, self.settings.significance)
+
+    def posed_at(self, effects: Sequence[Effect]) -> Problem:
+        """The problem of the simulation with effects put in: start states and scales of the residuals anew."""
+        base = self.problem
+        mended = base.simulation.with_effects(*effects)
+        return Problem.pose(mended, base.measured, base.horizon, settings=base.settings)
+
+    def rescaled(self, posed: Problem) -> SearchState:
+        """The state with the start states and scales of a problem posed with effects put in."""
+        return replace(self, problem=replace(posed, simulation=self.problem.simulation))
+
+
+def _no_effects(problem: Problem, rows: np.ndarray) -> Fit:
+    return Fit((), (), float(losses(problem.residual((), rows)).mean()), ())

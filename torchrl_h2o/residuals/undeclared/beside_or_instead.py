@@ -1,0 +1,173 @@
+"""Adds a force outside the catalogue to an explanation, beside the catalogue's effects or instead of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchrl_h2o.residuals.explanation import Explanation, Part
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.outcome import Trace
+from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
+from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+from torchrl_h2o.residuals.undeclared.find_force import Undeclared, find_undeclared
+from torchrl_h2o.residuals.undeclared.needed import needed_parts
+
+Parts = tuple[Part, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """An explanation that contains a force outside the catalogue.
+
+    Args:
+        parts: the force, alone or after effects of the catalogue.
+        force: the force as it was found.
+        base: simulation in which it was found.
+    """
+
+    parts: Parts
+    force: Undeclared
+    base: Simulation
+
+
+def add_undeclared_force(
+    simulation: Simulation,
+    measured: Measured,
+    explanation: Explanation,
+    *,
+    rng: np.random.Generator,
+    settings: LoopSettings = DEFAULTS,
+) -> Explanation:
+    """Adds a force outside the catalogue where it improves the explanation.
+
+    The force is searched for beside the effects found, and instead of them: if a force alone fits the data better than
+    the catalogue's effects, these are not named. Both are judged on held-out data against the present explanation.
+
+    Args:
+        simulation: the simulator without the effects found.
+        measured: the data.
+        explanation: effects of the catalogue.
+        rng: generator of synthetic noise.
+        settings: thresholds and budgets.
+
+    Returns:
+        The explanation, unchanged if no force pays or nothing is left to explain.
+    """
+    if explanation.trace.exact:
+        return explanation
+    parts = explanation.parts
+    candidates = _candidates(simulation, measured, explanation, settings)
+    if not candidates:
+        return explanation
+    compared = [parts, *(candidate.parts for candidate in candidates)]
+    problem = _with_least_noise(simulation, measured, compared, settings)
+    first = Problem.pose(simulation, measured, settings=settings.residual)
+    before = _held_out_losses(problem, parts)
+    paying = []
+    for candidate in candidates:
+        after = _held_out_losses(problem, candidate.parts)
+        pays = _pays(first, before, after, parts, candidate.parts, settings)
+        if pays and _beyond_noise(candidate, measured, rng, settings):
+            paying.append((candidate.parts, after.mean()))
+    return explanation.with_parts(_shortest(paying, settings) if paying else parts)
+
+
+def _candidates(
+    simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
+) -> list[_Candidate]:
+    """A force beside the effects found, and a force instead of them, where there are such forces."""
+    parts, candidates = explanation.parts, []
+    mended = simulation.with_effects(*explanation.effects)
+    if (beside := find_undeclared(mended, measured, settings=settings)) is not None:
+        together = _beside(simulation, measured, explanation.trace, parts, beside, settings)
+        candidates.append(_Candidate(together, beside, mended))
+    # also without a force beside: effects that imitate a force may leave a residual that looks like noise
+    if parts and (alone := find_undeclared(simulation, measured, settings=settings)) is not None:
+        candidates.append(_Candidate((Part(alone.effect, False, alone.ci95),), alone, simulation))
+    return candidates
+
+
+def _beside(
+    simulation: Simulation, measured: Measured, trace: Trace, parts: Parts, force: Undeclared, settings: LoopSettings
+) -> Parts:
+    """The effects that are needed beside a force, and the force, found again beside them."""
+    candidate = (*parts, Part(force.effect, False, force.ci95))
+    if not parts:
+        return candidate
+    mended = simulation.with_effects(*(part.effect for part in parts))
+    posed = Problem.pose(mended, measured, settings=settings.residual)
+    needed = needed_parts(replace(posed, simulation=simulation), trace, candidate, settings)
+    known = needed[:-1]
+    again = find_undeclared(
+        simulation.with_effects(*(part.effect for part in known)), measured, settings=settings
+    )  # without the terms that have become redundant
+    return needed if again is None else (*known, Part(again.effect, False, again.ci95))
+
+
+def _with_least_noise(
+    simulation: Simulation, measured: Measured, explanations: Sequence[Parts], settings: LoopSettings
+) -> Problem:
+    """The problem in which explanations are compared: posed with the one that leaves the least sensor noise.
+
+    Noise of one explanation may be explained by another. States filtered with the first would favour it.
+    """
+    mended = [simulation.with_effects(*(part.effect for part in parts)) for parts in explanations]
+    spread = np.maximum(measured.observation.std(0), 1e-12)
+
+    def noise(candidate: Simulation) -> float:
+        std = sensor_noise(candidate, measured)
+        return 0.0 if std is None else float(((std / spread) ** 2).mean())
+
+    posed = Problem.pose(min(mended, key=noise), measured, settings=settings.residual)
+    return replace(posed, simulation=simulation)
+
+
+def _held_out_losses(problem: Problem, parts: Parts) -> np.ndarray:
+    return losses(problem.residual([part.effect for part in parts], problem.measured.judged()))
+
+
+def _pays(
+    first: Problem, before: np.ndarray, after: np.ndarray, parts: Parts, candidate: Parts, settings: LoopSettings
+) -> bool:
+    """Whether a candidate lowers the held-out loss enough, significantly, and by a share of the whole reduction."""
+    rules, test = settings.undeclared, settings.significance
+    gains = after.mean() < (1.0 - rules.min_gain_over_catalogue) * before.mean()
+    if not (gains and p_value_of_losses(before, after, test) < test.level):
+        return False
+    at_first = (first.held_out_loss([part.effect for part in some]) for some in ((), parts, candidate))
+    return matters(*at_first, rules.min_share)
+
+
+def _beyond_noise(candidate: _Candidate, measured: Measured, rng: np.random.Generator, settings: LoopSettings) -> bool:
+    """Whether the force explains more than one found in data with sensor noise as the only difference."""
+    sensor_std = sensor_noise(candidate.base, measured)
+    if sensor_std is None:
+        return True
+    data = stand_in(candidate.base, measured, sensor_std, rng)
+    by_chance = find_undeclared(candidate.base, data, settings=settings)
+    if by_chance is None:
+        return True
+    return _explained(candidate.force) > settings.undeclared.beyond_noise * _explained(by_chance)
+
+
+def _explained(force: Undeclared) -> float:
+    """Share of the held-out error that a force removes, mean over the dimensions."""
+    return float(np.mean(1.0 - force.error_after / np.maximum(force.error_before, 1e-300)))
+
+
+def _shortest(paying: Sequence[tuple[Parts, float]], settings: LoopSettings) -> Parts:
+    """The shortest of the explanations whose loss is close to the least; with the catalogue's effects on a tie."""
+    least = min(loss for _, loss in paying)
+    limit = least / (1.0 - settings.undeclared.min_gain_over_catalogue)
+    return min((parts for parts, loss in paying if loss <= limit), key=_description_length)
+
+
+def _description_length(parts: Parts) -> int:
+    """Description length: one per effect of the catalogue, one per term of a force."""
+    return sum(1 if part.declared else len(part.effect.terms) for part in parts)

@@ -1,0 +1,196 @@
+"""Finds a force outside the catalogue: a sum of terms, regressed on the residual and fitted in the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_h2o.effects import ResidualForce
+from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.fit import Fit, fit
+from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+from torchrl_h2o.residuals.undeclared.inverse_force import StepPath, force_response, residual_forces, step_path
+from torchrl_h2o.residuals.undeclared.sparse_force import SparseForce, sparse_force
+from torchrl_h2o.residuals.undeclared.terms import TermLibrary
+
+
+@dataclass(frozen=True, eq=False)
+class Undeclared:
+    """A force outside the catalogue.
+
+    Args:
+        effect: the force.
+        ci95: 95 % interval (low, high) of each fitted parameter, in its unit.
+        error_before: (n), held-out one-step RMSE of each dimension without the force, in the dimension's unit.
+        error_after: (n), the same with the force.
+        p_value: of the decrease of the held-out loss.
+    """
+
+    effect: ResidualForce
+    ci95: Mapping[str, tuple[float, float]]
+    error_before: np.ndarray
+    error_after: np.ndarray
+    p_value: float
+
+
+def find_undeclared(
+    simulation: Simulation,
+    measured: Measured,
+    *,
+    progress: Callable[[str], object] | None = None,
+    settings: LoopSettings = DEFAULTS,
+) -> Undeclared | None:
+    """Finds a force that explains the residual of a simulation with all effects found so far.
+
+    The residual is converted to a force on each degree of freedom and regressed, sparsely, on a library of terms. The
+    terms are then fitted in the simulation to the residual itself, and redundant ones are removed. The force must lower
+    the held-out loss by a minimum share and significantly, one step ahead and several steps ahead: a bias that sensor
+    noise causes one step ahead can be imitated by terms, but these increase the error further ahead.
+
+    Args:
+        simulation: the simulator with all effects found so far.
+        measured: the data.
+        progress: called after each round with a description of the force found so far.
+        settings: thresholds and budgets.
+
+    Returns:
+        The force; None if none passes the tests.
+    """
+    problem = Problem.pose(simulation, measured, settings=settings.residual)
+    if _nothing_to_explain(problem, measured.fitted(), settings):
+        return None
+    regression = _Regression.of(problem, settings)
+    found = _grown(regression, progress or (lambda words: None))
+    if found is None:
+        return None
+    judged = measured.judged()
+    before, after = problem.residual((), judged), problem.residual(found.effects, judged)
+    gain = losses(before) - losses(after)
+    p_one_step = p_value_of_losses(losses(before), losses(after), settings.significance)
+    p = max(p_one_step, _p_value_further(regression, (), found.effects, held_out=True))
+    if p > settings.significance.level or gain.mean() < settings.undeclared.min_gain * losses(before).mean():
+        return None
+    size = problem.scale_of(judged)
+    errors = [np.sqrt(((size * residual)[:, 0] ** 2).mean(0)) for residual in (before, after)]
+    return Undeclared(found.effects[0], found.ci95(0), *errors, p)
+
+
+@dataclass(frozen=True, eq=False)
+class _Regression:
+    """The data of the regression, on the transitions that may be fitted.
+
+    Args:
+        problem: one-step residuals of the simulation.
+        further: residuals several steps ahead.
+        starts: (W), the transitions.
+        path: states and controls within each transition.
+        response: (W, n, nv), derivative of the observation by the generalised forces.
+        before: mean robust loss without a force.
+        settings: thresholds and budgets.
+    """
+
+    problem: Problem
+    further: Problem
+    starts: np.ndarray
+    path: StepPath
+    response: np.ndarray
+    before: float
+    settings: LoopSettings
+
+    @classmethod
+    def of(cls, problem: Problem, settings: LoopSettings) -> _Regression:
+        simulation, measured, states = problem.simulation, problem.measured, problem.states
+        starts, steps = measured.fitted(), settings.undeclared.further_steps
+        return cls(
+            problem,
+            Problem.pose(simulation, measured, steps, sensor_std=problem.sensor_std, settings=settings.residual),
+            starts,
+            step_path(simulation, measured, starts, states=states),
+            force_response(simulation, measured, starts, states=states, settings=settings.regression),
+            losses(problem.residual((), starts)).mean(),
+            settings,
+        )
+
+
+def _nothing_to_explain(problem: Problem, starts: np.ndarray, settings: LoopSettings) -> bool:
+    """Whether the residual is within rounding."""
+    spread = np.maximum(problem.measured.observation.std(0), 1e-12)
+    return bool((problem.scale_of(starts).mean((0, 1)) < settings.undeclared.negligible * spread).all())
+
+
+def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | None:
+    """Adds terms while they pay; refits all terms and removes redundant ones after each addition."""
+    rules, level = regression.settings.undeclared, regression.settings.significance.level
+    best, left = None, regression.before
+    barred = set()  # degrees of freedom on which a term did not pay
+    for _ in range(rules.rounds):
+        effect = best.effects[0] if best else ResidualForce()
+        added = _best_terms(regression, effect, barred)
+        exhausted = left < rules.min_term_gain * regression.before
+        if exhausted or not added.terms or len(effect.terms) >= rules.max_terms:
+            break
+        candidate = _pruned(regression, _fitted(regression, ResidualForce((*effect.terms, *map(str, added.terms)))))
+        pays = left - candidate.loss > rules.min_term_gain * regression.before
+        if pays and _p_value_further(regression, (effect,), candidate.effects, held_out=False) < level:
+            best, left = candidate, candidate.loss
+            progress(best.effects[0].describe())
+        else:
+            barred.add(added.terms[0].joint)
+    return best
+
+
+def _p_value_further(
+    regression: _Regression, before: Sequence[ResidualForce], after: Sequence[ResidualForce], *, held_out: bool
+) -> float:
+    """p-value of the decrease of the loss several steps ahead, from one force to another."""
+    measured, steps = regression.problem.measured, regression.settings.undeclared.further_steps
+    starts = measured.judged(steps) if held_out else measured.fitted(steps)
+    ahead = [losses(regression.further.residual(forces, starts)) for forces in (before, after)]
+    return p_value_of_losses(*ahead, regression.settings.significance)
+
+
+def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]) -> SparseForce:
+    """The terms on one degree of freedom that explain most of the residual that a force leaves."""
+    problem, starts, settings = regression.problem, regression.starts, regression.settings.regression
+    simulation = problem.simulation
+    residual = (problem.residual((effect,), starts) * problem.scale_of(starts))[:, 0]
+    forces = residual_forces(
+        simulation, problem.measured, starts, residual=residual, response=regression.response, settings=settings
+    )
+    observed = simulation.state_map.restore.any(1)
+    found = [
+        sparse_force(
+            TermLibrary(freedom, regression.path, observed, settings),
+            forces.force[:, freedom.velocity],
+            forces.weight[:, freedom.velocity],
+        )
+        for freedom in degrees_of_freedom(simulation.model)
+        if freedom.name not in barred
+    ]
+    return max(found, key=lambda candidate: candidate.gain, default=SparseForce())
+
+
+def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
+    """The force fitted in the simulation; starting times of steps are kept."""
+    free = tuple(name for name in effect.parameters if not name.startswith("start"))
+    return fit(regression.problem, (effect,), (free,), regression.starts, settings=regression.settings.fit)
+
+
+def _pruned(regression: _Regression, best: Fit) -> Fit:
+    """Removes the term that explains least, as long as the others make up for it."""
+    problem, starts = regression.problem, regression.starts
+    while len(terms := best.effects[0].terms) > 1:
+        rest = [ResidualForce(terms[:i] + terms[i + 1 :]) for i in range(len(terms))]
+        alone = [losses(problem.residual((effect,), starts)).mean() for effect in rest]
+        candidate = _fitted(regression, rest[int(np.argmin(alone))])
+        cost = candidate.loss - best.loss
+        if cost > regression.settings.undeclared.min_term_gain * (regression.before - best.loss):
+            break
+        best = candidate
+    return best
