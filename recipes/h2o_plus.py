@@ -30,6 +30,7 @@ from torchrl_h2o.objectives import (
     H2OPlusLoss,
     MixedBellmanLoss,
     SparseValueLoss,
+    accelerate,
     make_actor,
     make_dynamics_ratio_estimator,
     make_qvalue,
@@ -113,6 +114,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         target_entropy=cfg.target_entropy,
     )
     loss.make_value_estimator(gamma=cfg.gamma)
+    accelerate(loss)  # optional: the same losses by fewer calls
     loss_fn = maybe_compiled(loss, cfg.compiled, cfg.updates)
 
     # Optimiser, target networks, and the collector of simulated transitions

@@ -27,7 +27,8 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
     """
     if cfg.method != "h2o_plus" or cfg.baselines:
         raise ValueError(
-            f"method={cfg.method} baselines={cfg.baselines}: a population trains h2o_plus alone; use --multirun for others"
+            f"method={cfg.method} baselines={cfg.baselines}: a population trains h2o_plus alone; "
+            "use --multirun for other methods"
         )
     start = time.perf_counter()
     for own in members.values():
