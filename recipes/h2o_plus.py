@@ -3,35 +3,190 @@
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
-python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the simulator, mended
-python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # anything in config/ can be overridden
-python recipes/h2o_plus.py seeds=[0,1,2,3,4] gaps=[gravity,friction]   # ten runs at once, stacked
-python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # go on after an interruption
+python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # with the simulator mended
+python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
+python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
+
+Other methods, baselines, many runs at once and simulators in worker processes: recipes/train.py.
 """
 
-import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages whose warnings it silences)
 
+import time
+from pathlib import Path
 
 import hydra
+import torch
 from omegaconf import DictConfig
+from torch.optim.lr_scheduler import LinearLR
+from torchrl.collectors import Collector
+from torchrl.objectives import SoftUpdate
 
-from torchrl_h2o.training.job import resumable, run_job
-from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS, make_value_loss
-from torchrl_h2o.training.methods.sac import SAC
-from torchrl_h2o.training.populations.job import run_population
-from torchrl_h2o.training.populations.loop import members_of
-from torchrl_h2o.training.run_folder import claimed, open_run
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import (
+    DynamicsRatioLoss,
+    ExpectileValueLoss,
+    ExponentialValueLoss,
+    H2OPlusLoss,
+    MixedBellmanLoss,
+    SparseValueLoss,
+    make_actor,
+    make_dynamics_ratio_estimator,
+    make_qvalue,
+    make_value,
+    total_loss,
+)
+from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.film import try_to_film
+from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.progress import Budget, Training, epoch_seed
+from torchrl_h2o.training.real_data import RECORDED, behaviour_of
+from torchrl_h2o.training.returns import BestPolicy, evaluate
+from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
+from torchrl_h2o.training.task import Task
 
 
 @hydra.main(config_path="config", config_name="h2o_plus", version_base=None)
 def main(cfg: DictConfig) -> None:
-    cfg, directory = open_run(cfg)
-    make_value_loss(cfg, observation_dim=1)  # a backbone that there is not: said before the data are read
-    with claimed(directory), resumable(directory):
-        if members := members_of(cfg):
-            run_population(cfg, members, directory)
-        else:
-            run_job(cfg, directory, [H2O_PLUS, SAC] if cfg.baseline else [H2O_PLUS])
+    cfg, folder = open_run(cfg)
+    with claimed(folder), resumable(folder):
+        train(cfg, folder)
+
+
+def train(cfg: DictConfig, folder: Path) -> None:
+    """Trains, evaluates in reality, and writes summary.json, metrics.csv, learning_curve.png and a film."""
+    start = time.perf_counter()
+    if cfg.backbone not in ("expectile", "sparse", "exponential"):
+        raise ValueError(f"backbone={cfg.backbone}: choose expectile, sparse or exponential")
+
+    # Task: the target dynamics (reality), and a simulator with the dynamics gap
+    task = Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.gap_fix)
+    task.make_simulator()  # fails before the data are loaded if an effect does not fit the model
+
+    # Data: real transitions in TED, [T]; both streams show observations and rewards in the same way
+    real = task.read_real_data(cfg.data, cfg.columns)
+    behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
+    preprocessing = Preprocessing.fit(
+        real,
+        normalise=cfg.normalise_observation,
+        norm=cfg.observation_norm,
+        frames=cfg.frames,
+        reward_scale=cfg.reward_scale,
+        reward_offset=cfg.reward_offset,
+    )
+    cfg.observation_norm = preprocessing.norm
+    save_config(cfg, folder)
+    shown = preprocessing.apply(real)
+    replay = HybridReplayBuffer(shown, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+
+    # Environments: to collect, to evaluate during training, and for the evaluation at the end
+    simulator = task.make_simulator(cfg.num_worlds, preprocessing)
+    reality = task.make_reality(cfg.eval_episodes, preprocessing)
+    trials = task.make_simulator(cfg.eval_episodes, preprocessing)
+    final_reality = task.make_reality(cfg.final_episodes, preprocessing)
+    final_simulator = task.make_simulator(1, preprocessing)
+    observation_dim = reality.observation_spec["observation"].shape[-1]
+    action_spec = reality.action_spec_unbatched
+    action_dim = action_spec.shape[-1]
+
+    # Networks
+    torch.manual_seed(cfg.seed)
+    actor = make_actor(observation_dim, action_spec, cfg.num_cells)
+    qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
+    value = make_value(observation_dim, cfg.num_cells)
+    estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
+
+    # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
+    if cfg.backbone == "expectile":
+        value_loss = ExpectileValueLoss(value, cfg.expectile)
+    else:
+        value_loss = {"sparse": SparseValueLoss, "exponential": ExponentialValueLoss}[cfg.backbone](
+            value, cfg.value_alpha
+        )
+    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    loss = H2OPlusLoss(
+        MixedBellmanLoss(actor, qvalues, value, mixing=cfg.mixing),
+        value_loss,
+        ratio_loss,
+        weighted=cfg.ratio,
+        target_entropy=cfg.target_entropy,
+    )
+    loss.make_value_estimator(gamma=cfg.gamma)
+    loss_fn = maybe_compiled(loss, cfg.compiled, cfg.updates)
+
+    # Optimiser, target networks, and the collector of simulated transitions
+    budget = Budget(cfg.updates, cfg.updates_per_epoch, cfg.eval_every, cfg.checkpoint_every)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=cfg.lr, fused=True)
+    schedule = LinearLR(optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
+    targets = SoftUpdate(loss, tau=cfg.tau)
+    collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
+    rollouts = iter(collector)
+
+    # Checkpoints hold all of these; with keep=best_in_simulator also the policy that did best there
+    parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "replay": replay, "schedule": schedule}
+    best = None
+    if keeps_best(cfg):
+        best = BestPolicy(actor, trials, cfg.eval_episodes)
+        parts["policy"] = best.policy
+    training = Training("H2O+", folder, budget, **parts)
+    setup_s = time.perf_counter() - start
+
+    # Training
+    for epoch, evaluating in training.epochs():
+        # Every epoch has its own random stream, so that a resumed run draws the same numbers as an unbroken one
+        seed = epoch_seed(cfg.seed, epoch)
+        torch.manual_seed(seed)
+
+        # Collect
+        collector.set_seed(seed % 2**31)
+        collector.update_policy_weights_()
+        simulated = next(rollouts).reshape(-1)
+        simulated["next", "reward"] = preprocessing.reward(simulated["next", "reward"])
+        replay.extend(simulated)
+
+        # Update
+        for _ in training.epoch_updates():
+            batch = replay.sample(cfg.batch_size)
+            pairs = replay.sample(cfg.discriminator_batch_size)
+            losses = loss_fn(batch, pairs)
+            optimiser.zero_grad()
+            total_loss(losses).backward()
+            optimiser.step()
+            targets.step()
+        schedule.step()
+
+        # Evaluate
+        if evaluating:
+            in_reality = evaluate(reality, actor, cfg.eval_episodes)
+            training.log(
+                epoch,
+                **({} if best is None else best.consider(actor, training.rows)),
+                return_real=in_reality.mean,
+                return_real_std=in_reality.std,
+                length_real=in_reality.mean_length,
+                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
+                **{name: term.item() for name, term in losses.items()},
+            )
+    collector.shutdown()
+
+    # Results
+    policy = actor if best is None else best.policy
+    settings = run_settings(cfg, real)
+    in_reality = judge(
+        task,
+        final_reality,
+        final_simulator,
+        {"H2O+": policy},
+        {"H2O+": training},
+        behaviour,
+        folder,
+        episodes=cfg.final_episodes,
+        settings=settings,
+        wall_s=setup_s + training.progress["seconds"],
+    )
+    film = try_to_film(task, preprocessing, policy, folder) if cfg.render else None
+    print(table_of_run(in_reality, folder, film, task.seconds_per_step))
 
 
 if __name__ == "__main__":

@@ -1,37 +1,45 @@
-"""The paper's tables and figures: grids of runs, of which those that are done are not run again.
+"""Runs the paper's tables and figures as grids of training runs; finished runs are skipped.
 
 python recipes/paper.py table=returns                          # every task, gap, method and seed of the main table
 python recipes/paper.py table=returns methods=[h2o_plus,iql] gaps=[gravity] seeds=[0,1] updates=100000
 python recipes/paper.py figure=wheel_legged seeds=[0,1,2] hydra/launcher=joblib hydra.launcher.n_jobs=2
-python recipes/paper.py table=methods tasks=[mine] results=mine.csv     # your own, config/env/mine.yaml
-PYTHONPATH=$PWD/recipes python recipes/paper.py table=mixing hydra/launcher=submitit_slurm     # or ...=ray
+python recipes/paper.py table=methods tasks=[mine] results=mine.csv     # your own task, config/env/mine.yaml
+python recipes/paper.py table=mixing hydra/launcher=submitit_slurm      # or hydra/launcher=ray
 
-Ctrl-C loses nothing: the same command goes on. recipes/report.py makes tables and pictures of what is there.
+After Ctrl-C, the same command continues. recipes/report.py makes tables and figures from the results.
 """
 
-import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401, I001  (must precede the packages that it silences)
+
+import sys
+from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from torchrl_h2o.training.run_folder import claimed, open_run
-from train import train_and_record
 
-from torchrl_h2o.comparison.sweeper import register_sweeper
+from torchrl_h2o.comparison.grids import check_overrides, chosen_grid, group_name
+from torchrl_h2o.comparison.launching import GridLauncher, shared_overrides
+from torchrl_h2o.comparison.recorded_run import train_grid_run
 
 
 @hydra.main(config_path="config", config_name="paper", version_base=None)
 def main(cfg: DictConfig) -> None:
-    """One run of the grid; the sweeper, hydra_plugins/paper_grid.py, has chosen it."""
-    cfg.overrides = list(HydraConfig.get().overrides.task)
-    cfg.seeds = cfg.gaps = None  # of the grid; this is one run, also for h2o_plus.py
-    results = cfg.results
-    cfg, directory = open_run(cfg, go_on=True)
-    cfg.results = results  # a run that goes on may have been begun for another file
-    with claimed(directory):
-        train_and_record(cfg, directory)
+    shared = shared_overrides(HydraConfig.get().overrides.task)
+    try:
+        results = Path(cfg.results or Path(__file__).parent / "results" / f"{group_name(cfg)}.csv").resolve()
+        runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))
+        check_overrides(shared, runs)
+    except ValueError as error:
+        sys.exit(f"{type(error).__name__}: {error}")
+    grid = GridLauncher.of_this_job(results, shared, train_grid_run)
+    try:
+        failed = grid.run(runs, cfg.retries)
+    except KeyboardInterrupt:
+        sys.exit(f"\ninterrupted with {len(grid.remaining(runs))} runs to go; the same command continues with them")
+    if failed:
+        sys.exit("\n".join(["these runs failed:", *failed]))
 
 
 if __name__ == "__main__":
-    register_sweeper()
     main()

@@ -8,8 +8,7 @@ import hydra
 import pytest
 
 from tests.small_runs import ROBOT, ROOT, SMALL
-from torchrl_h2o.training.environments import measure_observation_norm
-from torchrl_h2o.training.real_data import read_real_data
+from torchrl_h2o.training.environments import measure_observation_norm, task_of
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +40,7 @@ def compose(cache, monkeypatch):
     def build(*overrides, config="h2o_plus"):
         with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
             cfg = hydra.compose(config, [*SMALL, *ROBOT, *overrides])
-        real = read_real_data(cfg)
+        real = task_of(cfg).read_real_data(cfg.data, cfg.columns)
         measure_observation_norm(cfg, real)
         return cfg, real
 

@@ -1,7 +1,7 @@
-"""Imported first by a recipe: keeps other packages' warnings and notices off its user's terminal.
+"""Silences warnings and log messages of other packages; import it before them.
 
-What this project has to say comes as an error that says what to do. PYTHONWARNINGS and RL_LOGGING_LEVEL=INFO bring the
-rest back.
+Scripts and console commands import it, the library does not. PYTHONWARNINGS and RL_LOGGING_LEVEL=INFO restore the
+messages.
 """
 
 import os

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_h2o.commands.close_the_loop import chosen_entries, in_full, make_simulation, print_report
+from torchrl_h2o.commands.close_the_loop import chosen_entries, expanded, make_simulation, print_report
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import LogColumns, write_ted
 from torchrl_h2o.data.readers.ted import to_ted
@@ -82,8 +82,9 @@ def command(folder, *overrides, script="close_the_loop.py"):
 @pytest.fixture
 def compose():
     def build(*overrides, config="close_the_loop"):
-        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            return hydra.compose(config, [full for override in overrides for full in in_full(override)])
+        folder = ROOT / ("torchrl_h2o" if config == "close_the_loop" else "recipes") / "config"
+        with hydra.initialize_config_dir(str(folder), version_base=None):
+            return hydra.compose(config, [full for override in overrides for full in expanded(override)])
 
     return build
 
@@ -152,7 +153,7 @@ class GymRecording:
     ],
 )
 def test_short_forms_of_a_simulator(argument, full):
-    assert in_full(argument) == full
+    assert expanded(argument) == full
 
 
 def test_rows_are_taken_where_they_are_asked_for(compose, robot):

@@ -13,8 +13,8 @@ from torchrl.checkpoint import CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, trained
 from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
+from torchrl_h2o.comparison.launching import GridLauncher
 from torchrl_h2o.comparison.results_file import CURVE, IDENTITY, RESULT, adopt_runs, append_rows, identity, read_rows
-from torchrl_h2o.comparison.sweeper import PaperGrid
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
@@ -167,7 +167,7 @@ def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
     process.send_signal(signal.SIGINT)
     printed, _ = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert printed.strip().endswith("interrupted with 2 runs to go; the same command goes on with them")
+    assert printed.strip().endswith("interrupted with 2 runs to go; the same command continues with them")
 
 
 @pytest.mark.slow
@@ -205,16 +205,12 @@ def test_a_run_that_died_once_is_done_by_the_second_try(tmp_path, monkeypatch):
     def identity_of(run):
         return dict.fromkeys(IDENTITY, "") | {"method": run[0].partition("=")[2]}
 
-    runs = [["method=0"], ["method=1"]]
-    monkeypatch.setattr(
-        "torchrl_h2o.comparison.grids.chosen_grid", lambda cfg: SimpleNamespace(runs=lambda seeds: runs)
-    )
-    monkeypatch.setattr(PaperGrid, "_identity", lambda self, run: identity_of(run))
+    monkeypatch.setattr(GridLauncher, "identity", lambda self, run: identity_of(run))
     monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **kwargs: Launcher())
-    grid = PaperGrid()
-    cfg = paper("figure=wheel_legged", f"results={tmp_path / 'results.csv'}")
-    grid.setup(hydra_context=None, task_function=None, config=cfg)
-    grid.sweep([])
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        config = hydra.compose("paper", ["figure=wheel_legged"], return_hydra_config=True)
+        grid = GridLauncher(config, tmp_path / "results.csv", shared=[], task=lambda cfg: None)
+        assert grid.run([["method=0"], ["method=1"]], retries=1) == []
     assert launched == [2, 2]
 
 
@@ -244,6 +240,6 @@ def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(comman
     done = subprocess.run(**grid, text=True, check=False)
     assert done.returncode != 0
     assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
-    assert "these runs died:\n  method=h2o_plus" in done.stdout
+    assert "these runs failed:\n  method=h2o_plus" in done.stdout
     assert "ValueError: backbone=huber: choose expectile" in done.stdout
     assert done.stdout.count("run folder:") == 3  # it was tried again, once

@@ -172,7 +172,9 @@ def test_an_observation_effect_on_pixels_alone_is_refused():
 
 def test_an_effect_that_forgot_to_say_that_it_is_random_is_named():
     for effects in ([ForgetfulNoise(0.5)], [ActionNoise(0.5), ForgetfulNoise(0.5)]):
-        with pytest.raises(ValueError, match=r"ForgetfulNoise\(std=0.5\) draws.*random: ClassVar\[bool\] = True"):
+        with pytest.raises(
+            ValueError, match=r"ForgetfulNoise\(std=0.5\) draws random numbers, but.*random: ClassVar\[bool\] = True"
+        ):
             gapped(*effects)
 
 

@@ -11,14 +11,14 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
-from torchrl_h2o.commands.evaluate import load_policy
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.training.environments import make_simulator
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
 from torchrl_h2o.training.methods.sac import SAC
+from torchrl_h2o.training.progress import Training
 from torchrl_h2o.training.returns import evaluate
-from torchrl_h2o.training.run_folder import Training
+from torchrl_h2o.training.trained_policy import load_policy
 
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
 
@@ -138,7 +138,7 @@ def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
 def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, method, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1")
     train(method, cfg, real, tmp_path / "whole")
-    monkeypatch.setattr("torchrl_h2o.training.run_folder.Training.log", interrupt_at(epoch=1, log=Training.log))
+    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
     with pytest.raises(KeyboardInterrupt):
         train(method, cfg, real, tmp_path / "parts")
     monkeypatch.undo()
@@ -157,7 +157,7 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
     assert evaluate(make_simulator(cfg, 1), load_policy(cfg, tmp_path / "whole"), 1).mean == max(promised)
 
     monkeypatch.setattr(
-        "torchrl_h2o.training.run_folder.Training.log",
+        "torchrl_h2o.training.progress.Training.log",
         interrupt_at(epoch=promised.index(max(promised)) + 1, log=Training.log),
     )
     with pytest.raises(KeyboardInterrupt):

@@ -18,7 +18,7 @@ from torchrl_h2o.effects import (
     ObservationGain,
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller
-from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.mujoco_model import find_backend
 from torchrl_h2o.residuals import Measured, Simulation, residuals
 from torchrl_h2o.residuals.measured.residual import executed_actions
 
@@ -76,7 +76,7 @@ def exact_wheel_legged(*effects, steps=80):
     """Measured in double precision, though the env observes in single precision, and the states that it was in."""
     env = TransformedEnv(WheelLeggedEnv(), DynamicsGap(*effects)) if effects else WheelLeggedEnv()
     simulation = Simulation.from_env(env)
-    data = find_simulator(env).owner.data
+    data = find_backend(env).owner.data
     env.set_seed(0)
     torch.manual_seed(0)
     step, states, actions, controller = env.reset(), [], [], noisy_balance_controller()

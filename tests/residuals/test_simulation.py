@@ -1,5 +1,7 @@
 """Simulations: many states at once, exactly as MuJoCo steps one; with effects in, and with what diverges marked."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Simulation
-from torchrl_h2o.residuals.simulation import simulation as module
+from torchrl_h2o.residuals.simulation.settings import SimulationSettings
 
 PULL = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q) - 0.1 * v + np.cos(3.0 * t))
 
@@ -48,13 +50,13 @@ def test_a_rollout_is_what_mujoco_makes_of_each_state_alone(effects):
 
 
 @pytest.mark.parametrize("effects", [(), (PULL,)], ids=["free", "forced"])
-def test_a_rollout_in_chunks_is_the_rollout_at_once(effects, monkeypatch):
+def test_a_rollout_in_chunks_is_the_rollout_at_once(effects):
     simulation = pendulum().with_effects(*effects)
     states, actions, time = drawn(batch=50)
     applied = np.random.default_rng(1).standard_normal((50, 5, 1))
     at_once = simulation.rollout(states, actions, time=time, applied=applied)
-    monkeypatch.setattr(module, "_CHUNK", 100)
-    np.testing.assert_array_equal(simulation.rollout(states, actions, time=time, applied=applied), at_once)
+    in_chunks = replace(simulation, settings=SimulationSettings(rollout_numbers=100))
+    np.testing.assert_array_equal(in_chunks.rollout(states, actions, time=time, applied=applied), at_once)
 
 
 def test_a_rollout_of_no_states_is_empty():

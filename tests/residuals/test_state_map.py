@@ -6,7 +6,7 @@ import torch
 from torchrl.envs import GymEnv
 
 from torchrl_h2o.envs import WheelLeggedEnv
-from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.mujoco_model import find_backend
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.simulation.state_map import StateMap, probe_gymnasium
 
@@ -27,7 +27,7 @@ def test_observations_become_states_and_back(task):
     states = state_map.states(observed)
     np.testing.assert_allclose(state_map.observations(states), observed, atol=1e-12)
     # the task itself observes the very same at these states
-    owner = find_simulator(env).owner
+    owner = find_backend(env).owner
     for state, expected in zip(states, observed, strict=True):
         owner.set_state(state[: owner.model.nq], state[owner.model.nq :])
         np.testing.assert_allclose(owner._get_obs(), expected, atol=1e-12)
@@ -38,7 +38,7 @@ def test_probing_leaves_the_task_where_it_was(task):
     env = GymEnv(task)
     env.set_seed(0)
     env.reset()
-    data = find_simulator(env).owner.data
+    data = find_backend(env).owner.data
     before = data.qpos.copy(), data.qvel.copy()
     Simulation.from_env(env)
     np.testing.assert_array_equal(before[0], data.qpos)
@@ -84,7 +84,7 @@ def test_an_observation_that_is_no_coordinate_is_refused(task):
 
 
 def test_an_observation_that_mixes_coordinates_is_refused():
-    task = find_simulator(GymEnv("InvertedPendulum-v5")).owner
+    task = find_backend(GymEnv("InvertedPendulum-v5")).owner
     task._get_obs = lambda: np.array([task.data.qpos.sum(), *task.data.qvel])
     with pytest.raises(ValueError, match="does not observe coordinates"):
         probe_gymnasium(task, np.random.default_rng(0))

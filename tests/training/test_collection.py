@@ -14,7 +14,7 @@ from torchrl_h2o.training.collection import check_collector, collecting
 from torchrl_h2o.training.environments import make_simulator
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
-from torchrl_h2o.training.run_folder import Training
+from torchrl_h2o.training.progress import Training
 
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is an extra: pip install 'torchrl_h2o[ray]'")
 WORKERS = ["multi_sync", pytest.param("ray", marks=needs_ray)]
@@ -48,7 +48,7 @@ def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind,
             shutil.copytree(self.directory, tmp_path / "parts")
         log(self, epoch, **metrics)
 
-    monkeypatch.setattr("torchrl_h2o.training.run_folder.Training.log", stop_and_go_on)
+    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", stop_and_go_on)
     _, whole = train(H2O_PLUS, cfg, real, tmp_path / "whole")
     monkeypatch.undo()
     _, parts = train(H2O_PLUS, cfg, real, tmp_path / "parts")

@@ -39,7 +39,7 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     torch._dynamo.reset()
     counters = torch._dynamo.utils.counters
     counters.clear()
-    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
     torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-6)
     assert counters["stats"]["unique_graphs"] == 1  # neither broken, nor compiled a second time
     assert not counters["graph_break"]
@@ -58,7 +58,7 @@ def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, 
     cfg, real = compose("compiled=auto", f"updates={PAYS_FROM}")
     expected = updated(learner_of(cfg, real))
     learner = learner_of(cfg, real)
-    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
     torch.testing.assert_close(updated(learner), expected, rtol=0.0, atol=0.0)
     assert capsys.readouterr().out.count("cannot be compiled here") == 1
 
@@ -68,7 +68,7 @@ def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, 
 def test_where_compiled_losses_are_asked_for_it_is_an_error_that_there_can_be_none(compose):
     cfg, real = compose("compiled=true")
     learner = learner_of(cfg, real)
-    learner.terms_of = maybe_compiled(cfg, learner.terms_of)
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
     with pytest.raises(RuntimeError, match="compiler"):
         learner.update()
 
@@ -90,4 +90,4 @@ def test_losses_are_compiled_where_it_pays_or_is_asked_for(chosen, updates, pays
     def losses_of(batch):
         return batch
 
-    assert (maybe_compiled(cfg, losses_of, pays=pays) is not losses_of) == compiles
+    assert (maybe_compiled(losses_of, cfg.compiled, cfg.updates, pays=pays) is not losses_of) == compiles

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from tests.small_runs import ROBOT, SMALL, interrupt_at, rows, run, trained
-from torchrl_h2o.commands.evaluate import load_policy
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.environments import as_observed, make_reality
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
-from torchrl_h2o.training.run_folder import Training
+from torchrl_h2o.training.progress import Training
+from torchrl_h2o.training.trained_policy import load_policy
 
 methods = pytest.mark.parametrize("name", METHODS)
 OFFLINE = ("cql", "iql")
@@ -50,7 +50,7 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
     first = method_policy(method, cfg, real, tmp_path / "first")
     assert all((p != q).any() for p, q in zip(policy.parameters(), first.parameters(), strict=True))
 
-    monkeypatch.setattr("torchrl_h2o.training.run_folder.Training.log", interrupt_at(epoch=1, log=Training.log))
+    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
     with pytest.raises(KeyboardInterrupt):
         train(method, cfg, real, tmp_path / "parts")
     monkeypatch.undo()

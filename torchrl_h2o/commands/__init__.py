@@ -1,1 +1,8 @@
 """Console commands of the package: ``close-the-loop`` and ``h2o-evaluate``."""
+
+from importlib.util import find_spec
+
+import torchrl_h2o.quiet  # noqa: F401  (the command modules below import the packages that it silences)
+
+if find_spec("hydra") is None:
+    raise ModuleNotFoundError("the console commands need Hydra: pip install 'torchrl_h2o[recipes]'")

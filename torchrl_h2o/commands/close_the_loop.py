@@ -1,13 +1,10 @@
-"""Finds what a simulator lacks from measured data, puts it in, and shows how much closer the simulator now is.
+"""Finds the effects that a simulator lacks from measured data, adds them and reports the remaining error.
 
-python recipes/close_the_loop.py                                           # the wheel-legged robot, nothing downloaded
-python recipes/close_the_loop.py data=standing_still.txt                   # the same with the real robot's log
-python recipes/close_the_loop.py simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
-python recipes/close_the_loop.py simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
-python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json  # then train in the mended simulator
+close-the-loop                                           # the wheel-legged robot, recorded in simulation
+close-the-loop data=standing_still.txt                   # the same simulator with the real robot's log
+close-the-loop simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
+close-the-loop simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
 """
-
-import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps quiet)
 
 import os
 import re
@@ -18,17 +15,25 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from torchrl_h2o.commands.recording import Recording, read_recording
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
+from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.effects import CatalogueEntry, paper_gap
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 
 
 def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
-    """The simulator as its user has it: the task or MJCF file, with its own effects and the paper's gap, if named."""
+    """Build the simulator under test: a task or MJCF file with ``simulator.effects`` and the paper's gap, if named.
+
+    Args:
+        cfg: the command's configuration.
+        recording: measured data, for the coordinates and control step of an MJCF file.
+
+    Raises:
+        ValueError: for a gap strength without a gap, or a recording that does not fit the model.
+    """
     effects = [instantiate(effect) for effect in cfg.simulator.effects]
     if cfg.simulator.gap is not None:
         effects.append(paper_gap(cfg.simulator.gap, cfg.simulator.gap_strength))
@@ -46,7 +51,11 @@ def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
 
 
 def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEntry] | None:
-    """The entries of the simulator's catalogue that ``catalogue`` names; None for all."""
+    """Select the catalogue entries whose class names match the patterns in ``catalogue``; None means all.
+
+    Raises:
+        ValueError: for a pattern that matches no effect.
+    """
     if cfg.catalogue is None:
         return None
     patterns = [cfg.catalogue] if isinstance(cfg.catalogue, str) else list(cfg.catalogue)
@@ -54,7 +63,9 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
     names = {entry.name: type(entry.effect).__name__ for entry in entries}
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in names.values()):
-            raise ValueError(f"catalogue={pattern} names no effect; choose of {', '.join(sorted(set(names.values())))}")
+            raise ValueError(
+                f"catalogue={pattern} matches no effect; choose from {', '.join(sorted(set(names.values())))}"
+            )
     return [entry for entry in entries if any(fnmatchcase(names[entry.name], pattern) for pattern in patterns)]
 
 
@@ -76,7 +87,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def print_report(report: Report, directory: Path) -> None:
-    """The report's sentence, its effects and errors as tables, and where the rest lies."""
+    """Print the report's sentence, tables of its effects and errors, and the paths of the files written."""
     print(f"\n{report.sentence()}\n\ndata       {report.data.source}")
     if report.found:
         print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
@@ -91,13 +102,13 @@ def print_report(report: Report, directory: Path) -> None:
         for dimension in report.error.per_dimension:
             print(f"{dimension.name:<48}{dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
     folder = os.path.relpath(directory)
-    print(f"\nresults    {folder}/report.json\nlook at    {folder}/report.html")
+    print(f"\nresults    {folder}/report.json\nreport     {folder}/report.html")
     if report.found:
         print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")
 
 
-def in_full(argument: str) -> list[str]:
-    """What a short form stands for: neither ``simulator=robot.xml`` nor ``simulator=HalfCheetah-v5`` is in config/."""
+def expanded(argument: str) -> list[str]:
+    """Expand ``simulator=robot.xml`` and ``simulator=HalfCheetah-v5``, which name no configuration file."""
     key, _, name = argument.partition("=")
     if key == "simulator" and name.endswith(".xml"):
         return ["simulator=mjcf", f"simulator.path={name}"]
@@ -107,8 +118,8 @@ def in_full(argument: str) -> list[str]:
 
 
 def run() -> None:
-    """The console command ``close-the-loop``."""
-    sys.argv[1:] = [full for argument in sys.argv[1:] for full in in_full(argument)]
+    """Entry point of the console command ``close-the-loop``."""
+    sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()
 
 

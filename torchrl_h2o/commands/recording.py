@@ -11,7 +11,8 @@ from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDictBase
 
 from torchrl_h2o.data import LogColumns, load
-from torchrl_h2o.training.real_data import RECORDED, read_real_data
+from torchrl_h2o.training.real_data import RECORDED
+from torchrl_h2o.training.task import Task
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,8 @@ def read_recording(cfg: DictConfig) -> Recording:
     if cfg.data == RECORDED:
         if cfg.simulator.get("recorded") is None:
             raise ValueError("data=recorded is for the wheel-legged robot: name a data set, or a log and its columns")
-        transitions = read_real_data(hydra.compose("recorded", [f"env={cfg.simulator.recorded}"]))
+        recorded = hydra.compose("recorded", [f"env={cfg.simulator.recorded}"])
+        transitions = Task.from_config(recorded.env).read_real_data(RECORDED)
     else:
         is_log = Path(cfg.data).is_file() and Path(cfg.data).suffix not in (".hdf5", ".h5")
         name = cfg.columns or (cfg.simulator.get("columns") if is_log else None)

@@ -14,15 +14,14 @@ from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_h2o.commands.evaluate import load_policy
 from torchrl_h2o.comparison.results_file import IDENTITY, identity
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
-from torchrl_h2o.training.environments import as_observed, make_reality
+from torchrl_h2o.training.environments import as_observed, make_reality, task_of
 from torchrl_h2o.training.methods import METHODS
-from torchrl_h2o.training.real_data import read_real_data
 from torchrl_h2o.training.returns import SEED
 from torchrl_h2o.training.run_folder import checkpoint_folder, load_config
+from torchrl_h2o.training.trained_policy import load_policy
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
 EVERY = 0.2  # s
@@ -78,7 +77,7 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     """Pitch (rad) and pitch rate (rad/s) of the simulated transitions that the run ended with, ``[N, 2]``."""
-    real = as_observed(cfg, read_real_data(cfg))
+    real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns))
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     title = METHODS[cfg.method].title
     Checkpoint(replay=replay).load(CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest())

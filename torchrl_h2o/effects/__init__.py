@@ -15,12 +15,12 @@ from torchrl_h2o.effects.effect import (
     ForceEffect,
     ModelEffect,
     ObservationEffect,
-    compile_model,
 )
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.force.residual_force import ResidualForce
 from torchrl_h2o.effects.indices import Indices
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
+from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
 from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
 from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
@@ -36,8 +36,10 @@ from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation.sensor import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
 from torchrl_h2o.effects.parameter import Parameter, parameter
+from torchrl_h2o.effects.pipeline import Episode, Pipeline
 from torchrl_h2o.effects.selection import Names
 from torchrl_h2o.effects.serialisation import effect_from_dict, effect_to_dict
+from torchrl_h2o.effects.settings import EffectSettings
 
 __all__ = [
     "PAPER_GAPS",
@@ -57,6 +59,8 @@ __all__ = [
     "CatalogueEntry",
     "ContactSoftness",
     "Effect",
+    "EffectSettings",
+    "Episode",
     "ForceEffect",
     "GeomFriction",
     "GeomLength",
@@ -82,6 +86,7 @@ __all__ = [
     "PaperGap",
     "Parameter",
     "Payload",
+    "Pipeline",
     "QuadraticDrag",
     "ResidualForce",
     "RollingResistance",

@@ -5,7 +5,6 @@ touches is one of four kinds: the model, the actions, the forces or the observat
 """
 
 import dataclasses
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -281,37 +280,3 @@ class ObservationEffect(Effect):
             where nothing is known.
         """
         return np.array(observations, dtype=float)
-
-
-def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco.MjModel:
-    """Edits a specification by the model effects in their order, then compiles it once.
-
-    Args:
-        spec: the specification, edited in place.
-        effects: effects of any kind; those that do not lie in the model are passed over.
-
-    Returns:
-        The compiled model.
-
-    Raises:
-        ValueError: if the model has nothing that one of the effects could act on.
-
-    Examples:
-        >>> import mujoco
-        >>> from torchrl_h2o.effects import Gravity
-        >>> compile_model(mujoco.MjSpec(), [Gravity(2.0)]).opt.gravity
-        array([  0.  ,   0.  , -19.62])
-    """
-    for effect in effects:
-        if isinstance(effect, ModelEffect):
-            try:
-                effect.edit(spec)
-            except ValueError as error:
-                raise ValueError(
-                    f"{type(effect).__name__} ({effect.describe()}) cannot be put into model "
-                    f"'{spec.modelname}': {error}"
-                ) from error
-    with warnings.catch_warnings():
-        # HalfCheetah's own file asks for it, which its user cannot change
-        warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")
-        return spec.compile()

@@ -8,12 +8,10 @@ from math import sqrt
 
 from torchrl_h2o.effects.action.signal import ActionNoise
 from torchrl_h2o.effects.effect import Effect
-
-_TOLERANCE = 0.01  # of the variance: a fitted standard deviation may lie that little above the one it takes away
-_ROUNDING = 1e-9  # of the variance: what is left by no more than rounding
+from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
 
 
-def balanced(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTINGS) -> tuple[Effect, ...]:
     """The effects as they are executed: negative noise made neutral, the noise before it smaller by its variance.
 
     Noise is taken off effects that are on the very same actuators. Several of them shrink in proportion. It is
@@ -21,6 +19,7 @@ def balanced(effects: Sequence[Effect]) -> tuple[Effect, ...]:
 
     Args:
         effects: all effects of a simulator, in their order.
+        settings: the tolerance for negative noise that exceeds the noise before it.
 
     Returns:
         As many effects in the same order, and the very same where there is no negative noise.
@@ -42,22 +41,22 @@ def balanced(effects: Sequence[Effect]) -> tuple[Effect, ...]:
     settled = list(effects)
     for place, effect in enumerate(settled):
         if isinstance(effect, ActionNoise) and effect.std < 0.0:
-            settled[:place] = _without(effect, settled[:place])
+            settled[:place] = _without(effect, settled[:place], settings)
             settled[place] = effect.with_parameters({"std": 0.0})
     return tuple(settled)
 
 
-def _without(negative: ActionNoise, before: Sequence[Effect]) -> list[Effect]:
+def _without(negative: ActionNoise, before: Sequence[Effect], settings: EffectSettings) -> list[Effect]:
     """The effects before negative noise, without the variance that it takes away."""
     there = sum(effect.std**2 for effect in before if _same_actuators(effect, negative))
     taken = negative.std**2
-    if taken > (1.0 + _TOLERANCE) * there:
+    if taken > (1.0 + settings.noise_excess) * there:
         raise ValueError(
             f"{negative.describe()}: the effects before it add one of {sqrt(there):g} on exactly these actuators; "
             "put it behind an ActionNoise that is at least as large, with the same actuators"
         )
     left = 1.0 - taken / there
-    factor = sqrt(left) if left > _ROUNDING else 0.0
+    factor = sqrt(left) if left > settings.noise_rounding else 0.0
     return [
         effect.with_parameters({"std": factor * effect.std}) if _same_actuators(effect, negative) else effect
         for effect in before

@@ -16,11 +16,11 @@ from torchrl._utils import seed_generator
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect, balanced, compile_model
-from torchrl_h2o.effects.effect import BatchedForce, Process
-from torchrl_h2o.envs.backends.gymnasium import GymnasiumSimulator
+from torchrl_h2o.effects import ActionEffect, Effect, Episode, ObservationEffect, Pipeline
+from torchrl_h2o.effects.effect import BatchedForce
+from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 from torchrl_h2o.envs.dynamics_gap import DynamicsGap, transforms_of
-from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.envs.mujoco_model import find_backend
 from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, roll_out
 from torchrl_h2o.envs.task_rules import rules_of
 
@@ -73,27 +73,27 @@ class BatchedMujocoEnv(EnvBase):
         if num_worlds < 1:
             raise ValueError(f"num_worlds is {num_worlds}; there must be at least one world")
         super().__init__(device=torch.device("cpu"), batch_size=[num_worlds])
-        simulator = _simulator_in(env)
-        self._task = simulator.owner
+        backend = _backend_in(env)
+        self._task = backend.owner
         self._rules = rules_of(self._task)
         self.num_worlds = num_worlds
-        self.max_episode_steps = _time_limit(simulator.env)
-        inside = [effect for of_gap in simulator.gaps.values() for effect in of_gap]
-        self._effects = [tuple(balanced((*inside, *own))) for own in _of_each_world(effects, num_worlds)]
+        self.max_episode_steps = _time_limit(backend.env)
+        inside = [effect for of_gap in backend.gaps.values() for effect in of_gap]
+        self._pipelines = [Pipeline((*inside, *own)) for own in _of_each_world(effects, num_worlds)]
         self.physics_steps = self._task.frame_skip
-        self._models = self._compiled(simulator)
-        self._differ = len(set(self._effects)) > 1
+        self._models = self._compiled(backend)
+        self._differ = len(set(self._pipelines)) > 1
         threads = min(num_threads or cpu_count(), num_worlds)
         self._pool = Rollout(nthread=threads if threads > 1 else 0)  # 0 is the caller's own
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
         self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], FULL_PHYSICS)))
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._control_steps = np.array([self.physics_steps * model.opt.timestep for model in self._models])
-        self._worlds = [_World(own, step) for own, step in zip(self._effects, self._control_steps, strict=True)]
-        self._alters_actions = any(world.on_actions for world in self._worlds)
-        self._alters_observations = any(world.on_observations for world in self._worlds)
+        self._episodes = [self._begin_episode(index) for index in range(num_worlds)]
+        self._alters_actions = any(pipeline.of_kind(ActionEffect) for pipeline in self._pipelines)
+        self._alters_observations = any(pipeline.of_kind(ObservationEffect) for pipeline in self._pipelines)
         self._forces = self._batched_forces()
-        self._make_specs(simulator.env)
+        self._make_specs(backend.env)
         self.set_seed(int(torch.randint(2**31, ())))
 
     @property
@@ -101,20 +101,19 @@ class BatchedMujocoEnv(EnvBase):
         """The model of each world, with its effects in it."""
         return self._models
 
-    def _compiled(self, simulator: GymnasiumSimulator) -> list[mujoco.MjModel]:
+    def _compiled(self, backend: GymnasiumBackend) -> list[mujoco.MjModel]:
         """A model a world; worlds with the same effects share one."""
-        models = {effects: compile_model(simulator.spec(), effects) for effects in dict.fromkeys(self._effects)}
+        models = {pipeline: pipeline.compile(backend.spec()) for pipeline in dict.fromkeys(self._pipelines)}
         for model in models.values():
-            simulator.check_sizes(model)
-        return [models[effects] for effects in self._effects]
+            backend.check_sizes(model)
+        return [models[pipeline] for pipeline in self._pipelines]
 
     def _batched_forces(self) -> list[BatchedForce]:
         """The forces that act, each in the worlds that it acts in."""
         forces = []
-        for effects in dict.fromkeys(self._effects):
-            worlds = np.array([index for index, own in enumerate(self._effects) if own == effects])
-            model = self._models[worlds[0]]
-            forces += [_in_worlds(worlds, effect.batched(model)) for effect in _of_kind(effects, ForceEffect)]
+        for pipeline in dict.fromkeys(self._pipelines):
+            worlds = np.array([index for index, own in enumerate(self._pipelines) if own == pipeline])
+            forces += [_in_worlds(worlds, force) for force in pipeline.batched_forces(self._models[worlds[0]])]
         return forces
 
     def _make_specs(self, env: EnvBase) -> None:
@@ -149,7 +148,7 @@ class BatchedMujocoEnv(EnvBase):
         action = tensordict.get("action").numpy()
         executed = action
         if self._alters_actions:
-            executed = np.stack([world.executed(own) for world, own in zip(self._worlds, action, strict=True)])
+            executed = np.stack([episode.executed(own) for episode, own in zip(self._episodes, action, strict=True)])
             executed = executed.astype(action.dtype)
         before = positions_and_velocities(self._models[0], self.states)[0].copy()
         reached = roll_out(
@@ -190,41 +189,22 @@ class BatchedMujocoEnv(EnvBase):
         own, qpos0 = self._models[index].qpos0, task.model.qpos0
         state[1 : 1 + len(own)] += np.where(task.init_qpos == qpos0, own - qpos0, 0.0)
         self._steps[index] = 0
-        self._worlds[index].begin()
+        self._episodes[index] = self._begin_episode(index)
+
+    def _begin_episode(self, index: int) -> Episode:
+        """Begins an episode of a world's action and observation effects."""
+        pipeline, rng = self._pipelines[index], None
+        if pipeline.is_random:  # otherwise torch's generator stays untouched
+            rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
+        return pipeline.begin(self._control_steps[index], rng)
 
     def _observe(self, mask: np.ndarray | slice = slice(None)) -> torch.Tensor:
         """What is observed, (N, n), by the sensors of the worlds in a mask; TorchRL takes nothing of the others."""
         observed = self._rules.observe(*positions_and_velocities(self._models[0], self.states))
         if self._alters_observations:
             for index in np.arange(self.num_worlds)[mask]:
-                observed[index] = self._worlds[index].observed(observed[index])
+                observed[index] = self._episodes[index].observed(observed[index])
         return torch.as_tensor(observed, dtype=self._observation_dtype)
-
-
-class _World:
-    """The effects of one world that are not in its model, with what they remember since its last reset."""
-
-    def __init__(self, effects: Sequence[Effect], control_step: float) -> None:
-        self.on_actions = _of_kind(effects, ActionEffect)
-        self.on_observations = _of_kind(effects, ObservationEffect)
-        self.control_step = control_step
-        self.begin()
-
-    def begin(self) -> None:
-        """Forgets, and draws a new generator for random effects, from torch's global one."""
-        rng = None
-        if any(effect.random for effect in (*self.on_actions, *self.on_observations)):
-            rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
-        self._actions = [effect.process(self.control_step, rng) for effect in self.on_actions]
-        self._observations = [effect.process(self.control_step, rng) for effect in self.on_observations]
-
-    def executed(self, action: np.ndarray) -> np.ndarray:
-        """What is executed of an action, (nu)."""
-        return _through(self._actions, action)
-
-    def observed(self, observation: np.ndarray) -> np.ndarray:
-        """What is reported of an observation, (n)."""
-        return _through(self._observations, observation)
 
 
 def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
@@ -238,17 +218,6 @@ def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
     return forces
 
 
-def _through(processes: Sequence[Process], values: np.ndarray) -> np.ndarray:
-    values = values.astype(float)  # a copy: what an effect remembers must not change
-    for process in processes:
-        values = process(values)
-    return values
-
-
-def _of_kind(effects: Sequence[Effect], kind: type[Effect]) -> list[Effect]:
-    return [effect for effect in effects if isinstance(effect, kind) and not effect.is_neutral]
-
-
 def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_worlds: int) -> list[tuple[Effect, ...]]:
     effects = list(effects)
     if all(isinstance(effect, Effect) for effect in effects):
@@ -260,10 +229,10 @@ def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_w
     return [tuple(own) for own in effects]
 
 
-def _simulator_in(env: EnvBase) -> GymnasiumSimulator:
-    """The simulator of an env that can be stepped in a batch as it is."""
-    simulator = find_simulator(env)
-    if not isinstance(simulator, GymnasiumSimulator):
+def _backend_in(env: EnvBase) -> GymnasiumBackend:
+    """Returns the backend of an env that a batch can step; raises ValueError for other envs."""
+    backend = find_backend(env)
+    if not isinstance(backend, GymnasiumBackend):
         raise ValueError(f"{env} is no Gymnasium task; build one world of it with GymEnv")
     others = [type(transform).__name__ for transform in transforms_of(env) if not isinstance(transform, DynamicsGap)]
     if others:
@@ -271,9 +240,9 @@ def _simulator_in(env: EnvBase) -> GymnasiumSimulator:
             f"the env that is given has transforms that a batch would be without ({', '.join(others)}): put them "
             "around it, TransformedEnv(BatchedMujocoEnv(...), ...)"
         )
-    if simulator.env.wrapper_frame_skip != 1:
+    if backend.env.wrapper_frame_skip != 1:
         raise ValueError("the env that is given repeats actions (frame_skip); leave that out")
-    return simulator
+    return backend
 
 
 def _time_limit(env: EnvBase) -> float:

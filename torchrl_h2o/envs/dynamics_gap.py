@@ -1,19 +1,15 @@
 """DynamicsGap, the TorchRL transform that puts effects into a simulator."""
 
-from collections.abc import Sequence
-from itertools import islice
-
 import mujoco
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform, TransformedEnv
 
-from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, balanced, paper_gap
-from torchrl_h2o.effects.effect import Process
-from torchrl_h2o.envs.backends.backend import Simulator
-from torchrl_h2o.envs.episode import Episode
-from torchrl_h2o.envs.mujoco_model import find_simulator
+from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, Pipeline, paper_gap
+from torchrl_h2o.envs.backends.backend import MujocoBackend
+from torchrl_h2o.envs.episode import GapEpisode
+from torchrl_h2o.envs.mujoco_model import find_backend
 
 
 class DynamicsGap(Transform):
@@ -95,15 +91,15 @@ class DynamicsGap(Transform):
         if env is None:  # in a Compose that is not on an env yet
             return
         self._check_place(env)
-        simulator = find_simulator(env)
-        # Before the model is changed: does everything that an effect names exist?
-        rehearsal = Episode.begin(self._balanced_effects(simulator), simulator, np.random.default_rng(0))
-        example = simulator.env.fake_tensordict()
-        _alter(example, rehearsal.action_keys, rehearsal.actions)
-        _alter(example, rehearsal.observation_keys, rehearsal.observations)
-        for force in rehearsal.forces:
-            force(mujoco.MjData(simulator.model))
-        simulator.apply(self._identity, {gap._identity: gap.effects for gap in self._gaps_on(env)})
+        backend = find_backend(env)
+        # a trial episode, so that an effect with nothing to act on raises before the model is changed
+        trial = self._begin(backend, self._pipeline(backend), np.random.default_rng(0))
+        example = backend.env.fake_tensordict()
+        trial.execute(example)
+        trial.observe(example)
+        for force in trial.effects.forces:
+            force(mujoco.MjData(backend.model))
+        backend.apply(self._identity, {gap._identity: gap.effects for gap in self._gaps_on(env)})
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # A copied or unpickled env may have built its simulator anew, without the gaps.
@@ -116,45 +112,46 @@ class DynamicsGap(Transform):
                 f"{self} and a clone of it are on one env, where they count as one gap; to have "
                 "its effects twice, make a second DynamicsGap"
             )
-        simulator = find_simulator(env)
+        backend = find_backend(env)
         for identity in effects:
-            simulator.apply(identity, effects)
+            backend.apply(identity, effects)
         return super()._reset_env_preprocess(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        find_simulator(_env_of(self)).episodes.pop(self._identity, None)
+        find_backend(_env_of(self)).episodes.pop(self._identity, None)
         return self._call(tensordict_reset)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        episode = self._episode()
-        return _alter(tensordict, episode.action_keys, episode.actions)
+        return self._episode().execute(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        episode = self._episode()
-        return _alter(next_tensordict, episode.observation_keys, episode.observations)
+        return self._episode().observe(next_tensordict)
 
-    def _episode(self) -> Episode:
+    def _episode(self) -> GapEpisode:
+        """The current episode, begun if there is none."""
         env = _env_of(self)
         if env is None:  # in a replay buffer there is no simulator to alter
-            return Episode()
-        simulator = find_simulator(env)
-        episodes = simulator.episodes
+            return GapEpisode()
+        backend = find_backend(env)
+        episodes = backend.episodes
         if self._identity not in episodes:
-            # Without random effects torch's generator is left alone: runs with and without the gap
-            # then sample the same actions.
-            rng, effects = None, self._balanced_effects(simulator)
-            if any(effect.random and not effect.is_neutral for effect in effects):
+            rng, pipeline = None, self._pipeline(backend)
+            # Without random effects torch's generator stays untouched, so that runs with and without
+            # the gap sample the same actions.
+            if pipeline.is_random:
                 rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
-            episodes[self._identity] = Episode.begin(effects, simulator, rng)
+            episodes[self._identity] = self._begin(backend, pipeline, rng)
         return episodes[self._identity]
 
-    def _balanced_effects(self, simulator: Simulator) -> tuple[Effect, ...]:
-        """This gap's own of all gaps' effects, once the noise that some take away is off the others."""
-        # the simulator knows those on envs around this one too; one that is just being put on, it does not yet
-        of_gap = {gap._identity: gap.effects for gap in self._gaps_on(_env_of(self))} | simulator.gaps
-        everything = iter(balanced([effect for effects in of_gap.values() for effect in effects]))
-        shares = {identity: tuple(islice(everything, len(effects))) for identity, effects in of_gap.items()}
-        return shares[self._identity]
+    def _pipeline(self, backend: MujocoBackend) -> Pipeline:
+        """The gap's effects, with negative noise settled across all gaps of the simulation."""
+        # backend.gaps also lists gaps on envs around this one, but not yet a gap that is being put on
+        of_gap = {gap._identity: gap.effects for gap in self._gaps_on(_env_of(self))} | backend.gaps
+        return Pipeline.balanced_together(of_gap)[self._identity]
+
+    @staticmethod
+    def _begin(backend: MujocoBackend, pipeline: Pipeline, rng: np.random.Generator | None) -> GapEpisode:
+        return GapEpisode.begin(pipeline, backend.env, backend.control_step, backend.model, rng)
 
     def _gaps_on(self, env: EnvBase) -> list["DynamicsGap"]:
         return [transform for transform in _transforms_of(self, env) if isinstance(transform, DynamicsGap)]
@@ -204,22 +201,6 @@ def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:
     Source: H2O+ (arXiv 2309.12716), simulation experiments.
     """
     return DynamicsGap(paper_gap(name, strength))
-
-
-def _alter(tensordict: TensorDictBase, keys: Sequence[NestedKey], processes: Sequence[Process]) -> TensorDictBase:
-    """Passes the entries under the keys, as one vector, through the processes."""
-    if not processes:
-        return tensordict
-    tensors = [tensordict.get(key) for key in keys]
-    parts = [tensor.detach().cpu().double().flatten().numpy() for tensor in tensors]
-    vector = np.concatenate(parts)  # a copy: what an effect remembers must not change
-    for process in processes:
-        vector = process(vector)
-    ends = np.cumsum([part.size for part in parts])[:-1]
-    for key, tensor, part in zip(keys, tensors, np.split(vector, ends), strict=True):
-        altered = torch.as_tensor(part, dtype=tensor.dtype, device=tensor.device)
-        tensordict.set(key, altered.view(tensor.shape))
-    return tensordict
 
 
 def _env_of(transform: Transform) -> EnvBase | None:

@@ -1,82 +1,87 @@
-"""One episode of a dynamics gap: its effects at work, with what they remember since the reset."""
+"""One episode of a dynamics gap in a TorchRL env: its effects at work on tensordicts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
-from tensordict import NestedKey
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import ActionEffect, Effect, ForceEffect, ObservationEffect
-from torchrl_h2o.effects.effect import Force, Process
-
-if TYPE_CHECKING:
-    from torchrl_h2o.envs.backends.backend import Simulator
+from torchrl_h2o.effects import Episode, Pipeline
 
 
-class Episode(NamedTuple):
-    """The effects of one gap at work in one episode; those in the model need no work."""
+class GapEpisode(NamedTuple):
+    """The effects of one gap in one episode, and the tensordict entries that they alter.
 
-    actions: Sequence[Process] = ()
+    Args:
+        effects: the effects at work. Effects on the model need no work during an episode.
+        action_keys: the entries of the action.
+        observation_keys: the floating-point entries of the observation.
+    """
+
+    effects: Episode = Episode()
     action_keys: Sequence[NestedKey] = ()
-    observations: Sequence[Process] = ()
     observation_keys: Sequence[NestedKey] = ()
-    forces: Sequence[Force] = ()
 
     @classmethod
-    def begin(cls, effects: Sequence[Effect], simulator: Simulator, rng: np.random.Generator | None) -> Episode:
+    def begin(
+        cls, pipeline: Pipeline, env: EnvBase, dt: float, model: mujoco.MjModel, rng: np.random.Generator | None
+    ) -> GapEpisode:
         """Begins an episode.
 
         Args:
-            effects: those of the gap, with no noise left to take away: see :func:`balanced`.
-            simulator: where the episode takes place.
-            rng: for the random effects; None where there is none among them.
+            pipeline: the effects of the gap, with negative noise settled across all gaps.
+            env: the env without transforms.
+            dt: the control step, in s.
+            model: the compiled model.
+            rng: the generator of the random effects; None if there are none.
 
         Raises:
-            ValueError: if an effect finds nothing to act on, or draws random numbers unannounced.
+            ValueError: if an effect finds nothing to act on, or draws random numbers without being marked random.
         """
-
-        def processes(kind: type[Effect], of: Any) -> list:
-            return [
-                effect.process(of, rng if effect.random else _NoGenerator(effect))
-                for effect in effects
-                if isinstance(effect, kind) and not effect.is_neutral
-            ]
-
-        env, dt = simulator.env, simulator.control_step
+        effects = pipeline.begin(dt, rng, model)
         observed = [key for key, spec in env.observation_spec.items(True, True) if spec.dtype.is_floating_point]
-        observations = processes(ObservationEffect, dt)
-        if observations and not observed:
+        if effects.observations and not observed:
             raise ValueError(
                 f"{env} has no floating-point observations that an observation effect could alter, only "
                 f"{', '.join(map(str, env.observation_spec.keys(True, True)))}; leave the effect out or let "
                 "the env observe its state too (pixels_only=False)"
             )
-        return cls(
-            actions=processes(ActionEffect, dt),
-            action_keys=env.action_keys,
-            observations=observations,
-            observation_keys=observed,
-            forces=processes(ForceEffect, simulator.model),
-        )
+        return cls(effects, env.action_keys, observed)
+
+    def execute(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the actions in a tensordict by those that the simulator executes."""
+        if not self.effects.actions:
+            return tensordict
+        return _replace(tensordict, self.action_keys, self.effects.executed)
+
+    def observe(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the observations in a tensordict by those that the sensors report."""
+        if not self.effects.observations:
+            return tensordict
+        return _replace(tensordict, self.observation_keys, self.effects.observed)
 
 
-class Episodes(dict):
-    """The present episodes of a simulation's gaps. A copy of the simulation starts without any."""
+class GapEpisodes(dict):
+    """The current episodes of a simulation's gaps, by gap. A copy of the simulation starts without any."""
 
     def __reduce__(self) -> tuple:
-        return Episodes, ()
+        return GapEpisodes, ()
 
 
-class _NoGenerator:
-    """Stands where an effect that is not ``random`` would find the random generator."""
-
-    def __init__(self, effect: Effect):
-        self.effect = effect
-
-    def __getattr__(self, name: str) -> Any:
-        raise ValueError(
-            f"{self.effect} draws random numbers, but does not say so: write "
-            f"'random: ClassVar[bool] = True' into the class {type(self.effect).__name__}"
-        )
+def _replace(
+    tensordict: TensorDictBase, keys: Sequence[NestedKey], alter: Callable[[np.ndarray], np.ndarray]
+) -> TensorDictBase:
+    """Passes the entries under the keys through a function, as one vector (n,), and writes them back."""
+    tensors = [tensordict.get(key) for key in keys]
+    parts = [tensor.detach().cpu().double().flatten().numpy() for tensor in tensors]
+    vector = alter(np.concatenate(parts))
+    ends = np.cumsum([part.size for part in parts])[:-1]
+    for key, tensor, part in zip(keys, tensors, np.split(vector, ends), strict=True):
+        altered = torch.as_tensor(part, dtype=tensor.dtype, device=tensor.device)
+        tensordict.set(key, altered.view(tensor.shape))
+    return tensordict

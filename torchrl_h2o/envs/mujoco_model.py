@@ -3,9 +3,9 @@
 import mujoco
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.envs.backends.backend import Simulator, base_env
-from torchrl_h2o.envs.backends.dm_control import DMControlSimulator
-from torchrl_h2o.envs.backends.gymnasium import GymnasiumSimulator
+from torchrl_h2o.envs.backends.backend import MujocoBackend, base_env
+from torchrl_h2o.envs.backends.dm_control import DMControlBackend
+from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 
 
 def mujoco_model(env: EnvBase) -> mujoco.MjModel:
@@ -27,10 +27,10 @@ def mujoco_model(env: EnvBase) -> mujoco.MjModel:
         >>> float(mujoco_model(GymEnv("HalfCheetah-v5")).opt.gravity[2])
         -9.81
     """
-    return find_simulator(env).model
+    return find_backend(env).model
 
 
-def find_simulator(env: EnvBase) -> Simulator:
+def find_backend(env: EnvBase) -> MujocoBackend:
     """The MuJoCo simulation inside an env.
 
     Args:
@@ -49,10 +49,10 @@ def find_simulator(env: EnvBase) -> Simulator:
             "be reached from outside. Put the gap inside each worker, as in "
             "ParallelEnv(2, lambda: TransformedEnv(GymEnv('HalfCheetah-v5'), DynamicsGap(...)))"
         )
-    simulator = GymnasiumSimulator.inside(base) or DMControlSimulator.inside(base)
-    if simulator is None:
+    backend = GymnasiumBackend.inside(base) or DMControlBackend.inside(base)
+    if backend is None:
         raise ValueError(
             f"{base} does not run on MuJoCo; choose a MuJoCo task of Gymnasium, such as "
             "GymEnv('HalfCheetah-v5'), or of dm_control, such as DMControlEnv('cheetah', 'run')"
         )
-    return simulator
+    return backend

@@ -1,10 +1,9 @@
-"""Where simulated transitions come from: a simulator in this process, or workers on this machine or on many.
+"""Collectors of simulated transitions: in this process, in worker processes, or in Ray workers on many machines.
 
-The collectors are TorchRL's. Weights go out to the workers, transitions come in. Each worker has a simulator and random
-streams of its own, seeded from the run's seed.
+The collectors are TorchRL's. Workers receive the policy's weights and send transitions. Each worker has a simulator and
+random streams of its own, seeded from the run's seed.
 """
 
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
@@ -16,15 +15,14 @@ from tensordict import NestedKey
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.training import environments
 from torchrl_h2o.training.environments import simulator_maker
-from torchrl_h2o.training.run_folder import num_epochs
+from torchrl_h2o.training.progress import Budget
 
 DIRECT = OmegaConf.create({"backend": "direct"})
 
 
 class SeededCollector(Collector):
-    """What a Ray worker runs: its seed is also that of the policy's noise, as it is in TorchRL's other workers."""
+    """Collector of a Ray worker whose seed also seeds the policy's noise, as in TorchRL's other workers."""
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         torch.manual_seed(seed)
@@ -32,11 +30,11 @@ class SeededCollector(Collector):
 
 
 def check_collector(cfg: DictConfig) -> None:
-    """Says before a run what its collector lacks.
+    """Validates the collector's settings before a run.
 
     Raises:
-        ModuleNotFoundError: for Ray's workers without Ray.
-        ValueError: for workers and worlds that cannot share an epoch's steps alike.
+        ModuleNotFoundError: if Ray is chosen and not installed.
+        ValueError: if an epoch's steps cannot be divided evenly among all worlds of all workers.
     """
     chosen = _chosen(cfg)
     if chosen.backend == "ray" and find_spec("ray") is None:
@@ -53,14 +51,14 @@ def check_collector(cfg: DictConfig) -> None:
 def collecting(
     cfg: DictConfig, simulator: EnvBase, actor: torch.nn.Module, keys: Sequence[NestedKey]
 ) -> Iterator[BaseCollector]:
-    """A collector of an epoch's simulated transitions at a time, whose workers end with the block.
+    """Yields a collector that returns one epoch of simulated transitions at a time; its workers end with the block.
 
-    Its policy is as old as the last ``update_policy_weights_()``. Every batch begins with fresh episodes, so that an
-    epoch depends on its seed and its policy alone.
+    Call ``update_policy_weights_()`` to send the policy's present weights. Every batch begins with fresh episodes, so
+    that an epoch depends on its seed and its policy only.
 
     Args:
         cfg: the run's configuration.
-        simulator: what steps in this process; workers make their own.
+        simulator: the environment of this process; workers build their own.
         actor: the policy.
         keys: the entries of a transition that Ray's workers send.
     """
@@ -70,7 +68,7 @@ def collecting(
         if chosen.backend == "direct":
             collector = Collector(simulator, actor, **options)
         elif chosen.backend == "process":
-            threads = torch.get_num_threads()  # which TorchRL would share out among the workers
+            threads = torch.get_num_threads()  # TorchRL would divide them among the workers
             stack.callback(torch.set_num_threads, threads)
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": {"num_threads": threads}}
             collector = Collector(simulator_maker(cfg), actor, backend="process", **options)
@@ -85,14 +83,15 @@ def collecting(
 
 
 def _chosen(cfg: DictConfig) -> DictConfig:
-    return cfg.get("collector") or DIRECT  # a run of an earlier version says nothing of it
+    return cfg.get("collector") or DIRECT  # configurations of earlier versions have no such entry
 
 
 def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:
-    """What TorchRL's RayCollector takes beside what all take."""
+    """Further arguments of TorchRL's RayCollector."""
     chosen = cfg.collector
     return {
-        "total_frames": num_epochs(cfg) * cfg.steps_per_epoch,  # without it, there are none
+        # RayCollector collects nothing without a total.
+        "total_frames": Budget.from_config(cfg).epochs * cfg.steps_per_epoch,
         "collector_class": SeededCollector,
         "collector_kwargs": [{"postproc": methodcaller("select", *keys)} for _ in range(chosen.workers)],
         "remote_configs": OmegaConf.to_container(chosen.resources),
@@ -101,16 +100,13 @@ def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:
 
 @contextmanager
 def _ray(chosen: DictConfig) -> Iterator[None]:
-    """Ray's runtime: the one that this process is in already, the cluster of this machine, or a new one.
+    """Connects to Ray: this process's runtime, this machine's cluster, or a new one.
 
     Raises:
-        RuntimeError: for more workers than the cluster has room for: they would be waited for, without a word.
+        RuntimeError: for more workers than the cluster has processors; Ray would wait for them silently.
     """
     import ray  # an extra
 
-    # Other machines have the library but not the recipes: these travel with what is made of them.
-    for module in (environments, sys.modules[__name__]):
-        ray.cloudpickle.register_pickle_by_value(module)
     mine = not ray.is_initialized()
     if mine:
         ray.init(**chosen.init)

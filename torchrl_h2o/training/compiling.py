@@ -1,48 +1,48 @@
-"""Losses by torch.compile, where that pays and where it can be done.
+"""Compiles losses with ``torch.compile`` where that is faster and possible.
 
-It takes half a minute. After that an update takes 4 to 10 ms less, mostly of Python, and draws the same random numbers.
+Compiling takes half a minute. After it an update takes 4 to 10 ms less, mostly of Python, and draws the same random
+numbers.
 """
 
 from collections.abc import Callable, Mapping
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch._dynamo.exc import TorchDynamoException
 from tqdm import tqdm
 
-PAYS_FROM = 10_000  # updates
+PAYS_FROM = 10_000  # updates; fewer do not make up for the time of compiling
 
 
-def maybe_compiled(cfg: DictConfig, losses_of: Callable, *, pays: bool = True) -> Callable:
-    """Losses as ``compiled`` asks for them: compiled, as they are, or for ``auto`` compiled where that pays.
+def maybe_compiled(losses_of: Callable, compiled: bool | str, updates: int, *, pays: bool = True) -> Callable:
+    """Compiles losses if that is asked for, or if it saves time.
 
     Args:
-        cfg: the run's configuration.
-        losses_of: of batches.
-        pays: whether compiled losses are faster, once they are compiled.
+        losses_of: function of batches.
+        compiled: True, False, or ``"auto"`` for compiled where that saves time.
+        updates: length of the training, for ``"auto"``.
+        pays: whether compiled losses are faster at all, for ``"auto"``.
 
     Returns:
-        The same losses. For ``auto`` they stay as they are on a machine that cannot compile them, and say so.
+        The losses, compiled at their first call. With ``"auto"`` on a machine without a compiler they stay uncompiled,
+        which is reported.
     """
-    chosen = cfg.get("compiled", False)  # a run of an earlier version says nothing of it
-    if chosen == "auto":
-        chosen = pays and cfg.updates >= PAYS_FROM
-    return _Announced(losses_of, needed=cfg.compiled is True) if chosen else losses_of
+    chosen = pays and updates >= PAYS_FROM if compiled == "auto" else compiled
+    return _CompiledAtFirstCall(losses_of, needed=compiled is True) if chosen else losses_of
 
 
 def compiled(losses_of: Callable) -> Callable:
-    """Losses that are compiled at their first call, and draw the random numbers of those that are not."""
+    """Compiles losses so that they draw the same random numbers as uncompiled ones."""
     return torch.compile(losses_of, options={"fallback_random": True})
 
 
-class _Announced:
-    """Compiled losses that say what takes so long; where it cannot be done, and need not, the losses as they are."""
+class _CompiledAtFirstCall:
+    """Reports why the first call takes long; falls back to uncompiled losses unless compiled ones are needed."""
 
     def __init__(self, losses_of: Callable, needed: bool) -> None:
         self._plain, self._needed = losses_of, needed
-        self._chosen: Callable | None = None  # until the first call
+        self._chosen: Callable | None = None  # set at the first call
 
     def __call__(self, *batches: TensorDictBase) -> Mapping[str, Tensor]:
         if self._chosen is None:

@@ -1,35 +1,51 @@
-"""Films of a policy at work, where MuJoCo can render: with a display, or without one through EGL or OSMesa."""
+"""Films a policy, where MuJoCo can render: with a display, or without one through EGL or OSMesa."""
+
+from __future__ import annotations
 
 import os
 import sys
 from pathlib import Path
 
-from omegaconf import DictConfig
+import torch
+from tqdm import tqdm
+
+from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.returns import run_episode
+from torchrl_h2o.training.task import Task
 
 FPS = 25
-
-
-def try_to_film(cfg: DictConfig, policy, directory: Path) -> Path | None:
-    """A film in the run's folder; where that fails, None and a line that says why: the run is done without it."""
-    try:
-        return film(cfg, policy, directory / "policy.mp4")
-    except Exception as error:
-        print(f"\nno film: {error}")
-        return None
 
 
 class RenderingUnavailableError(RuntimeError):
     """MuJoCo found no OpenGL."""
 
 
-def film(cfg: DictConfig, policy, path: Path, *, simulator: bool = False, seconds: float = 10.0) -> Path:
-    """Films the policy in reality (or the simulator).
+def try_to_film(task: Task, preprocessing: Preprocessing, policy: torch.nn.Module, directory: Path) -> Path | None:
+    """Films the policy into the run's folder; a failure is reported and returns None, as the run is complete."""
+    try:
+        return film(task, preprocessing, policy, directory / "policy.mp4")
+    except Exception as error:
+        tqdm.write(f"\nno film: {error}")
+        return None
+
+
+def film(
+    task: Task,
+    preprocessing: Preprocessing,
+    policy: torch.nn.Module,
+    path: Path,
+    *,
+    simulator: bool = False,
+    seconds: float = 10.0,
+) -> Path:
+    """Films the policy in reality, or in the simulator.
 
     Args:
-        cfg: the run's configuration.
+        task: the task.
+        preprocessing: of the observations that the policy reads.
         policy: writes ``action``.
         path: an .mp4 file, or a folder (no suffix) for PNG frames.
-        simulator: film in the simulator instead.
+        simulator: whether to film in the simulator.
         seconds: of simulated time.
 
     Returns:
@@ -38,11 +54,11 @@ def film(cfg: DictConfig, policy, path: Path, *, simulator: bool = False, second
     Raises:
         RenderingUnavailableError: if MuJoCo cannot render here, with what to do.
     """
-    frames = _frames(cfg, policy, simulator, seconds)
+    frames = _frames(task, preprocessing, policy, simulator, seconds)
     import imageio.v3 as iio
 
     if path.suffix == ".mp4":
-        iio.imwrite(path, frames, fps=1 / (_every(cfg) * cfg.env.seconds_per_step), codec="libx264")
+        iio.imwrite(path, frames, fps=1 / (_stride(task) * task.seconds_per_step), codec="libx264")
     else:
         path.mkdir(parents=True, exist_ok=True)
         for index, frame in enumerate(frames):
@@ -50,24 +66,21 @@ def film(cfg: DictConfig, policy, path: Path, *, simulator: bool = False, second
     return path
 
 
-def _frames(cfg: DictConfig, policy, simulator: bool, seconds: float) -> list:
+def _frames(task: Task, preprocessing: Preprocessing, policy: torch.nn.Module, simulator: bool, seconds: float) -> list:
     if sys.platform == "linux" and "DISPLAY" not in os.environ:
         os.environ.setdefault("MUJOCO_GL", "egl")
-    from torchrl_h2o.training.environments import make_reality, make_simulator
-    from torchrl_h2o.training.returns import run_episode
-
-    env = (make_simulator if simulator else make_reality)(cfg, render_mode="rgb_array")
-    every = _every(cfg)
+    make = task.make_simulator if simulator else task.make_reality
+    env, stride = make(None, preprocessing, render_mode="rgb_array"), _stride(task)
     frames, steps = [], iter(range(10**9))
 
     def watched(tensordict):
-        if next(steps) % every == 0:
+        if next(steps) % stride == 0:
             frames.append(env.render())
         return policy(tensordict)
 
     env.set_seed(0)
     try:
-        run_episode(env, watched, max_steps=round(seconds / cfg.env.seconds_per_step))
+        run_episode(env, watched, max_steps=round(seconds / task.seconds_per_step))
     except Exception as error:
         if frames:
             raise
@@ -80,6 +93,6 @@ def _frames(cfg: DictConfig, policy, simulator: bool, seconds: float) -> list:
     return frames
 
 
-def _every(cfg: DictConfig) -> int:
-    """Steps between two frames: about FPS frames a second of simulated time."""
-    return max(1, round(1 / (FPS * cfg.env.seconds_per_step)))
+def _stride(task: Task) -> int:
+    """Control steps between two frames, for about ``FPS`` frames per second of simulated time."""
+    return max(1, round(1 / (FPS * task.seconds_per_step)))

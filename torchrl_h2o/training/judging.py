@@ -1,54 +1,71 @@
-"""What a run's policies do in reality and in the simulator they learnt in: summary.json and learning_curve.png."""
+"""Results of a run: evaluations in reality and the simulator, summary.json, learning_curve.png, and a short table."""
 
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
 import time
+from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
-from torchrl_h2o.training.environments import make_reality, make_simulator
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
-from torchrl_h2o.training.real_data import behaviour_in
 from torchrl_h2o.training.returns import Evaluation, evaluate
-from torchrl_h2o.training.run_folder import write_summary
+from torchrl_h2o.training.task import Task
 
-H2O_PLUS_S = ("backbone", "mixing", "ratio")  # which no other method reads
+PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
+DATA = "the data's behaviour"
 
 
 def judge(
-    cfg: DictConfig,
-    real: TensorDictBase,
-    policies: dict[str, torch.nn.Module],
-    trainings: dict[str, Trained],
+    task: Task,
+    reality: EnvBase,
+    simulator: EnvBase,
+    policies: Mapping[str, torch.nn.Module],
+    trainings: Mapping[str, Trained],
+    behaviour: Evaluation,
     directory: Path,
+    *,
+    episodes: int,
+    settings: Mapping[str, Any],
     wall_s: float,
 ) -> dict[str, Evaluation]:
-    """Evaluates the policies and leaves summary.json and learning_curve.png.
+    """Evaluates the policies and writes summary.json and learning_curve.png.
 
     Args:
-        cfg: the run's configuration.
-        real: the measured transitions.
-        policies: by method; the one that the run is about, and maybe others beside it.
-        trainings: theirs.
+        task: the task, for the picture's title.
+        reality: the environment of the evaluations, preprocessed as in training.
+        simulator: one episode of the first policy is evaluated in it.
+        policies: by method; the first is the one that the run is about, the others are baselines.
+        trainings: their trainings, by method.
+        behaviour: returns of the data's own episodes.
         directory: where the files go.
-        wall_s: seconds that the run took so far.
+        episodes: number of episodes in reality.
+        settings: further entries of the summary, see :func:`run_settings`.
+        wall_s: seconds that the run has taken so far.
 
     Returns:
-        The episodes in reality, by method, and the data's own.
+        The evaluations in reality by method, and the data's behaviour.
     """
     start = time.perf_counter()
     main = next(iter(policies))
-    reality, simulator = make_reality(cfg, cfg.final_episodes), make_simulator(cfg, 1)
-    in_reality = {name: evaluate(reality, policy, cfg.final_episodes) for name, policy in policies.items()}
+    in_reality = {name: evaluate(reality, policy, episodes) for name, policy in policies.items()}
     in_simulator = evaluate(simulator, policies[main], 1)
-    behaviour = behaviour_in(cfg, real)
-    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, cfg)
+    draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, task)
     write_summary(
         directory,
         {
             "method": main,
-            **settings(cfg, real),
+            **settings,
             "updates": trainings[main].updates,
             "return_real": in_reality[main].summary(),
             "return_sim": in_simulator.summary(),
@@ -58,23 +75,89 @@ def judge(
             "wall_s": wall_s + time.perf_counter() - start,
         },
     )
-    return in_reality | {"the data's behaviour": behaviour}
+    return in_reality | {DATA: behaviour}
 
 
-def judge_failed(cfg: DictConfig, real: TensorDictBase, failure: dict, directory: Path) -> None:
-    """Leaves the summary.json of a run that has no policy to show, and says there why."""
+def write_failure(directory: Path, failure: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Writes the summary.json of a run without a policy, with the reason of its failure."""
     failed = {"updates": failure["updates"], "return_real": None, "failure": failure["why"]}
-    write_summary(directory, settings(cfg, real) | failed)
+    write_summary(directory, {**settings, **failed})
 
 
-def settings(cfg: DictConfig, real: TensorDictBase) -> dict:
-    """What a summary says of the run itself."""
+def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
+    """The entries of a summary that describe the run: environment, gap, data, the method's options and the seed."""
+    of_h2o_plus = ("backbone", "mixing", "ratio")  # options that no other method reads
     return {
         "env": cfg.env.name,
         "gap": cfg.gap,
         "gap_fix": cfg.get("gap_fix"),
         "data": cfg.data,
         "transitions": len(real),
-        **({key: cfg[key] for key in H2O_PLUS_S} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
+        **({key: cfg[key] for key in of_h2o_plus} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
         "seed": cfg.seed,
     }
+
+
+def write_summary(directory: Path, summary: dict) -> None:
+    """Writes summary.json, with the versions and the command that made it."""
+    summary = summary | {
+        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
+        "command": shlex.join(["python", *sys.argv]),
+    }
+    (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def _commit() -> dict[str, str]:
+    """The commit of the library, if it runs from a repository. Changed result files do not count as changes."""
+    git = ["git", "-C", str(Path(__file__).parent)]
+    try:
+        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return {}
+    unchanged = [*git, "diff", "--quiet", "HEAD", "--", ":/", ":(exclude,top)recipes/results"]
+    dirty = "-dirty" * (subprocess.run(unchanged, check=False).returncode != 0)
+    return {"commit": commit.stdout.strip() + dirty}
+
+
+def table_of_run(
+    in_reality: Mapping[str, Evaluation], directory: Path, film: Path | None, seconds_per_step: float
+) -> str:
+    """Mean return and length of the episodes in reality, one line per policy, and the names of the files.
+
+    Args:
+        in_reality: evaluations by the name of the policy.
+        directory: the run's folder.
+        film: the film's file, if there is one.
+        seconds_per_step: control step, in s.
+    """
+    folder = os.path.relpath(directory)
+    lines = [
+        *_lines(in_reality, seconds_per_step),
+        f"\nresults    {folder}/summary.json, metrics.csv",
+        f"look at    {folder}/learning_curve.png" + (f", {film.name}" if film else ""),
+        f"replay     python recipes/evaluate.py checkpoint={folder}",
+    ]
+    return "\n".join(lines)
+
+
+def table_of_population(in_reality: Mapping[str, Evaluation | None], directory: Path, seconds_per_step: float) -> str:
+    """The same for a population, one line per member; None stands for a member that failed."""
+    folder = os.path.relpath(directory)
+    lines = [
+        *_lines(in_reality, seconds_per_step),
+        f"\nresults    {folder}/*/summary.json, metrics.csv, learning_curve.png",
+        f"replay     python recipes/evaluate.py checkpoint={folder}/{next(iter(in_reality))}",
+    ]
+    return "\n".join(lines)
+
+
+def _lines(in_reality: Mapping[str, Evaluation | None], seconds_per_step: float) -> list[str]:
+    width = max(24, *(len(name) + 2 for name in in_reality))
+    lines = [f"\n{'in reality':<{width}}{'return':>10}{'':>9}{'lasts':>10}{'episodes':>10}"]
+    for name, result in in_reality.items():
+        if result is None:
+            lines.append(f"{name:<{width}}{'failed':>10}")
+            continue
+        spread, seconds = f"± {result.std:.0f}", result.mean_length * seconds_per_step
+        lines.append(f"{name:<{width}}{result.mean:>10.0f}{spread:>9}{seconds:>8.1f} s{len(result.returns):>10}")
+    return lines

@@ -1,4 +1,4 @@
-"""What is trained, and one update of it: batches, losses, a step of the optimiser, a step of the targets."""
+"""A learner: networks, losses, optimiser and data, and one update of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,15 +20,15 @@ class Learner:
 
     Args:
         actor: the policy.
-        losses: by the name that a checkpoint gives them; each holds the networks that it trains.
+        losses: by their names in a checkpoint; each holds the networks that it trains.
         optimiser: of all of their parameters.
         targets: moves the target networks.
-        replay: where batches come from.
-        batch_sizes: of the batches of one update, (real, simulated) rows each.
-        terms_of: takes these batches; returns terms named ``loss_*``, to be added up, and figures to be logged.
-        figures: takes the same batches; returns what is logged beside the losses, and costs too much at every update.
-        pays_to_compile: whether ``terms_of`` is faster once it is compiled.
-        batches: those of the last update.
+        replay: the replay buffer.
+        batch_sizes: (real, simulated) rows of each batch of one update.
+        terms_of: function of these batches that returns terms named ``loss_*``, which are summed, and figures to log.
+        figures: function of the same batches that returns further figures, computed at evaluations only.
+        pays_to_compile: whether ``terms_of`` is faster when compiled.
+        batches: the batches of the last update.
     """
 
     actor: torch.nn.Module
@@ -47,7 +47,7 @@ class Learner:
         return [self.replay.sample(size) for size in self.batch_sizes]
 
     def update(self) -> dict[str, torch.Tensor]:
-        """One update of everything; returns what ``terms_of`` did."""
+        """Makes one update of all networks; returns the terms."""
         self.batches = self.sample()
         losses = self.terms_of(*self.batches)
         self.optimiser.zero_grad()
@@ -58,24 +58,24 @@ class Learner:
 
     @property
     def simulates(self) -> bool:
-        """Whether it needs a simulator: one that learns from real rows alone has no use for it."""
+        """Whether any batch has simulated rows."""
         return any(sim for _, sim in self.batch_sizes)
 
     @property
     def components(self) -> dict:
-        """What a checkpoint holds."""
+        """The contents of a checkpoint."""
         return {"actor": self.actor, **self.losses, "optimiser": self.optimiser, "replay": self.replay}
 
 
 def make_networks(
     cfg: DictConfig, observation_dim: int, action_spec: TensorSpec
 ) -> tuple[ProbabilisticActor, list[ValueOperator]]:
-    """The policy and the two Q of the run's seed, the same for every method."""
+    """Builds the policy and two Q networks from the run's seed, the same for every method."""
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
     return actor, [make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells) for _ in range(2)]
 
 
 def adam(*losses: LossModule, lr: float) -> torch.optim.Adam:
-    """One Adam for all parameters, in one pass over them."""
+    """Builds one fused Adam for the parameters of all losses."""
     return torch.optim.Adam([p for loss in losses for p in loss.parameters()], lr=lr, fused=True)

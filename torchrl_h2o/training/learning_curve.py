@@ -1,5 +1,6 @@
-"""The picture of a run: returns in reality over the updates, and what the discriminators see."""
+"""Draws the picture of a run: returns in reality over the updates, and the discriminators' accuracy."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -7,9 +8,9 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from omegaconf import DictConfig
 
 from torchrl_h2o.training.returns import Evaluation
+from torchrl_h2o.training.task import Task
 
 COLOURS = {
     "H2O+": "#0b6e4f",
@@ -27,15 +28,22 @@ BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13)
 
 
 class Trained(Protocol):
-    """What is told of a training when it is over."""
+    """A finished training: its metrics and its speed."""
 
     rows: list[dict]
     updates: int
     updates_per_second: float
 
 
-def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Evaluation, cfg: DictConfig) -> None:
-    """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line."""
+def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour: Evaluation, task: Task) -> None:
+    """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line.
+
+    Args:
+        path: of the PNG.
+        trainings: by method; the discriminators of the first are drawn.
+        behaviour: returns of the data's own episodes.
+        task: for the title and the length of episodes.
+    """
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained", width_ratios=(3, 2))
     for name, training in trainings.items():
         updates, mean, std = (
@@ -51,12 +59,12 @@ def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Ev
             lw=0,
         )
     top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour.mean])
-    if left.get_ylim()[0] < -abs(top):  # a robot that runs away loses without bound and would flatten all else
+    if left.get_ylim()[0] < -abs(top):  # unbounded negative returns would flatten the rest
         left.set_ylim(-0.25 * abs(top), 1.1 * top)
         left.text(0.01, 0.01, "returns below are cut off", transform=left.transAxes, fontsize=8, color="0.4")
-    left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=_label_of(behaviour, cfg))
-    gap = f", simulator with {cfg.gap}" if cfg.gap else ""
-    left.set(xlabel="updates", ylabel="return in reality", title=f"{cfg.env.name}{gap}")
+    left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=_label_of(behaviour, task))
+    gap = f", simulator with {task.gap}" if task.gap else ""
+    left.set(xlabel="updates", ylabel="return in reality", title=f"{task.name}{gap}")
     left.legend(**BELOW)
 
     _draw_discriminators(right, next(iter(trainings.values())).rows)
@@ -67,16 +75,16 @@ def draw_learning_curve(path: Path, trainings: dict[str, Trained], behaviour: Ev
     plt.close(figure)
 
 
-def _label_of(behaviour: Evaluation, cfg: DictConfig) -> str:
-    """Says how long the data's episodes are, where those of a policy end sooner and so can return less."""
-    longest = cfg.env.make.get("max_episode_steps")
+def _label_of(behaviour: Evaluation, task: Task) -> str:
+    """Label of the data's line, with the length of their episodes where a policy's episodes are limited to less."""
+    longest = task.max_episode_steps
     if longest is None or behaviour.mean_length <= longest:
         return "the data's behaviour"
-    return f"the data's behaviour (episodes of {behaviour.mean_length * cfg.env.seconds_per_step:.0f} s)"
+    return f"the data's behaviour (episodes of {behaviour.mean_length * task.seconds_per_step:.0f} s)"
 
 
 def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
-    """How well the discriminators tell the streams apart; nothing for a method that has none."""
+    """Accuracy of the discriminators and the mean ratio; an empty panel for a method without discriminators."""
     updates = [row["updates"] for row in rows]
     lines = [
         ("accuracy_sa", "o-", None, "accuracy on (s, a)"),

@@ -1,13 +1,13 @@
-"""The loop that every method goes through: simulate, update, look at it, again and again."""
+"""The training loop of every method in ``recipes/train.py``: collect, update, evaluate."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from copy import deepcopy
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -17,21 +17,22 @@ from torchrl.data import TensorSpec
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
-from torchrl_h2o.training.environments import as_observed, learning_reward, make_reality, make_simulator
+from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of
 from torchrl_h2o.training.learner import Learner
-from torchrl_h2o.training.returns import evaluate
-from torchrl_h2o.training.run_folder import Training, keeps_best, num_epochs
+from torchrl_h2o.training.progress import Budget, Training, epoch_seed
+from torchrl_h2o.training.returns import BestPolicy, evaluate
+from torchrl_h2o.training.run_folder import keeps_best
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
 
 
 @dataclass(frozen=True)
 class Method:
-    """What tells one method from another.
+    """A method of the comparison.
 
     Args:
-        title: what bars, tables and checkpoints call it.
-        make_learner: from the configuration, the size of the observation, the action's spec and the data.
+        title: its name in progress bars, tables and checkpoint folders.
+        make_learner: builds its learner from the configuration, the observation's size, the action's spec and the data.
     """
 
     title: str
@@ -39,19 +40,20 @@ class Method:
 
 
 class Trainee:
-    """A policy in training: what it learns with, its data, the simulator that it acts in, and how it is looked at.
+    """A learner with its environments: collects in the simulator, evaluates in reality.
 
-    One that learns from real data alone has no simulator: nothing is simulated, and no policy chosen there.
+    A learner without simulated batches has no simulator, so nothing is collected and no policy is chosen there.
 
     Args:
-        make_learner: from the configuration, the size of the observation, the action's spec and the data.
+        make_learner: see :class:`Method`.
         cfg: the run's configuration.
-        replay: its data, the real ones as the learner sees them. The networks are where it is; the simulator stays on
-            the CPU, with a copy of the policy.
+        replay: the data, preprocessed. The networks are on its device. Simulators stay on the CPU, with a copy of the
+            policy.
     """
 
     def __init__(self, make_learner: MakeLearner, cfg: DictConfig, replay: HybridReplayBuffer) -> None:
         self.cfg = cfg
+        self._preprocessing = preprocessing_of(cfg)
         self._reality = make_reality(cfg, cfg.eval_episodes)
         observation_dim = self._reality.observation_spec["observation"].shape[-1]
         with replay.device:
@@ -60,68 +62,64 @@ class Trainee:
         self._actor = self.learner.actor if replay.device.type == "cpu" else deepcopy(self.learner.actor).cpu()
         self.components = self.learner.components
         self._open = ExitStack()
-        self._collector = self._trials = None
+        self._collector = self._best = None
         if self.learner.simulates:
             simulator = make_simulator(cfg, cfg.num_worlds)
             self._collector = self._open.enter_context(collecting(cfg, simulator, self._actor, replay.keys))
             self._rollouts = iter(self._collector)
             if keeps_best(cfg):
-                self._trials = make_simulator(cfg, cfg.eval_episodes)
-                self.components["policy"] = deepcopy(self._actor)
+                self._best = BestPolicy(self._actor, make_simulator(cfg, cfg.eval_episodes), cfg.eval_episodes)
+                self.components["policy"] = self._best.policy
 
     @property
     def policy(self) -> torch.nn.Module:
-        """The one that ``keep`` asks for."""
-        return self.actor if self._trials is None else self.components["policy"]
+        """The policy that the run returns: the last, or the best in the simulator."""
+        return self.actor if self._best is None else self._best.policy
 
     @property
     def actor(self) -> torch.nn.Module:
-        """The policy that is trained, as it is now, where the simulator is."""
-        self._catch_up()
+        """The trained policy with its present parameters, on the CPU."""
+        self._copy_to_cpu()
         return self._actor
 
-    def _catch_up(self) -> None:
+    def _copy_to_cpu(self) -> None:
         if self._actor is not self.learner.actor:
             self._actor.load_state_dict(self.learner.actor.state_dict())
 
     def begin_epoch(self, epoch: int) -> None:
-        """Starts the epoch's random streams, torch's and the simulator's, and simulates its steps."""
-        seed = int(np.random.SeedSequence((self.cfg.seed, epoch)).generate_state(1)[0])
+        """Seeds the random streams of the epoch, torch's and the simulator's, and collects its transitions."""
+        seed = epoch_seed(self.cfg.seed, epoch)
         torch.manual_seed(seed)
         if self._collector is not None:
             self._collector.set_seed(seed % 2**31)
-            self._simulate()
+            self._collect()
 
-    def _simulate(self) -> None:
-        """An epoch's steps of the policy in the simulator, into the replay buffer."""
-        self._catch_up()
+    def _collect(self) -> None:
+        """Adds one epoch of the policy's transitions in the simulator to the replay buffer."""
+        self._copy_to_cpu()
         self._collector.update_policy_weights_()
         simulated = next(self._rollouts).reshape(-1)
-        simulated["next", "reward"] = learning_reward(self.cfg, simulated["next", "reward"])
+        simulated["next", "reward"] = self._preprocessing.reward(simulated["next", "reward"])
         self.learner.replay.extend(simulated)
 
     def look(self, rows: list[dict]) -> dict[str, float]:
-        """What the policy does now; takes it as the one to keep if it is the best in the simulator.
+        """Evaluates the present policy; keeps it if it is the best in the simulator so far.
 
         Args:
-            rows: what this gave before.
+            rows: metrics of the earlier evaluations.
         """
-        actor, promised = self.actor, {}
-        evaluation = evaluate(self._reality, actor, self.cfg.eval_episodes)
-        if self._trials is not None:
-            promised["return_sim"] = evaluate(self._trials, actor, self.cfg.eval_episodes).mean
-            if promised["return_sim"] >= max((row["return_sim"] for row in rows), default=-inf):
-                self.components["policy"].load_state_dict(actor.state_dict())
+        actor = self.actor
+        in_reality = evaluate(self._reality, actor, self.cfg.eval_episodes)
         return {
-            **promised,
-            "return_real": evaluation.mean,
-            "return_real_std": evaluation.std,
-            "length_real": evaluation.mean_length,
+            **({} if self._best is None else self._best.consider(actor, rows)),
+            "return_real": in_reality.mean,
+            "return_real_std": in_reality.std,
+            "length_real": in_reality.mean_length,
             **self.learner.figures(*self.learner.batches),
         }
 
     def close(self) -> None:
-        """Ends the collector's workers."""
+        """Ends the collector's worker processes."""
         self._open.close()
 
 
@@ -129,21 +127,22 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     """Trains one method.
 
     Args:
-        method: what it learns with.
+        method: what to train.
         cfg: the run's configuration.
-        real: the measured transitions.
+        real: the measured transitions, ``[T]``.
         directory: the run's folder.
 
     Returns:
-        The policy that ``keep`` asks for, and the training with its metrics.
+        The policy that ``keep`` selects, and the training with its metrics.
     """
-    real = as_observed(cfg, real)  # both streams show observations and rewards in the same way
+    real = preprocessing_of(cfg).apply(real)
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
-    trainee = Trainee(method.make_learner, cfg, replay)
+    trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
-    learner.terms_of = maybe_compiled(cfg, learner.terms_of, pays=learner.pays_to_compile)
-    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
-    training = Training(method.title, cfg, directory, **trainee.components, schedule=schedule)
+    compiled = cfg.get("compiled", False)  # configurations of earlier versions have no such entry
+    learner.terms_of = maybe_compiled(learner.terms_of, compiled, cfg.updates, pays=learner.pays_to_compile)
+    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
+    training = Training(method.title, directory, budget, **trainee.components, schedule=schedule)
     with closing(trainee):
         for epoch, evaluating in training.epochs():
             trainee.begin_epoch(epoch)

@@ -1,55 +1,67 @@
-"""The real transitions of a run: read from whatever ``data=`` names, or recorded once in ``env.reality`` and cached."""
+"""The real transitions of a run: read from a data set or a log, or recorded once in reality and cached."""
 
 import contextlib
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
 from torchrl_h2o import __version__
 from torchrl_h2o.data import DataError, check_specs, episodes, load, read_ted, write_ted
 from torchrl_h2o.envs import record
-from torchrl_h2o.training.environments import make_reality
 from torchrl_h2o.training.returns import Evaluation
 
 RECORDED = "recorded"
 
 
-def read_real_data(cfg: DictConfig) -> TensorDictBase:
-    """Real transitions in TED, ``[T]``, checked against the task.
+def read_real_data(
+    config: Mapping[str, Any], reality: EnvBase, data: str, columns: str | None = None
+) -> TensorDictBase:
+    """Reads real transitions in TED, ``[T]``, and checks them against the task.
+
+    Args:
+        config: the ``env`` section of a configuration, see :class:`~torchrl_h2o.training.task.Task`.
+        reality: one env of the task, with observations in their own units.
+        data: ``"recorded"``, or what :func:`torchrl_h2o.data.load` reads: a data set's name, a file or a folder.
+        columns: the YAML file that describes a log's columns; the task's own by default.
 
     Raises:
-        ValueError: for ``data=recorded`` where the environment has nobody to record.
+        ValueError: for ``"recorded"`` where the task has no controller to record.
         torchrl_h2o.data.DataError: for data that cannot be read or do not fit the task.
     """
-    if cfg.data == RECORDED:
-        return _recorded(cfg)
-    columns = cfg.columns
-    if columns is None and Path(cfg.data).is_file() and Path(cfg.data).suffix not in (".hdf5", ".h5"):
-        columns = cfg.env.get("columns")  # a log of this robot
-    reward = instantiate(cfg.env.reward) if "reward" in cfg.env else None
-    data = load(cfg.data, columns=columns, reward=reward, task=cfg.env.make.get("env_name", cfg.env.name))
-    check_specs(data, make_reality(cfg, raw=True), source=cfg.data)
-    return data
+    if data == RECORDED:
+        return _recorded(config, reality)
+    if columns is None and is_log(data):
+        columns = config.get("columns")
+    reward = instantiate(config["reward"]) if "reward" in config else None
+    real = load(data, columns=columns, reward=reward, task=config["make"].get("env_name", config["name"]))
+    check_specs(real, reality, source=data)
+    return real
 
 
-def _recorded(cfg: DictConfig) -> TensorDictBase:
-    if "behaviour" not in cfg.env:
+def is_log(data: str) -> bool:
+    """Whether ``data`` names a log, whose columns have to be described, and not a data set."""
+    return Path(data).is_file() and Path(data).suffix not in (".hdf5", ".h5")
+
+
+def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
+    if "behaviour" not in config:
         raise ValueError(
-            f"data=recorded needs a controller to record, and {cfg.env.name} has none: name a data set, "
+            f"data=recorded needs a controller to record, and {config['name']} has none: name a data set, "
             "such as data=halfcheetah/medium-replay-v0"
         )
-    env = OmegaConf.to_container(cfg.env, resolve=True)
-    made_of = [env[key] for key in ("make", "reality", "behaviour", "recording")]
+    made_of = [config[key] for key in ("make", "reality", "behaviour", "recording")]
     digest = hashlib.sha256(json.dumps([made_of, __version__], sort_keys=True).encode()).hexdigest()[:12]
-    folder = _cache() / f"{cfg.env.name}_{digest}"
+    folder = _cache() / f"{config['name']}_{digest}"
     if not folder.exists():
-        data = record(make_reality(cfg, raw=True), instantiate(cfg.env.behaviour), **cfg.env.recording)
-        with contextlib.suppress(DataError):  # another run, started at the same time, was faster
+        data = record(reality, instantiate(config["behaviour"]), **config["recording"])
+        with contextlib.suppress(DataError):  # another run may have written the folder in the meantime
             write_ted(data, folder)
     return read_ted(folder)
 
@@ -59,10 +71,16 @@ def _cache() -> Path:
     return Path(home) / "torchrl_h2o"
 
 
-def behaviour_in(cfg: DictConfig, data: TensorDictBase) -> Evaluation:
-    """Returns and lengths of the data's episodes; the one that our own recording cut off counts only if alone."""
-    whole = list(episodes(data))
-    if cfg.data == RECORDED and len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:
+def behaviour_of(real: TensorDictBase, *, recorded: bool) -> Evaluation:
+    """Returns and lengths of the data's own episodes.
+
+    Args:
+        real: the measured transitions, ``[T]``.
+        recorded: whether the data were recorded with ``data=recorded``, whose last episode is cut off by the number of
+            transitions and does not count unless it is the only one.
+    """
+    whole = list(episodes(real))
+    if recorded and len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:
         whole.pop()
     returns = [float(episode["next", "reward"].sum()) for episode in whole]
     return Evaluation(returns, [len(episode) for episode in whole])

@@ -1,19 +1,26 @@
-"""Evaluation of a policy: whole episodes with its deterministic actions, as many at once as the env has worlds."""
+"""Returns of a policy over whole episodes with deterministic actions."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
+from math import inf
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-SEED = 1_000_000  # of a table's first episode
+SEED = 1_000_000  # of the first episode of an evaluation
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Undiscounted returns and lengths (steps) of some episodes."""
+    """Undiscounted returns and lengths of episodes.
+
+    Args:
+        returns: one per episode, in units of the reward.
+        lengths: in control steps.
+    """
 
     returns: list[float]
     lengths: list[int]
@@ -37,12 +44,12 @@ class Evaluation:
 def evaluate(
     env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int, seed: int = SEED
 ) -> Evaluation:
-    """Runs whole episodes, the first from the given seed, without touching the run's own random streams.
+    """Runs whole episodes without changing the state of torch's global generator.
 
     Args:
-        env: one env, ``[]``, whose episodes follow each other, or N worlds, ``[N]``, with an episode each.
+        env: one env ``[]``, which runs one episode after another, or N worlds ``[N]``, which run one episode each.
         policy: writes ``action``.
-        episodes: how many.
+        episodes: number of episodes.
         seed: of the env.
     """
     returns, lengths = [], []
@@ -58,7 +65,7 @@ def evaluate(
 
 @torch.no_grad()
 def _run_episodes(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> tuple[list[float], list[int]]:
-    """An episode in each world: returns and lengths. Worlds that are done first go on, and count no more."""
+    """Runs one episode in each world. Worlds that end early keep stepping, and their further rewards do not count."""
     returns = torch.zeros(env.batch_size, dtype=torch.float64)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
     running = torch.ones(env.batch_size, dtype=torch.bool)
@@ -73,6 +80,35 @@ def _run_episodes(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBas
 
 @torch.no_grad()
 def run_episode(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], max_steps: int = 100_000):
-    """One episode to its end, ``[T]``."""
+    """Runs one episode to its end and returns its transitions, ``[T]``."""
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return env.rollout(max_steps, policy, auto_cast_to_device=False)
+
+
+class BestPolicy:
+    """Keeps the parameters of an actor at the evaluation with the highest return in the simulator.
+
+    Args:
+        actor: the policy that is trained; it is copied.
+        simulator: the environment of the evaluations.
+        episodes: number of episodes of an evaluation.
+    """
+
+    def __init__(self, actor: torch.nn.Module, simulator: EnvBase, episodes: int) -> None:
+        self.policy = deepcopy(actor)
+        self.simulator, self.episodes = simulator, episodes
+
+    def consider(self, actor: torch.nn.Module, rows: list[dict]) -> dict[str, float]:
+        """Evaluates the actor in the simulator and keeps it if no earlier evaluation was better.
+
+        Args:
+            actor: the policy as it is now.
+            rows: metrics of the earlier evaluations, with ``return_sim``.
+
+        Returns:
+            The mean return, as ``return_sim``.
+        """
+        return_sim = evaluate(self.simulator, actor, self.episodes).mean
+        if return_sim >= max((row["return_sim"] for row in rows), default=-inf):
+            self.policy.load_state_dict(actor.state_dict())
+        return {"return_sim": return_sim}

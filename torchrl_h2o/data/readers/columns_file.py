@@ -1,6 +1,6 @@
-"""Read a log's layout from a small YAML, and name the entry that is wrong.
+"""Read a log's layout from a YAML file, with errors that name the wrong entry.
 
-YAML 1.1 has traps: ``on`` is true, ``5e-3`` is a text, and of two equal keys the last one wins.
+Three rules of YAML 1.1 need checks: ``on`` is true, ``5e-3`` is a string, and the last of two equal keys wins.
 """
 
 from __future__ import annotations
@@ -8,26 +8,32 @@ from __future__ import annotations
 from dataclasses import fields
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
 from torchrl_h2o.data.readers.error import DataError
-from torchrl_h2o.data.readers.log_columns import Column, LogColumns
+
+Layout = TypeVar("Layout")
 
 
-def read_columns(source: str | Path) -> LogColumns:
-    """Read a layout; see :meth:`LogColumns.load`.
+def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layout:
+    """Read a YAML file into a dataclass whose field ``columns`` is a tuple of another dataclass.
+
+    Both classes are arguments, so that :class:`LogColumns` can call this function without an import circle.
 
     Args:
         source: a YAML file, or the name of one in the package.
+        layout: the class of the layout, :class:`LogColumns`.
+        column: the class of a column, :class:`Column`, with the field ``name``.
 
     Raises:
-        DataError: no such file, no YAML, an unknown, doubled or wrong entry, a contradiction.
+        DataError: a missing file, invalid YAML, an unknown, duplicate or invalid entry, or contradicting entries.
 
     Example:
-        >>> from torchrl_h2o.data.readers.columns_file import read_columns
-        >>> read_columns("simple_pendulum").action
+        >>> from torchrl_h2o.data.readers.columns_file import read_layout
+        >>> from torchrl_h2o.data.readers.log_columns import Column, LogColumns
+        >>> read_layout("simple_pendulum", LogColumns, Column).action
         ('torque',)
     """
     path = _find(source)
@@ -38,14 +44,14 @@ def read_columns(source: str | Path) -> LogColumns:
         raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DataError(f"no YAML: {error}", "correct it", source=source) from error
-    known = _known_entries(LogColumns, entries, source)
+    known = _known_entries(layout, entries, source)
     if not isinstance(known.get("columns"), list) or not known["columns"]:
         raise DataError("'columns' is no list", "list the file's columns", source=source)
     columns = tuple(
-        _build(Column, {"name": f"column {number}", **_known_entries(Column, entry, source)}, source)
+        _build_column(column, {"name": f"column {number}", **_known_entries(column, entry, source)}, source)
         for number, entry in enumerate(known["columns"], start=1)
     )
-    return _build(LogColumns, {**known, "columns": columns}, source)
+    return _build(layout, {**known, "columns": columns}, source)
 
 
 class _Loader(yaml.SafeLoader):
@@ -88,7 +94,11 @@ def _known_entries(kind: type, entries: Any, source: str | Path) -> dict[str, An
     return entries
 
 
-def _build(kind: type, entries: dict[str, Any], source: str | Path) -> Any:
+def _build_column(kind: type, entries: dict[str, Any], source: str | Path) -> Any:
+    return _build(kind, entries, source, column=str(entries["name"]))
+
+
+def _build(kind: type, entries: dict[str, Any], source: str | Path, column: str | None = None) -> Any:
     convert = {
         "dt": lambda name, value: None if value is None else _number(name, value),
         "scale": _number,
@@ -97,7 +107,6 @@ def _build(kind: type, entries: dict[str, Any], source: str | Path) -> Any:
         "observation": _names,
         "action": _names,
     }
-    column = str(entries["name"]) if kind is Column else None
     try:
         values = {name: convert[name](name, value) if name in convert else value for name, value in entries.items()}
         return kind(**values)

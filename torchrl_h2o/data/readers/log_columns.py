@@ -176,7 +176,7 @@ class LogColumns:
             >>> LogColumns.load("wheel_legged_standing_still").observation
             ('theta', 'theta_dot', 'x', 'v')
         """
-        # here: that file imports this one, and yaml, which a layout in code does without
-        from torchrl_h2o.data.readers.columns_file import read_columns
+        # imported here, because a layout written in code does not need yaml
+        from torchrl_h2o.data.readers.columns_file import read_layout
 
-        return read_columns(source)
+        return read_layout(source, cls, Column)

@@ -17,14 +17,19 @@ from torchrl import torchrl_logger
 from torchrl_h2o.data.readers.error import DataError, require_finite
 from torchrl_h2o.data.readers.log_columns import LogColumns
 from torchrl_h2o.data.readers.log_table import LogTable, read_table
+from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.ted import to_ted
-
-_DT_TOLERANCE = 0.02  # of dt: what a clock may be off; rows that were left out by rule are off by more
 
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-def read_robot_log(path: str | Path, columns: LogColumns | str | Path, *, reward: Reward | None = None) -> TensorDict:
+def read_robot_log(
+    path: str | Path,
+    columns: LogColumns | str | Path,
+    *,
+    reward: Reward | None = None,
+    settings: ReaderSettings = READER_SETTINGS,
+) -> TensorDict:
     """Read a log with the meaning of its columns.
 
     How many rows were left out and how many actions were clipped is logged. The first row with
@@ -57,7 +62,7 @@ def read_robot_log(path: str | Path, columns: LogColumns | str | Path, *, reward
     layout = columns if isinstance(columns, LogColumns) else LogColumns.load(columns)
     table = read_table(path, layout)
     observation, action = table.columns(layout.observation), table.columns(layout.action)
-    links = _link_rows(table, layout)
+    links = _link_rows(table, layout, settings)
     action, clipped = _bounded(action, links.start, table, layout)
     observed, acted = observation[links.start], action[links.start]
     following = observation[links.start + 1]
@@ -88,13 +93,13 @@ class _Links:
     dropped: int
 
 
-def _link_rows(table: LogTable, layout: LogColumns) -> _Links:
+def _link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> _Links:
     done = _done(table, layout)
     linked = ~done[:-1]
     _require_declared_restart(table, layout, done)
     if layout.after_done == "drop" and done.any():
         linked[np.argmax(done) :] = False
-    linked &= ~_jumps(table, layout, linked)
+    linked &= ~_jumps(table, layout, linked, settings)
     start = np.flatnonzero(linked)
     if not len(start):
         raise DataError(
@@ -138,7 +143,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndar
         )
 
 
-def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray) -> np.ndarray:
+def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings) -> np.ndarray:
     """Where the time between two linked rows is not dt; an error unless a split is asked for."""
     column = layout.named("time")
     if column is None:
@@ -156,7 +161,7 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray) -> np.ndarra
             row=table.rows[index + 1],
             **place,
         )
-    dt = _dt(steps[linked], layout, place)
+    dt = _dt(steps[linked], layout, place, settings)
     jumps = linked & (np.abs(steps - dt) > layout.time_tolerance * dt)
     if jumps.any() and layout.on_time_jump == "error":
         index = np.argmax(jumps)
@@ -169,15 +174,15 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray) -> np.ndarra
     return jumps
 
 
-def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, str]) -> float:
+def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, str], settings: ReaderSettings) -> float:
     """The layout's dt, held against the time between linked rows; without one, the median time."""
     if layout.dt is None or not len(steps):
         return float(np.median(steps)) if len(steps) else 0.0
     median = float(np.median(steps))
     # a clock that counts in ms gives 3, 3, 4 at 300 Hz: there the mean is right, without the gaps
-    mean = float(np.mean(steps[steps <= 2 * median]))
+    mean = float(np.mean(steps[steps <= settings.longest_regular_step * median]))
     # time_tolerance is for single late rows: it would let dt be wrong throughout
-    if min(abs(median - layout.dt), abs(mean - layout.dt)) > _DT_TOLERANCE * layout.dt:
+    if min(abs(median - layout.dt), abs(mean - layout.dt)) > settings.clock_tolerance * layout.dt:
         raise DataError(
             f"the median time step is {median:.9g} s, dt is {layout.dt:.9g} s",
             "correct dt or the unit of time, or leave dt out to take the median",

@@ -10,21 +10,28 @@ from tensordict import TensorDictBase
 from torchrl import torchrl_logger
 
 from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.ted import require_ted
 
 if TYPE_CHECKING:
+    from torchrl.data import TensorSpec
     from torchrl.envs import EnvBase
 
-_ROUNDING = 1e-6  # of the bound: float32 keeps 1 + 1e-7 of a recording in float64
 
-
-def check_specs(td: TensorDictBase, env: EnvBase, *, source: str | Path = "transitions") -> None:
+def check_specs(
+    td: TensorDictBase,
+    env: EnvBase,
+    *,
+    source: str | Path = "transitions",
+    settings: ReaderSettings = READER_SETTINGS,
+) -> None:
     """Check that transitions could have come from an environment.
 
     Args:
         td: flat TED transitions, batch size [T].
         env: a TorchRL environment with the entries ``observation`` and ``action``.
-        source: what to call the data in errors.
+        source: name of the data in errors.
+        settings: the tolerance of the action bounds.
 
     Raises:
         DataError: another number of dimensions, another kind of number, an action outside the
@@ -72,7 +79,7 @@ def check_specs(td: TensorDictBase, env: EnvBase, *, source: str | Path = "trans
                 source=source,
                 column=key,
             )
-    _require_bounds(td["action"], specs["action"]["action"], source)
+    _require_bounds(td["action"], specs["action"]["action"], source, settings.bound_rounding)
 
 
 def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
@@ -86,12 +93,12 @@ def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
         torchrl_logger.warning(f"{source} does not say which task it was recorded in: not checked to be {task}")
 
 
-def _require_bounds(action: torch.Tensor, spec, source: str | Path) -> None:
+def _require_bounds(action: torch.Tensor, spec: TensorSpec, source: str | Path, rounding: float) -> None:
     low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
     if low is None or high is None:  # unbounded or discrete
         return
     low, high = low.to(action.dtype), high.to(action.dtype)
-    outside = (action < low - _ROUNDING * low.abs()) | (action > high + _ROUNDING * high.abs())
+    outside = (action < low - rounding * low.abs()) | (action > high + rounding * high.abs())
     if not outside.any():
         return
     row, *position = outside.nonzero()[0].tolist()

@@ -15,14 +15,9 @@ from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.catalogue.choices import indexed_choices
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
 from torchrl_h2o.effects.catalogue.mechanism import Mechanism
-from torchrl_h2o.effects.catalogue.model_entries import (
-    FACTORS,
-    body_entries,
-    force_entries,
-    geom_entries,
-    joint_entries,
-)
-from torchrl_h2o.effects.effect import ModelEffect, compile_model
+from torchrl_h2o.effects.catalogue.model_entries import body_entries, force_entries, geom_entries, joint_entries
+from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
 from torchrl_h2o.effects.model.timestep import Timestep
 from torchrl_h2o.effects.observation.sensor import (
@@ -31,15 +26,19 @@ from torchrl_h2o.effects.observation.sensor import (
     ObservationGain,
     ObservationNoise,
 )
+from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
 
 
-def catalogue(spec: mujoco.MjSpec, *, num_observations: int, dt: float) -> tuple[CatalogueEntry, ...]:
+def catalogue(
+    spec: mujoco.MjSpec, *, num_observations: int, dt: float, settings: EffectSettings = EFFECT_SETTINGS
+) -> tuple[CatalogueEntry, ...]:
     """The effects that a simulator of a model could lack, with values to start their fits from.
 
     Args:
         spec: the model's specification, which is left as it is.
         num_observations: how many entries an observation has, 0 to leave the sensors out.
         dt: the control step, in s.
+        settings: sizes of the trials.
 
     Returns:
         The entries; no two of them have the same effect.
@@ -59,7 +58,7 @@ def catalogue(spec: mujoco.MjSpec, *, num_observations: int, dt: float) -> tuple
     if num_observations < 0:
         raise ValueError(f"num_observations = {num_observations} is negative; give 0 to leave the sensors out")
     model = compile_model(spec.copy())
-    mechanism = Mechanism(model)
+    mechanism = Mechanism(model, settings)
     entries = [
         *_world_entries(mechanism),
         *body_entries(mechanism),
@@ -76,7 +75,7 @@ def catalogue(spec: mujoco.MjSpec, *, num_observations: int, dt: float) -> tuple
 def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     model = mechanism.model
     if mechanism.weight:
-        yield CatalogueEntry(Gravity(), each("scale", *FACTORS))
+        yield CatalogueEntry(Gravity(), each("scale", *mechanism.settings.factors))
         planar = all(mechanism.planar(body) for body in range(1, model.nbody))
         spatial = tuple({"pitch": pitch, "roll": roll} for pitch in (0.1, -0.1) for roll in (0.1, -0.1))
         yield CatalogueEntry(GravityTilt(), each("pitch", 0.1, -0.1) if planar else spatial)
@@ -99,7 +98,10 @@ def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]
     single_and_all = indexed_choices(labels)
     singles = {chosen: indices for chosen, indices in single_and_all.items() if len(indices) == 1}
     yield from entries_of(
-        ActionGain, "actuators", indexed_choices(labels, groups=True), lambda _: each("scale", *FACTORS)
+        ActionGain,
+        "actuators",
+        indexed_choices(labels, groups=True),
+        lambda _: each("scale", *mechanism.settings.factors),
     )
     yield from entries_of(ActionBias, "actuators", singles, shares("bias", 0.1, -0.1))
     yield from entries_of(ActionDeadBand, "actuators", single_and_all, shares("width", 0.03, 0.15))

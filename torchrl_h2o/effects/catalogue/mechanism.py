@@ -6,11 +6,12 @@ Which joints carry a floating root, what moves in one plane, what can touch, and
 import mujoco
 import numpy as np
 
+from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
+
 # as integers: MuJoCo's own constants are not found in tuples by the integers that a model holds
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _ROUND = tuple(int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("SPHERE", "CYLINDER", "ELLIPSOID"))
-_LEVER = 0.1  # m; the weight at this lever is the torque of a joint without an actuator
 
 
 class Mechanism:
@@ -18,10 +19,12 @@ class Mechanism:
 
     Args:
         model: the compiled model.
+        settings: the lever arm for torques without an actuator, and the scales of the trials.
     """
 
-    def __init__(self, model: mujoco.MjModel):
+    def __init__(self, model: mujoco.MjModel, settings: EffectSettings = EFFECT_SETTINGS):
         self.model = model
+        self.settings = settings
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._axes = data.xaxis.copy()
@@ -58,8 +61,9 @@ class Mechanism:
             first = self.model.body_jntadr[body]
             for joint in range(first, first + self.model.body_jntnum[body]):
                 along_y = abs(self._axes[joint][1])
+                aligned = self.settings.aligned
                 kind = self.model.jnt_type[joint]
-                if not ((kind == _HINGE and along_y > 0.999) or (kind == _SLIDE and along_y < 0.001)):
+                if not ((kind == _HINGE and along_y > 1.0 - aligned) or (kind == _SLIDE and along_y < aligned)):
                     return False
             body = self.model.body_parentid[body]
         return True
@@ -85,7 +89,7 @@ class Mechanism:
         for actuator, target in enumerate(self._joint_of_actuators()):
             if target == joint:
                 largest += abs(self.model.actuator_gear[actuator, 0]) * self.control(actuator)
-        lever = _LEVER if self.model.jnt_type[joint] == _HINGE else 1.0
+        lever = self.settings.lever if self.model.jnt_type[joint] == _HINGE else 1.0
         return largest or self.weight * lever or 1.0
 
     def control(self, actuator: int) -> float:

@@ -11,16 +11,14 @@ import numpy as np
 from torchrl_h2o.effects.catalogue.choices import named_choices
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
 from torchrl_h2o.effects.catalogue.mechanism import Mechanism
-from torchrl_h2o.effects.effect import compile_model
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
+from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
 from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
 from torchrl_h2o.effects.model.joint import Armature, JointDamping, JointFrictionLoss, JointRange
 from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
 from torchrl_h2o.effects.selection import Names
-
-FACTORS = (0.5, 0.8, 1.25, 2.0)
 
 Choices = dict[Names, tuple[int, ...]]
 
@@ -32,9 +30,9 @@ def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     paths = _body_paths(model)
     # indices without the world, as the patterns for bodies count
     eligible, massless = [b - 1 for b in heavy], set(range(model.nbody - 1)) - {b - 1 for b in heavy}
-    yield from _factors(BodyMass, "bodies", named_choices(paths, eligible, passed_over=massless))
+    yield from _factors(mechanism, BodyMass, "bodies", named_choices(paths, eligible, passed_over=massless))
     singles = named_choices(paths, eligible, groups=False)
-    yield from _factors(BodyInertia, "bodies", singles)
+    yield from _factors(mechanism, BodyInertia, "bodies", singles)
     yield from entries_of(BodyCentreOfMass, "bodies", singles, lambda chosen: _shifts(mechanism, chosen[0] + 1))
     # what carries something is a trunk or the end of a limb
     carrying = {
@@ -57,8 +55,8 @@ def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         return named_choices(_joint_paths(model), joints, passed_over=passed_over, groups=groups)
 
     everything = set(range(model.njnt))
-    yield from _factors(JointRange, "joints", chosen(limited, everything - set(limited)))
-    yield from _factors(JointStiffness, "joints", chosen(sprung, everything - set(sprung)))
+    yield from _factors(mechanism, JointRange, "joints", chosen(limited, everything - set(limited)))
+    yield from _factors(mechanism, JointStiffness, "joints", chosen(sprung, everything - set(sprung)))
     yield from entries_of(JointRest, "joints", chosen(sprung, groups=False), lambda _: each("angle", 0.1, -0.1))
     yield from entries_of(JointSpring, "joints", chosen(loose), _added(mechanism.torque, "stiffness", (0.1, 1.0)))
     dampings = _added(lambda j: mechanism.inertia(j) / 0.1, "damping", (0.1, 1.0), _own(model, "dof_damping"))
@@ -75,27 +73,29 @@ def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[Catalogu
     everything, touching = set(range(model.ngeom)), sorted({geom for pair in pairs for geom in pair})
     moving = [g for g in everything if model.body_weldid[model.geom_bodyid[g]]]
     planes = {g for g in everything if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE}
-    weighing = _weighing(model, spec, [g for g in moving if g not in touching])
+    weighing = _weighing(mechanism, spec, [g for g in moving if g not in touching])
 
     def chosen(geoms: Collection[int], passed_over: Collection[int] = (), groups: bool = True) -> Choices:
         return named_choices(_geom_paths(model), sorted(geoms), passed_over=passed_over, groups=groups)
 
     shaped = [g for g in moving if g in touching or g in weighing]
     hidden = everything - set(touching) - weighing
-    yield from _factors(GeomSize, "geoms", chosen(shaped, hidden | planes))
+    yield from _factors(mechanism, GeomSize, "geoms", chosen(shaped, hidden | planes))
     spanned = {geom.name for geom in spec.geoms if not np.isnan(geom.fromto[0])}
     lengthy = {g for g in shaped if model.geom(g).name in spanned}
-    yield from _factors(GeomLength, "geoms", chosen(lengthy, everything - lengthy))
+    yield from _factors(mechanism, GeomLength, "geoms", chosen(lengthy, everything - lengthy))
     rubbing = chosen(touching, everything - set(touching))
     own = {names: geoms for names, geoms in rubbing.items() if len(geoms) > 1 or geoms[0] in moving}
     yield from entries_of(
         GeomFriction,
         "geoms",
         own,
-        lambda geoms: each("scale", *(factor for factor in FACTORS if _rubs_otherwise(model, pairs, geoms, factor))),
+        lambda geoms: each(
+            "scale", *(factor for factor in mechanism.settings.factors if _rubs_otherwise(model, pairs, geoms, factor))
+        ),
     )
     together = {names: geoms for names, geoms in rubbing.items() if len(geoms) > 1}
-    yield from _factors(ContactSoftness, "geoms", together)
+    yield from _factors(mechanism, ContactSoftness, "geoms", together)
     rolling = [g for g in touching if mechanism.wheel(g)]
     yield from entries_of(
         RollingResistance,
@@ -124,8 +124,8 @@ def force_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         )
 
 
-def _factors(effect: type, field: str, choices: Choices) -> Iterator[CatalogueEntry]:
-    return entries_of(effect, field, choices, lambda _: each("scale", *FACTORS))
+def _factors(mechanism: Mechanism, effect: type, field: str, choices: Choices) -> Iterator[CatalogueEntry]:
+    return entries_of(effect, field, choices, lambda _: each("scale", *mechanism.settings.factors))
 
 
 def _shifts(mechanism: Mechanism, body: int) -> Trials:
@@ -164,14 +164,14 @@ def _own(model: mujoco.MjModel, field: str) -> Callable[[int], float]:
     return lambda joint: float(np.ravel(getattr(model, field)[model.jnt_dofadr[joint]])[0])
 
 
-def _weighing(model: mujoco.MjModel, spec: mujoco.MjSpec, geoms: Sequence[int]) -> set[int]:
-    """Of the geoms, those whose size the inertia of a body follows from."""
-    found = set()
+def _weighing(mechanism: Mechanism, spec: mujoco.MjSpec, geoms: Sequence[int]) -> set[int]:
+    """Returns the geoms whose size changes the inertia of a body."""
+    model, found = mechanism.model, set()
     for geom in geoms:
         if not model.geom(geom).name:
             continue
         larger = compile_model(spec.copy(), [GeomSize(1.5, geoms=model.geom(geom).name)])
-        if not np.allclose(larger.body_inertia, model.body_inertia, rtol=1e-9, atol=0.0):
+        if not np.allclose(larger.body_inertia, model.body_inertia, rtol=mechanism.settings.inertia_change, atol=0.0):
             found.add(geom)
     return found
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import compile_model
+from torchrl_h2o.effects.model.compilation import compile_model
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_h2o.effects import Effect, ForceEffect, compile_model
+from torchrl_h2o.effects import Effect, ForceEffect, Pipeline, compile_model
 from torchrl_h2o.effects.effect import Force
-from torchrl_h2o.envs.episode import Episodes
+from torchrl_h2o.envs.episode import GapEpisodes
 
 _SIZES = ("nq", "nv", "nu", "na", "nbody", "njnt", "ngeom", "nsite", "nsensor")
 
 
-class Simulator(ABC):
+class MujocoBackend(ABC):
     """The simulation inside one env: its model, and how to put another one in.
 
     The gaps that are in a simulation, and their episodes, are remembered on the object that owns the
@@ -77,9 +77,9 @@ class Simulator(ABC):
         return getattr(self.owner, "_dynamics_gaps", {})
 
     @property
-    def episodes(self) -> Episodes:
+    def episodes(self) -> GapEpisodes:
         """The present episode of every gap, under what stands for the gap."""
-        return self.owner.__dict__.setdefault("_dynamics_gap_episodes", Episodes())
+        return self.owner.__dict__.setdefault("_dynamics_gap_episodes", GapEpisodes())
 
     def apply(self, gap: object, on_env: Mapping[object, Sequence[Effect]]) -> None:
         """Puts a gap in, after those that are in already; does nothing if it is one of them.
@@ -105,13 +105,13 @@ class Simulator(ABC):
         if not applied:
             self._check_source([effect for effects in on_env.values() for effect in effects])
         applied = {**applied, gap: tuple(on_env[gap])}
-        everything = [effect for effects in applied.values() for effect in effects]
-        model = compile_model(self.spec(), everything)
+        pipeline = Pipeline(tuple(effect for effects in applied.values() for effect in effects))
+        model = pipeline.compile(self.spec())
         self.check_sizes(model)
         model.vis.global_.offwidth = self.model.vis.global_.offwidth
         model.vis.global_.offheight = self.model.vis.global_.offheight
         self.load(model)
-        if any(isinstance(effect, ForceEffect) and not effect.is_neutral for effect in everything):
+        if pipeline.of_kind(ForceEffect):
             self.push()
         self.owner._dynamics_gaps = applied
 
@@ -165,7 +165,7 @@ class Simulator(ABC):
     def _forces(self) -> list[Force]:
         # in the order of the gaps, not of their resets, because a sum is rounded in its order
         episodes = self.episodes
-        return [force for gap in self.gaps if gap in episodes for force in episodes[gap].forces]
+        return [force for gap in self.gaps if gap in episodes for force in episodes[gap].effects.forces]
 
 
 def _bytes(model: mujoco.MjModel) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import mujoco
 from torchrl.envs import DMControlWrapper, EnvBase
 
-from torchrl_h2o.envs.backends.backend import Simulator
+from torchrl_h2o.envs.backends.backend import MujocoBackend
 
 if TYPE_CHECKING:
     from dm_control.mujoco import Physics
@@ -24,13 +24,13 @@ _WRITTEN_AT_RESET = {
 }
 
 
-class DMControlSimulator(Simulator):
+class DMControlBackend(MujocoBackend):
     """A dm_control ``Physics``, whose model comes from the module of the task."""
 
     owner: Physics
 
     @classmethod
-    def inside(cls, env: EnvBase) -> DMControlSimulator | None:
+    def inside(cls, env: EnvBase) -> DMControlBackend | None:
         """The simulation inside an env without transforms, None if there is none of this kind."""
         return cls(env._env.physics, env) if isinstance(env, DMControlWrapper) else None
 

@@ -8,19 +8,19 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase, GymWrapper
 
-from torchrl_h2o.envs.backends.backend import Simulator
+from torchrl_h2o.envs.backends.backend import MujocoBackend
 
 if TYPE_CHECKING:
     from gymnasium.envs.mujoco import MujocoEnv
 
 
-class GymnasiumSimulator(Simulator):
+class GymnasiumBackend(MujocoBackend):
     """A :class:`gymnasium.envs.mujoco.MujocoEnv`, whose model comes from the file ``fullpath``."""
 
     owner: MujocoEnv
 
     @classmethod
-    def inside(cls, env: EnvBase) -> GymnasiumSimulator | None:
+    def inside(cls, env: EnvBase) -> GymnasiumBackend | None:
         """The simulation inside an env without transforms, None if there is none of this kind."""
         if not isinstance(env, GymWrapper):
             return None

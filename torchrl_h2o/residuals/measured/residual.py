@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.effects import ObservationEffect
 from torchrl_h2o.residuals.measured.measured import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -41,11 +40,7 @@ def residuals(
     reached = simulation.rollout(
         states[starts], executed_actions(simulation, measured, rng)[rows], time=measured.time[starts], applied=applied
     )
-    observed = simulation.state_map.observations(reached)
-    for effect in simulation.effects:
-        if isinstance(effect, ObservationEffect) and effect.memoryless and not effect.is_neutral and not effect.random:
-            observed = effect.process(simulation.control_step, None)(observed)
-    return _undelayed(simulation, measured)[rows] - observed
+    return _undelayed(simulation, measured)[rows] - simulation.observed(reached)
 
 
 def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | None = None) -> np.ndarray:

@@ -1,42 +1,39 @@
-"""An MJCF file as a simulation that tracing can step: its file, its control step, and the names of what is observed."""
+"""Reads an MJCF file, the names of its observed coordinates and its control step into a simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
 import mujoco
 
 from torchrl_h2o.effects import Effect, compile_model
-from torchrl_h2o.residuals.simulation.observability import with_hidden_states
-from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
+from torchrl_h2o.residuals.simulation.source import SimulatorSource
 from torchrl_h2o.residuals.simulation.state_map import StateMap, coordinate_names
 
-_CLOCK = 0.01  # of the control step: what clocks may be off
 
-
-def simulation_of(
-    path: Path,
+def source_of_mjcf(
+    path: str | Path,
     state_map: StateMap | Mapping[str, str] | Sequence[str],
     control_step: float,
     effects: Sequence[Effect] = (),
-    cls: type[Simulation] = Simulation,
-) -> Simulation:
-    """The simulation of an MJCF file; see :meth:`Simulation.from_mjcf`.
+    settings: SimulationSettings = SIMULATION_SETTINGS,
+) -> SimulatorSource:
+    """Reads the simulator of an MJCF file; see :meth:`Simulation.from_mjcf`.
 
     Args:
-        path: of the file.
-        state_map: a map; or the coordinates that are observed, in the order of the data; or, for data whose columns
-            have names of their own, the coordinate of each column: ``{"theta": "pitch", "theta_dot":
-            "pitch_velocity"}``.
+        path: the file.
+        state_map: a map; or the observed coordinates, in the order of the data; or, for data whose columns have
+            names of their own, the coordinate of each column: ``{"theta": "pitch", "theta_dot": "pitch_velocity"}``.
         control_step: the time between two rows of the data, in s.
-        effects: put into it.
-        cls: the class of what is returned.
+        effects: effects to put into the simulator.
+        settings: the tolerance of the control step.
 
     Raises:
-        ValueError: for a file that is no model, names that it does not have, or a control step that is no multiple of
-            its timestep.
+        ValueError: for a file that is no model, names that the model does not have, or a control step that is no
+            multiple of its timestep.
     """
     path = Path(path)
 
@@ -51,11 +48,11 @@ def simulation_of(
             f"the state map is for {state_map.observe.shape[1]} coordinates, {path} has {model.nq} positions and "
             f"{model.nv} velocities"
         )
-    frame_skip = _frame_skip(control_step, model.opt.timestep, path)
-    return with_hidden_states(cls(spec, frame_skip, state_map, tuple(effects), name=path.stem))
+    frame_skip = _frame_skip(control_step, model.opt.timestep, settings.clock_tolerance, path)
+    return SimulatorSource(spec, frame_skip, state_map, tuple(effects), path.stem)
 
 
-def _compiled(path: Path, spec) -> mujoco.MjModel:
+def _compiled(path: Path, spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
     if not path.is_file():
         raise ValueError(f"there is no file {path}; give the path of an MJCF file")
     try:
@@ -65,7 +62,7 @@ def _compiled(path: Path, spec) -> mujoco.MjModel:
 
 
 def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjModel, path: Path) -> StateMap:
-    """The map of observed coordinates; what is not observed stands as in the model's own pose."""
+    """Builds the map of the observed coordinates; unobserved ones keep the value of the model's initial pose."""
     columns = list(coordinates)
     chosen = [coordinates[column] for column in columns] if isinstance(coordinates, Mapping) else columns
     names, units = coordinate_names(model)
@@ -74,8 +71,7 @@ def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjMode
             close = get_close_matches(str(coordinate), names, 1)
             raise ValueError(
                 f"{path} has no coordinate {coordinate!r}{f', but {close[0]!r}' if close else ''}: it has "
-                f"{', '.join(names)}. Where a column of the data has another name, say which it is: "
-                "{'theta': 'pitch'}"
+                f"{', '.join(names)}. Map a column with another name to its coordinate: {{'theta': 'pitch'}}"
             )
     twice = {coordinate for coordinate in chosen if chosen.count(coordinate) > 1}
     if twice:
@@ -87,9 +83,9 @@ def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjMode
     return found
 
 
-def _frame_skip(control_step: float, timestep: float, path: Path) -> int:
+def _frame_skip(control_step: float, timestep: float, tolerance: float, path: Path) -> int:
     frame_skip = round(control_step / timestep) if control_step > 0.0 else 0
-    if frame_skip < 1 or abs(frame_skip * timestep - control_step) > _CLOCK * control_step:
+    if frame_skip < 1 or abs(frame_skip * timestep - control_step) > tolerance * control_step:
         fitting = control_step / max(1, -(-control_step // timestep)) if control_step > 0.0 else None
         advice = f"set timestep={fitting:.6g} in the file's <option>" if fitting else "give the time between two rows"
         raise ValueError(

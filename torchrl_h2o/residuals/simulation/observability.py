@@ -1,39 +1,46 @@
-"""Which coordinates of the state nobody observes, though they matter: found by moving them and stepping."""
+"""Finds the coordinates of the state that are not observed but change later observations."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_NUDGE = 0.05  # m, rad, m/s or rad/s
-_MATTERS = 1e-6  # of a change of what is observed one step later
+from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
+from torchrl_h2o.residuals.simulation.state_map import StateMap
 
 
-def with_hidden_states(simulation: Simulation) -> Simulation:
-    """The simulation with those coordinates named as hidden that are not observed, but change what is.
+def hidden_coordinates(
+    state_map: StateMap,
+    num_actuators: int,
+    rollout: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    settings: SimulationSettings = SIMULATION_SETTINGS,
+) -> tuple[int, ...]:
+    """Returns the indices of the unobserved coordinates that change the next observation when they are moved.
 
-    HalfCheetah does not observe how far it has run, which changes nothing; a wheeled robot does not observe how deep
-    its wheels sink into the floor, which does.
+    HalfCheetah does not observe how far it has run, which changes no later observation. A wheeled robot does not
+    observe how deep its wheels sink into the floor, which does.
+
+    Args:
+        state_map: the map between observations and states.
+        num_actuators: nu, the size of the action.
+        rollout: steps states (B, nq + nv) under actions (B, H, nu) to states (B, H, nq + nv).
+        settings: the size of the displacements and the threshold of the response.
     """
-    state_map, model = simulation.state_map, simulation.model
     unobserved = np.flatnonzero(~state_map.restore.any(1))
-    states = state_map.offset + 0.01 * np.random.default_rng(0).standard_normal((8, len(state_map.offset)))
-    still = np.zeros((len(states), 1, model.nu))
+    size = (settings.num_nudged, len(state_map.offset))
+    states = state_map.offset + settings.probe_spread * np.random.default_rng(0).standard_normal(size)
+    still = np.zeros((len(states), 1, num_actuators))
 
     def observed(moved: np.ndarray) -> np.ndarray:
-        return state_map.observations(simulation.rollout(moved, still))
+        return state_map.observations(rollout(moved, still))
 
     base = observed(states)
     hidden = []
     for index in unobserved:
         moved = states.copy()
-        moved[:, index] += _NUDGE
-        own = _NUDGE * state_map.observe[:, index]  # nothing, as it is not observed
-        if np.abs(observed(moved) - base - own).max() > _MATTERS:
+        moved[:, index] += settings.nudge
+        own = settings.nudge * state_map.observe[:, index]
+        if np.abs(observed(moved) - base - own).max() > settings.nudge_response:
             hidden.append(int(index))
-    return replace(simulation, state_map=replace(state_map, hidden=tuple(hidden)))
+    return tuple(hidden)

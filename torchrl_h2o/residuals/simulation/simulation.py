@@ -1,6 +1,6 @@
-"""A simulator as tracing sees it: a model that effects can be put into, stepped from many states at once.
+"""A simulator that takes effects and is stepped from many states at once.
 
-Everything runs through ``mujoco.rollout``; one control step is ``frame_skip`` physics steps under one action.
+All steps run through ``mujoco.rollout``. One control step is ``frame_skip`` physics steps under one action.
 """
 
 from __future__ import annotations
@@ -17,35 +17,27 @@ import numpy as np
 from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import (
-    ActionDelay,
-    ActionEffect,
-    CatalogueEntry,
-    Effect,
-    ForceEffect,
-    ModelEffect,
-    ObservationDelay,
-    ObservationEffect,
-    balanced,
-    catalogue,
-    compile_model,
-)
+from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue
 from torchrl_h2o.envs.physics import FULL_PHYSICS, roll_out
+from torchrl_h2o.residuals.simulation.from_env import source_of_env
+from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
+from torchrl_h2o.residuals.simulation.observability import hidden_coordinates
+from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
+from torchrl_h2o.residuals.simulation.source import SimulatorSource
 from torchrl_h2o.residuals.simulation.state_map import StateMap
-
-_CHUNK = 2**24  # numbers that a rollout may return at once: 128 MB
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A simulator, its control step, what is observed of it, and the effects that are in it.
+    """A simulator with its control step, its observation and its effects.
 
     Args:
-        spec: returns the model's specification, parsed anew.
-        frame_skip: physics steps a control step.
-        state_map: how observations and states belong together.
-        effects: those in it, in their order.
-        name: what to call it in reports.
+        spec: returns the model's specification, parsed anew at each call.
+        frame_skip: physics steps per control step.
+        state_map: the map between observations and states.
+        effects: the effects in the simulator, in their order.
+        name: the name for reports.
+        settings: tolerances and limits.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -61,18 +53,20 @@ class Simulation:
     state_map: StateMap
     effects: tuple[Effect, ...] = ()
     name: str = "simulator"
+    settings: SimulationSettings = SIMULATION_SETTINGS
     _pool: Rollout = field(default_factory=lambda: Rollout(nthread=cpu_count()), repr=False)
 
     @classmethod
     def from_env(cls, env: EnvBase) -> Simulation:
-        """The simulation inside a TorchRL env of a Gymnasium MuJoCo task, with the env's gaps.
+        """Builds the simulation of a TorchRL env of a Gymnasium MuJoCo task, with the env's dynamics gaps.
+
+        Args:
+            env: a GymEnv of a MuJoCo task, with or without transforms.
 
         Raises:
-            ValueError: if the env does not run on MuJoCo or its observation is not linear in the state.
+            ValueError: if the env is no Gymnasium MuJoCo task or its observation is not linear in the state.
         """
-        from torchrl_h2o.residuals.simulation.from_env import simulation_of
-
-        return simulation_of(env)
+        return cls._from_source(source_of_env(env))
 
     @classmethod
     def from_mjcf(
@@ -82,26 +76,38 @@ class Simulation:
         control_step: float,
         effects: Sequence[Effect] = (),
     ) -> Simulation:
-        """An MJCF file.
+        """Builds the simulation of an MJCF file.
 
         Args:
-            path: of the file.
-            state_map: a map, or the names of what is observed, in the order of the data: a joint's name for its
-                position, with ``_velocity`` behind it for its velocity; or which of these each column of a log is.
-            control_step: the time between two rows of the data, in s: a multiple of the model's timestep.
-            effects: put into it.
+            path: the file.
+            state_map: a map; or the names of the observed coordinates, in the order of the data, where a joint's name
+                is its position and the name with ``_velocity`` appended its velocity; or a mapping from the columns
+                of a log to these names.
+            control_step: the time between two rows of the data, in s; a multiple of the model's timestep.
+            effects: effects to put into the simulator.
 
         Raises:
-            ValueError: for names that the model does not have, or a control step that is no multiple.
+            ValueError: for names that the model does not have, or a control step that is no multiple of the timestep.
         """
-        from torchrl_h2o.residuals.simulation.from_mjcf import simulation_of
+        return cls._from_source(source_of_mjcf(path, state_map, control_step, effects))
 
-        return simulation_of(Path(path), state_map, control_step, tuple(effects), cls)
+    @classmethod
+    def _from_source(cls, source: SimulatorSource) -> Simulation:
+        """Builds the simulation of a source and marks the hidden coordinates in its state map."""
+        simulation = cls(*source)
+        state_map = source.state_map
+        hidden = hidden_coordinates(state_map, simulation.model.nu, simulation.rollout, simulation.settings)
+        return replace(simulation, state_map=replace(state_map, hidden=hidden))
+
+    @cached_property
+    def pipeline(self) -> Pipeline:
+        """The effects and how they are applied."""
+        return Pipeline(self.effects)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The compiled model with the model effects in it."""
-        return compile_model(self.spec(), self.effects)
+        return self.pipeline.compile(self.spec())
 
     @property
     def control_step(self) -> float:
@@ -110,7 +116,7 @@ class Simulation:
 
     @property
     def actuators(self) -> tuple[str, ...]:
-        """The names of the action's entries, their indices where they have none."""
+        """The names of the action's entries; the index of an entry without a name."""
         return tuple(self.model.actuator(i).name or str(i) for i in range(self.model.nu))
 
     @cached_property
@@ -118,49 +124,39 @@ class Simulation:
         return [mujoco.MjData(self.model) for _ in range(max(1, self._pool.nthread))]
 
     def catalogue(self) -> tuple[CatalogueEntry, ...]:
-        """The effects that the simulator, with the effects that are in it, could lack."""
+        """Returns candidate effects that the simulator may lack, sized by the model with the present effects."""
         spec = self.spec()
-        for effect in self.effects:
-            if isinstance(effect, ModelEffect):
-                effect.edit(spec)
+        self.pipeline.edit(spec)
         return catalogue(spec, num_observations=len(self.state_map.names), dt=self.control_step)
 
     def with_effects(self, *effects: Effect) -> Simulation:
-        """The simulation with more effects in it, behind those that are in it."""
+        """Returns the simulation with more effects, appended to the present ones."""
         more = replace(self, effects=(*self.effects, *effects))
         if not any(isinstance(effect, ModelEffect) for effect in effects):
-            # the same model: not compiled anew for every value of an actuator's delay
+            # the model is unchanged, and compiling it for every value of an actuator's delay would be slow
             more.__dict__.update(model=self.model, _data=self._data)
         return more
 
     def executed(self, actions: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
-        """What is executed of the actions of one recorded run, (T, nu), after the action effects.
+        """Returns the executed actions of one recorded run, (T, nu); see :meth:`Pipeline.executed_run`.
 
-        Random effects are left out without a generator. Sensors that are all late by the same time show a run as it
-        would be if its actions were late, and are taken so.
+        Args:
+            actions: the recorded actions, (T, nu).
+            rng: the generator of random effects, which are skipped without it.
         """
-        for effect in balanced(self.effects):
-            if effect.is_neutral or (effect.random and rng is None):
-                continue
-            if isinstance(effect, ActionEffect):
-                actions = effect.run(actions, self.control_step, rng)
-            elif _all_late(effect):
-                actions = ActionDelay(effect.delay).run(actions, self.control_step, rng)
-        return actions
+        return self.pipeline.executed_run(actions, self.control_step, rng)
 
     def true_observations(self, observations: np.ndarray) -> np.ndarray:
-        """What the sensors of one run, (T, n), saw before the observation effects; NaN where that cannot be told."""
-        for effect in reversed(self.effects):
-            if isinstance(effect, ObservationEffect) and not effect.is_neutral and not _all_late(effect):
-                observations = effect.restore(observations, self.control_step)
-        return observations
+        """Undoes the sensors in one recorded run, (T, n); NaN where that fails. See :meth:`Pipeline.restore_run`."""
+        return self.pipeline.restore_run(observations, self.control_step)
 
     def undelayed(self, observations: np.ndarray) -> np.ndarray:
-        """The observations of one run, (T, n), at the time at which they were true, where some sensors are late."""
-        for effect in reversed(self.effects):
-            if isinstance(effect, ObservationDelay) and not effect.is_neutral and not _all_late(effect):
-                observations = effect.restore(observations, self.control_step)
-        return observations
+        """Undoes the delays of single sensors in one recorded run, (T, n); see :meth:`Pipeline.undelay_run`."""
+        return self.pipeline.undelay_run(observations, self.control_step)
+
+    def observed(self, states: np.ndarray) -> np.ndarray:
+        """Returns the observations (..., n) of states (..., nq + nv) after the sensors without memory or noise."""
+        return self.pipeline.observe_memoryless(self.state_map.observations(states), self.control_step)
 
     def rollout(
         self,
@@ -173,21 +169,21 @@ class Simulation:
         """Steps many states at once.
 
         Args:
-            states: (B, nq + nv), where to start from.
-            actions: (B, H, nu), executed for H control steps.
-            time: (B), of the start, in s; 0 by default.
-            applied: (B, H, nv), generalised forces in N or N·m beside those of the effects.
+            states: initial states, (B, nq + nv).
+            actions: executed actions of H control steps, (B, H, nu).
+            time: initial time in s, (B,); 0 by default.
+            applied: generalised forces in N or N·m, (B, H, nv), added to those of the effects.
 
         Returns:
-            The states after each control step, (B, H, nq + nv); NaN from where the simulation diverges on.
+            The states after each control step, (B, H, nq + nv); NaN from the step on at which the simulation diverges.
         """
         batch, horizon, _ = actions.shape
         size = mujoco.mj_stateSize(self.model, FULL_PHYSICS)
         full = np.zeros((batch, size))
         full[:, 0] = 0.0 if time is None else time
         full[:, 1 : 1 + states.shape[1]] = states
-        forces = [e.batched(self.model) for e in self.effects if isinstance(e, ForceEffect) and not e.is_neutral]
-        chunk = max(1, _CHUNK // (horizon * self.frame_skip * size))
+        forces = self.pipeline.batched_forces(self.model)
+        chunk = max(1, self.settings.rollout_numbers // (horizon * self.frame_skip * size))
         parts = []
         with _no_warnings():
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
@@ -205,9 +201,10 @@ class Simulation:
                     )
                 )
         reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
-        # MuJoCo starts anew, and its clock with it, where a state is not finite or far too large
+        # MuJoCo resets a simulation and its clock when its state is not finite or far too large
         expected = full[:, :1] + self.control_step * np.arange(1, horizon + 1)
-        diverged = np.maximum.accumulate(np.abs(reached[:, :, 0] - expected) > 0.5 * self.control_step, axis=1)
+        allowed = self.settings.clock_jump * self.control_step
+        diverged = np.maximum.accumulate(np.abs(reached[:, :, 0] - expected) > allowed, axis=1)
         reached = reached[:, :, 1 : 1 + states.shape[1]].copy()
         reached[diverged] = np.nan
         return reached
@@ -215,14 +212,10 @@ class Simulation:
 
 @contextmanager
 def _no_warnings() -> Iterator[None]:
-    """Keeps MuJoCo from writing to console and file that a simulation diverged: whoever tries values sees NaN."""
+    """Suppresses MuJoCo's divergence warnings on the console and in its log file; the result is NaN instead."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def _all_late(effect: Effect) -> bool:
-    return isinstance(effect, ObservationDelay) and effect.entries is None

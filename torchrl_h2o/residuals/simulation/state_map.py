@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-_PROBES = 4  # states beyond those that a linear map needs, to see whether it is one
+from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
+
+if TYPE_CHECKING:
+    from gymnasium.envs.mujoco import MujocoEnv
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +96,9 @@ def coordinate_names(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
     return positions + velocities, position_units + velocity_units
 
 
-def probe_gymnasium(task, rng: np.random.Generator) -> StateMap:
+def probe_gymnasium(
+    task: MujocoEnv, rng: np.random.Generator, settings: SimulationSettings = SIMULATION_SETTINGS
+) -> StateMap:
     """The state map of a Gymnasium MuJoCo task, found by showing it states and reading its observations.
 
     A task may state in ``hidden_state`` how a velocity that it does not observe follows from observations:
@@ -111,18 +117,18 @@ def probe_gymnasium(task, rng: np.random.Generator) -> StateMap:
     model = task.model
     num_states = model.nq + model.nv
     before = task.data.qpos.copy(), task.data.qvel.copy()
-    states = 0.01 * rng.standard_normal((num_states + 1 + _PROBES, num_states))
+    states = settings.probe_spread * rng.standard_normal((num_states + 1 + settings.spare_probes, num_states))
     observed = np.array([_observation(task, state) for state in states], dtype=np.float64)
     design = np.hstack([states, np.ones((len(states), 1))])
     solution = np.linalg.lstsq(design, observed, rcond=None)[0]
     error = np.abs(design @ solution - observed).max()
-    far = 1e3 * np.ones((2, num_states)) * np.array([[-1.0], [1.0]])
+    far = settings.far_state * np.ones((2, num_states)) * np.array([[-1.0], [1.0]])
     clip = np.array([_observation(task, state) for state in far], dtype=np.float64).T
     task.set_state(*before)
-    observe = solution[:-1].T
-    observe[np.abs(observe) < 1e-5] = 0.0
+    observe, tolerance = solution[:-1].T, settings.linear_tolerance
+    observe[np.abs(observe) < tolerance] = 0.0
     one_each = (np.abs(observe) > 0).sum(1) == 1
-    if error > 1e-5 or np.abs(solution[-1]).max() > 1e-5 or not one_each.all():
+    if error > tolerance or np.abs(solution[-1]).max() > tolerance or not one_each.all():
         raise ValueError(
             f"{type(task).__name__} does not observe coordinates of its state as they are (qpos and qvel); its "
             "observation cannot be turned into a state. Give the simulation a StateMap of your own"
@@ -143,6 +149,6 @@ def probe_gymnasium(task, rng: np.random.Generator) -> StateMap:
     return StateMap(found.names, found.units, found.observe, restore, offset, clip)
 
 
-def _observation(task, state: np.ndarray) -> np.ndarray:
+def _observation(task: MujocoEnv, state: np.ndarray) -> np.ndarray:
     task.set_state(state[: task.model.nq], state[task.model.nq :])
     return task._get_obs()

@@ -1,4 +1,4 @@
-"""Every system of the paper's comparison, and two more, by name."""
+"""The methods of the paper's comparison, and two more, by name."""
 
 from torchrl_h2o.training.loop import Method
 from torchrl_h2o.training.methods.cql import CQL
@@ -11,10 +11,10 @@ from torchrl_h2o.training.methods.sac import SAC
 from torchrl_h2o.training.methods.weighted_td3 import WEIGHTED_TD3
 
 METHODS = {
-    "sac": SAC,  # the simulator alone
-    "cql": CQL,  # the real data alone
+    "sac": SAC,  # simulator only
+    "cql": CQL,  # real data only
     "iql": IQL,
-    "darc": DARC,  # the simulator; the real data tell how real it is
+    "darc": DARC,  # simulator, with rewards corrected by real data
     "h2o": H2O,  # both
     "h2o_plus": H2O_PLUS,
     "rlpd": RLPD,  # both; not in the paper
@@ -23,10 +23,10 @@ METHODS = {
 
 
 def method_named(name: str) -> Method:
-    """One of :data:`METHODS`.
+    """Returns one of :data:`METHODS`.
 
     Raises:
-        ValueError: if there is none of that name.
+        ValueError: for an unknown name.
     """
     if name not in METHODS:
         raise ValueError(f"method={name}: choose {', '.join(METHODS)}")

@@ -1,4 +1,4 @@
-"""CQL on the real data alone: TorchRL's own loss. No simulator, so no gap touches it."""
+"""CQL on the real data only, with TorchRL's own loss. It has no simulator, so no dynamics gap affects it."""
 
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -12,10 +12,10 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """TorchRL's loss, on real rows alone.
+    """Builds TorchRL's loss on batches of real rows.
 
-    That loss draws its random actions from [-1, 1], so it is shown actions in units of their bounds: the policy that
-    it trains shares the actor's network and acts within [-1, 1].
+    The loss draws its random actions from [-1, 1]. Actions are therefore scaled by their bounds, and the loss trains a
+    policy on [-1, 1] that shares the actor's network.
     """
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     unit_spec = Bounded(-1.0, 1.0, action_spec.shape)
@@ -30,7 +30,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     def terms_of(batch: TensorDictBase) -> dict:
         batch["action"] = 2 * (batch["action"] - low) / (high - low) - 1
         losses = loss(batch)
-        return losses.exclude("loss_actor_bc")  # the policy's loss where it is to copy the data: the other one's rival
+        return losses.exclude("loss_actor_bc")  # behaviour cloning, an alternative to loss_actor
 
     targets = SoftUpdate(loss, tau=cfg.tau)
     sizes = [(sum(cfg.batch_size), 0)]
@@ -42,7 +42,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         replay,
         sizes,
         terms_of,
-        pays_to_compile=False,  # thousands of actions an update: its time is in products
+        pays_to_compile=False,  # matrix products of thousands of actions dominate its time
     )
 
 

@@ -1,4 +1,4 @@
-"""DARC: SAC in the simulator, where a step is paid less the less likely it is in reality."""
+"""DARC: SAC in the simulator, with the log dynamics ratio added to the reward."""
 
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -12,10 +12,10 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """TorchRL's SAC on simulated rows with corrected rewards; the real data train the discriminators alone."""
+    """Builds TorchRL's SAC loss on simulated rows with corrected rewards; real data train the discriminators only."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
-    corrected = DynamicsRewardCorrection(estimator, scale=cfg.reward_scale)  # of the task's own reward
+    corrected = DynamicsRewardCorrection(estimator, scale=cfg.reward_scale)  # corrects the unscaled reward
     loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)

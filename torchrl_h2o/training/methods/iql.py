@@ -1,4 +1,4 @@
-"""IQL on the real data alone: TorchRL's own loss. No simulator, so no gap touches it."""
+"""IQL on the real data only, with TorchRL's own loss. It has no simulator, so no dynamics gap affects it."""
 
 from omegaconf import DictConfig
 from torchrl.data import TensorSpec
@@ -11,7 +11,7 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """TorchRL's loss, on real rows alone."""
+    """Builds TorchRL's loss on batches of real rows."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     value = make_value(observation_dim, cfg.num_cells)
     loss = IQLLoss(actor, qvalues, value, loss_function="l2", **cfg.iql)

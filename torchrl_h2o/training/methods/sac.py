@@ -1,4 +1,4 @@
-"""SAC in the simulator alone: TorchRL's own loss, on the same budget. What zero-shot transfer comes to."""
+"""SAC in the simulator only, with TorchRL's own loss: zero-shot transfer."""
 
 from omegaconf import DictConfig
 from torchrl.data import TensorSpec
@@ -10,7 +10,7 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """TorchRL's loss, on simulated rows alone."""
+    """Builds TorchRL's loss on batches of simulated rows."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)

@@ -1,7 +1,7 @@
-"""TD3 on real and simulated rows, the simulated ones weighed by the dynamics ratio: TorchRL's loss, weighted by ours.
+"""TD3 on real and simulated rows: TorchRL's loss, with simulated rows weighted by the dynamics ratio.
 
-The Bellman error alone is weighed. The policy is the other methods': TD3 reads its mean, and explores in the simulator
-with the spread it starts with. It is updated at every step, not at every second one.
+Only the Bellman error is weighted. The policy is that of the other methods: TD3 uses its mean, and collects in the
+simulator with its initial standard deviation. The policy is updated at every step, not at every second one.
 """
 
 from omegaconf import DictConfig
@@ -16,7 +16,7 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """TorchRL's TD3 with the discriminators' weights."""
+    """Builds TorchRL's TD3 loss, weighted row by row."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
     td3 = TD3Loss(actor, qvalues, action_spec=action_spec, loss_function="l2", reduction="none")

@@ -1,35 +1,60 @@
-"""A population of H2O+ runs: trained at once, judged one by one, each with its files in a folder of its own."""
+"""A population of H2O+ runs: trained at once, then evaluated one by one, each with files in its own folder."""
 
 import time
 from pathlib import Path
 
 from omegaconf import DictConfig
+from tqdm import tqdm
 
-from torchrl_h2o.training.environments import make_simulator
+from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.job import prepare
-from torchrl_h2o.training.judging import judge, judge_failed
+from torchrl_h2o.training.judging import DATA, judge, run_settings, table_of_population, write_failure
 from torchrl_h2o.training.methods.h2o_plus import make_learner
 from torchrl_h2o.training.populations.loop import members_of, train_population
-from torchrl_h2o.training.printout import print_population
-from torchrl_h2o.training.real_data import behaviour_in
+from torchrl_h2o.training.real_data import RECORDED, behaviour_of
 
 
 def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: Path) -> None:
-    """The same for many runs at once, each with its files in a folder of its own; no baseline and no films."""
+    """Trains all members at once, evaluates each, and writes each one's files; without baselines and films.
+
+    Args:
+        cfg: the configuration that the members share.
+        members: their own configurations, by name.
+        directory: the population's folder.
+
+    Raises:
+        ValueError: for another method than H2O+, or with baselines.
+    """
+    if cfg.method != "h2o_plus" or cfg.baselines:
+        raise ValueError(
+            f"method={cfg.method} baselines={cfg.baselines}: a population trains h2o_plus alone; use --multirun for others"
+        )
     start = time.perf_counter()
     for own in members.values():
-        make_simulator(own, raw=True)  # a gap that there is not
+        task_of(own).make_simulator()  # fails before the data are loaded if a gap does not fit the model
     real = prepare(cfg, directory)
-    members = members_of(cfg)  # with what was measured from the data
+    members = members_of(cfg)  # again, as the observations' normalisation is known now
     wall_s = time.perf_counter() - start
     outcomes = train_population(make_learner, cfg, members, real, directory)
+    behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
     in_reality = {}
     for name, outcome in outcomes.items():
         own, folder = members[name], directory / name
-        if outcome.failure is None:
-            so_far_s = wall_s + outcome.seconds
-            in_reality[name] = judge(own, real, {"H2O+": outcome.policy}, {"H2O+": outcome}, folder, so_far_s)["H2O+"]
-        else:
-            judge_failed(own, real, outcome.failure, folder)
+        settings, task, preprocessing = run_settings(own, real), task_of(own), preprocessing_of(own)
+        if outcome.failure is not None:
+            write_failure(folder, outcome.failure, settings)
             in_reality[name] = None
-    print_population(cfg, in_reality | {"the data's behaviour": behaviour_in(cfg, real)}, directory)
+            continue
+        in_reality[name] = judge(
+            task,
+            task.make_reality(own.final_episodes, preprocessing),
+            task.make_simulator(1, preprocessing),
+            {"H2O+": outcome.policy},
+            {"H2O+": outcome},
+            behaviour,
+            folder,
+            episodes=own.final_episodes,
+            settings=settings,
+            wall_s=wall_s + outcome.seconds,
+        )["H2O+"]
+    tqdm.write(table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step))

@@ -22,14 +22,8 @@ from torchrl_h2o.training.environments import as_observed
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
-from torchrl_h2o.training.run_folder import (
-    Training,
-    checkpoint_folder,
-    num_epochs,
-    save_config,
-    uninterrupted,
-    write_metrics,
-)
+from torchrl_h2o.training.progress import Budget, Training, write_metrics
+from torchrl_h2o.training.run_folder import checkpoint_folder, save_config, uninterrupted
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
@@ -133,9 +127,12 @@ def train_population(
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)
     }
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    learner.losses_of = maybe_compiled(cfg, learner.losses_of, pays=False)  # on a CPU, stacked ones are slower so
-    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
-    training = PopulationTraining("H2O+", cfg, directory, **_components(trainees, learner), schedule=schedule)
+    learner.losses_of = maybe_compiled(
+        learner.losses_of, cfg.get("compiled", False), cfg.updates, pays=False
+    )  # on a CPU, stacked ones are slower so
+    budget = Budget.from_config(cfg)
+    schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
+    training = PopulationTraining("H2O+", directory, budget, **_components(trainees, learner), schedule=schedule)
     learner.updates = training.progress["epoch"] * cfg.updates_per_epoch
     learner.failures = {n: training.failures[name] for n, name in enumerate(members) if name in training.failures}
 

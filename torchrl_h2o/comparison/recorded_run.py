@@ -1,0 +1,41 @@
+"""Trains one run of a comparison and appends its row to the results file."""
+
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from torchrl_h2o.comparison.results_file import append_run
+from torchrl_h2o.training.job import run_job
+from torchrl_h2o.training.methods import method_named
+from torchrl_h2o.training.run_folder import claimed, open_run
+
+
+def train_and_record(cfg: DictConfig, directory: Path) -> None:
+    """Train one method and append its results; a finished run only appends its results.
+
+    Args:
+        cfg: the run's configuration; ``results`` names the CSV, None for no record.
+        directory: the run's folder.
+    """
+    if not (directory / "summary.json").exists():
+        run_job(cfg, directory, [method_named(name) for name in (cfg.method, *(cfg.get("baselines") or ()))])
+    if cfg.results is not None:
+        append_run(Path(cfg.results), cfg, directory)
+
+
+def train_grid_run(cfg: DictConfig) -> None:
+    """Start or continue one run of a grid, called by a Hydra launcher.
+
+    It lives in the package because launchers import it by name in their worker processes.
+
+    Args:
+        cfg: the run's configuration, composed from paper.yaml.
+    """
+    cfg.overrides = list(HydraConfig.get().overrides.task)
+    cfg.seeds = cfg.gaps = None  # these chose the grid's runs; in one run they would mean a population
+    results = cfg.results
+    cfg, directory = open_run(cfg, go_on=True)
+    cfg.results = results  # an interrupted run may have been started for another results file
+    with claimed(directory):
+        train_and_record(cfg, directory)

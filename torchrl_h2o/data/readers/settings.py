@@ -1,0 +1,25 @@
+"""Tolerances of the readers, as one documented settings object."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ReaderSettings:
+    """Tolerances for clocks and bounds in measured data.
+
+    The tolerance for single irregular time steps is :attr:`LogColumns.time_tolerance`, because it depends on the log.
+
+    Args:
+        clock_tolerance: share of dt by which the typical time step of a log may differ from the declared dt. Clocks
+            drift by less; logs from which every n-th row was removed differ by more.
+        longest_regular_step: multiple of the median time step; longer steps are gaps and do not enter the mean.
+        bound_rounding: share of an action bound by which an action may exceed it. A recording in float64 that is
+            rounded to float32 exceeds it by about 1e-7.
+    """
+
+    clock_tolerance: float = 0.02
+    longest_regular_step: float = 2.0
+    bound_rounding: float = 1e-6
+
+
+READER_SETTINGS = ReaderSettings()

@@ -1,0 +1,55 @@
+"""Compiles a MuJoCo specification with the edits of model effects."""
+
+import warnings
+from collections.abc import Iterable
+
+import mujoco
+
+from torchrl_h2o.effects.effect import Effect, ModelEffect
+
+
+def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco.MjModel:
+    """Edits a specification by the model effects in their order, then compiles it once.
+
+    Args:
+        spec: the specification, edited in place.
+        effects: effects of any kind; only model effects are applied.
+
+    Returns:
+        The compiled model.
+
+    Raises:
+        ValueError: if the model has no element that one of the effects could act on.
+
+    Examples:
+        >>> import mujoco
+        >>> from torchrl_h2o.effects import Gravity
+        >>> compile_model(mujoco.MjSpec(), [Gravity(2.0)]).opt.gravity
+        array([  0.  ,   0.  , -19.62])
+    """
+    edit_spec(spec, effects)
+    with warnings.catch_warnings():
+        # HalfCheetah's own file uses this attribute, and its user cannot change that file
+        warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")
+        return spec.compile()
+
+
+def edit_spec(spec: mujoco.MjSpec, effects: Iterable[Effect]) -> None:
+    """Edits a specification in place by the model effects in their order, without compiling it.
+
+    Args:
+        spec: the specification.
+        effects: effects of any kind; only model effects are applied.
+
+    Raises:
+        ValueError: if the model has no element that one of the effects could act on.
+    """
+    for effect in effects:
+        if isinstance(effect, ModelEffect):
+            try:
+                effect.edit(spec)
+            except ValueError as error:
+                raise ValueError(
+                    f"{type(effect).__name__} ({effect.describe()}) cannot be put into model "
+                    f"'{spec.modelname}': {error}"
+                ) from error

@@ -1,0 +1,144 @@
+"""One method's training inside a run: its epochs, progress bar, metrics and checkpoints.
+
+Every epoch has a random stream of its own, drawn from the run's seed and the epoch's number, and starts with fresh
+simulator episodes. A run that goes on from a checkpoint therefore draws the same numbers as an unbroken one.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from tqdm import tqdm
+
+from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long a training is, and how often it is evaluated and saved.
+
+    Args:
+        updates: of the networks, rounded up to whole epochs.
+        updates_per_epoch: between two collections in the simulator.
+        eval_every: epochs between two evaluations; the last epoch is always evaluated.
+        checkpoint_every: epochs between two checkpoints; the last epoch is always saved.
+    """
+
+    updates: int
+    updates_per_epoch: int
+    eval_every: int = 1
+    checkpoint_every: int = 1
+
+    @classmethod
+    def from_config(cls, cfg: DictConfig) -> Budget:
+        """The budget in a run's configuration."""
+        return cls(cfg.updates, cfg.updates_per_epoch, cfg.eval_every, cfg.checkpoint_every)
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs."""
+        return -(-self.updates // self.updates_per_epoch)
+
+
+def epoch_seed(seed: int, epoch: int) -> int:
+    """The seed of an epoch's random stream, from the run's seed and the epoch's number."""
+    return int(np.random.SeedSequence((seed, epoch)).generate_state(1)[0])
+
+
+class Training:
+    """Epochs, metrics and checkpoints of one method; continues from the last checkpoint in the folder, if any.
+
+    Args:
+        name: of the method, for the progress bar, the tables and the checkpoint folder.
+        directory: the run's folder.
+        budget: length of the training.
+        **components: contents of a checkpoint (losses, optimisers, replay buffers).
+
+    Raises:
+        RuntimeError: if the folder holds checkpoints, none of which can be read.
+    """
+
+    def __init__(self, name: str, directory: Path, budget: Budget, **components: Any) -> None:
+        self.name, self.directory, self.budget = name, directory, budget
+        self.progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
+        # A damaged ZIP archive raises an error; a damaged folder of memory maps would read as zeros.
+        self.checkpoint = Checkpoint(format="archive", **components)
+        directory.mkdir(parents=True, exist_ok=True)
+        folder = checkpoint_folder(directory, name)
+        self.rotation = CheckpointRotation(folder, keep_last=1)
+        if (latest := self.rotation.latest()) is not None:
+            self.checkpoint.load(latest)
+            self.progress = Checkpoint.manifest(latest)["metadata"]["progress"]
+        elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
+            raise RuntimeError(
+                f"{folder} holds no checkpoint that can be read: remove it to train {name} from the start"
+            )
+
+    @property
+    def updates(self) -> int:
+        """Number of updates of all epochs."""
+        return self.budget.epochs * self.budget.updates_per_epoch
+
+    @property
+    def rows(self) -> list[dict]:
+        """The metrics so far, one row per evaluation."""
+        return self.progress["rows"]
+
+    def epochs(self) -> Iterator[tuple[int, bool]]:
+        """Yields each epoch's number and whether to evaluate at its end; saves a checkpoint after it."""
+        done, size = self.progress["epoch"], self.budget.updates_per_epoch
+        self._bar = tqdm(desc=self.name, total=self.updates, initial=done * size, unit=" updates")
+        for epoch in range(done, self.budget.epochs):
+            start = time.perf_counter()
+            last = epoch + 1 == self.budget.epochs
+            yield epoch, last or (epoch + 1) % self.budget.eval_every == 0
+            self.progress["epoch"] = epoch + 1
+            self.progress["seconds"] += time.perf_counter() - start
+            if last or (epoch + 1) % self.budget.checkpoint_every == 0:
+                with uninterrupted():
+                    self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
+        self._bar.close()
+
+    def epoch_updates(self) -> Iterator[int]:
+        """Yields the number of each update of an epoch; moves the bar and measures the time."""
+        start = time.perf_counter()
+        for update in range(self.budget.updates_per_epoch):
+            yield update
+            self._bar.update()
+        self.progress["update_seconds"] += time.perf_counter() - start
+
+    @property
+    def updates_per_second(self) -> float:
+        """Updates per second, without collection and evaluation."""
+        return self.progress["epoch"] * self.budget.updates_per_epoch / self.progress["update_seconds"]
+
+    def log(self, epoch: int, **metrics: float) -> None:
+        """Adds a row of metrics, writes metrics.csv, and shows the return in reality beside the bar."""
+        self.rows.append(self._row(epoch, metrics))
+        write_metrics(self.directory, self.name, self.rows)
+        self._bar.set_postfix(return_real=f"{metrics['return_real']:.0f}")
+
+    def _row(self, epoch: int, metrics: dict[str, float]) -> dict:
+        return {"method": self.name, "updates": (epoch + 1) * self.budget.updates_per_epoch, **metrics}
+
+
+def write_metrics(directory: Path, method: str, rows: list[dict]) -> None:
+    """Writes metrics.csv: one row per evaluation, one column per metric. Rows of other methods stay."""
+    path = directory / "metrics.csv"
+    if path.exists():
+        with open(path, newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["method"] != method] + rows
+    first = ["method", "updates", "return_real", "return_real_std", "length_real"]
+    others = {key for row in rows for key in row} - set(first)
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, [*first, *sorted(others)])
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,117 @@
+"""A training task: the real system, the imperfect simulator, and where real data come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
+
+from torchrl_h2o.effects import Effect, paper_gap
+from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
+from torchrl_h2o.residuals import Report
+from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.real_data import read_real_data
+
+
+@dataclass(frozen=True)
+class Task:
+    """One task in two versions: reality, and a simulator with a dynamics gap.
+
+    A task is picklable, so a worker process can build its own environments from it. Report files are read when the
+    task is built, not in the worker.
+
+    Args:
+        config: the ``env`` section of a configuration, resolved: ``name``, ``make`` (what builds one env),
+            ``seconds_per_step``, and optionally ``batched``, ``reward``, ``columns``, ``behaviour``, ``recording``.
+        reality: effects of the target dynamics P.
+        simulator: effects of the simulator P̂, with the dynamics gap and the repair, if any.
+        gap: name of the paper's dynamics gap in the simulator, None without one.
+    """
+
+    config: Mapping[str, Any]
+    reality: tuple[Effect, ...]
+    simulator: tuple[Effect, ...]
+    gap: str | None = None
+
+    @classmethod
+    def from_config(
+        cls, env: DictConfig, *, gap: str | None = None, gap_strength: float | None = None, gap_fix: str | None = None
+    ) -> Task:
+        """Builds the task that a configuration describes.
+
+        Args:
+            env: the ``env`` section of the configuration.
+            gap: name of one of the paper's dynamics gaps, for the simulator.
+            gap_strength: of the gap; the paper's by default.
+            gap_fix: path of a ``report.json``, whose effects are added to the simulator after all others.
+
+        Raises:
+            ValueError: for an unknown gap, or a report without effects.
+            torchrl_h2o.data.DataError: for a report that cannot be read.
+        """
+        simulator = [instantiate(effect) for effect in env.simulator]
+        if gap is not None:
+            simulator.append(paper_gap(gap, gap_strength))
+        if gap_fix is not None:
+            simulator.extend(_effects_of_report(gap_fix))
+        reality = tuple(instantiate(effect) for effect in env.reality)
+        return cls(OmegaConf.to_container(env, resolve=True), reality, tuple(simulator), gap)
+
+    @property
+    def name(self) -> str:
+        """Name of the environment, for folders and tables."""
+        return self.config["name"]
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Control step, in s."""
+        return self.config["seconds_per_step"]
+
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Time limit of an episode in control steps; None for the environment's own."""
+        return self.config["make"].get("max_episode_steps")
+
+    def make_reality(
+        self, num_worlds: int | None = None, preprocessing: Preprocessing | None = None, **kwargs
+    ) -> EnvBase:
+        """Builds an environment with the target dynamics P.
+
+        Args:
+            num_worlds: N for a batched env ``[N]``; None for one env ``[]``. A task that cannot be stepped in batches
+                gives one env in both cases.
+            preprocessing: how observations are shown to the learner; None leaves them in their own units.
+            **kwargs: further arguments of the env, such as ``render_mode``.
+        """
+        return self._make(self.reality, num_worlds, preprocessing, kwargs)
+
+    def make_simulator(
+        self, num_worlds: int | None = None, preprocessing: Preprocessing | None = None, **kwargs
+    ) -> EnvBase:
+        """Builds an environment with the simulator's dynamics P̂; arguments as for :meth:`make_reality`."""
+        return self._make(self.simulator, num_worlds, preprocessing, kwargs)
+
+    def read_real_data(self, data: str, columns: str | None = None) -> TensorDictBase:
+        """Reads the real transitions, ``[T]``; see :func:`~torchrl_h2o.training.real_data.read_real_data`."""
+        return read_real_data(self.config, self.make_reality(), data, columns)
+
+    def _make(
+        self, effects: tuple[Effect, ...], num_worlds: int | None, preprocessing: Preprocessing | None, kwargs: dict
+    ) -> EnvBase:
+        env = TransformedEnv(instantiate(self.config["make"], **kwargs), DynamicsGap(*effects))
+        if num_worlds is not None and self.config.get("batched", False):
+            env = BatchedMujocoEnv(env, num_worlds)
+        shown = [] if preprocessing is None else preprocessing.transforms()
+        return TransformedEnv(env, Compose(DoubleToFloat(), *shown))
+
+
+def _effects_of_report(path: str) -> tuple[Effect, ...]:
+    effects = Report.load(path).effects
+    if not effects:
+        raise ValueError(f"gap_fix={path}: this report contains no effects to add to the simulator; leave gap_fix out")
+    return effects
