@@ -1,4 +1,4 @@
-"""Fixtures of small runs of the recipes, in this process and as commands; all draw on one recording."""
+"""Fixtures for short runs of the recipes, in this process and as commands; all of them use one cached recording."""
 
 import os
 import subprocess
@@ -13,12 +13,16 @@ from torchrl_h2o.training.environments import measure_observation_norm, task_of
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
+    """Folder for the recording that small runs learn from, shared by all pytest-xdist workers."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture
 def command(cache, tmp_path):
-    """What subprocess.run takes to run a recipe in a folder of its own."""
+    """Build the arguments of subprocess.run that run a recipe in the test's temporary folder."""
 
     def build(*overrides, script="h2o_plus.py"):
         env = os.environ | {"XDG_CACHE_HOME": str(cache), "OMP_NUM_THREADS": "1"}
@@ -30,7 +34,7 @@ def command(cache, tmp_path):
 
 @pytest.fixture
 def compose(cache, monkeypatch):
-    """The configuration and the real data of a small run of the robot's."""
+    """Build the configuration and the real data of a short run on the wheel-legged robot."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
 
     def build(*overrides, config="train"):

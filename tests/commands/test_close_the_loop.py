@@ -98,6 +98,7 @@ def report(*effects):
     )
 
 
+@pytest.mark.slow
 def test_an_mjcf_file_and_a_log_are_enough(robot):
     chosen = ["simulator=robot.xml", "data=log.csv", "columns=log.yaml", "simulator.coordinates={angle: pivot}"]
     done = command(robot, *chosen, "catalogue=[JointDamping,Gravity]", "hydra.run.dir=out")
@@ -257,6 +258,7 @@ def test_a_report_without_effects_and_a_file_that_is_none_are_refused(compose, t
         make_simulator(compose(f"gap_fix={tmp_path / 'none.json'}", config="h2o_plus"))
 
 
+@pytest.mark.slow
 def test_training_runs_in_the_mended_simulator(tmp_path):
     report(Gravity(0.5)).save(tmp_path)
     small = ["updates=20", "updates_per_epoch=20", "steps_per_epoch=40", "eval_episodes=1", "final_episodes=1"]

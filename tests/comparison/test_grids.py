@@ -125,6 +125,7 @@ def test_every_run_is_an_override_that_hydra_reads():
 GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
 
 
+@pytest.mark.slow
 def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_killed(command, compose, tmp_path):
     asked = command(*GRID, "methods=[iql,cql]", "updates=200", script="paper.py")
     process = subprocess.Popen(**asked, text=True)
@@ -157,6 +158,7 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     assert [row["method"] for row in read_rows(tmp_path / "elsewhere" / "results.csv")] == ["cql"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
     asked = command(*GRID, "methods=[cql,iql]", "updates=20000", script="paper.py")
     process = subprocess.Popen(**asked, text=True)
@@ -168,6 +170,7 @@ def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
     assert printed.strip().endswith("interrupted with 2 runs to go; the same command continues with them")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="an extra: .[launchers]")
 def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
     _, real = compose()
@@ -231,6 +234,7 @@ def checkpoint_of(folder, method):
     return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
 
 
+@pytest.mark.slow
 def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):
     grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "backbone=huber", script="paper.py")
     done = subprocess.run(**grid, text=True, check=False)

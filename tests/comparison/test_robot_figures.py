@@ -16,6 +16,7 @@ from torchrl_h2o.training.job import run_job
 from torchrl_h2o.training.methods import METHODS
 
 
+@pytest.mark.slow
 def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, tmp_path):
     short = ["updates=20", "frames=2", "num_worlds=1", "env.make.max_episode_steps=300", "final_episodes=5"]
     cfg, _ = compose("method=h2o_plus", *short, config="train")

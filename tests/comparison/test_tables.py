@@ -185,6 +185,7 @@ def test_runs_that_count_in_several_gaps_are_drawn_anew_together():
     assert (alone.low, alone.high) == pytest.approx((values[0], values[2]))
 
 
+@pytest.mark.slow
 def test_one_command_makes_tables_and_pictures(tmp_path):
     write(tmp_path / "returns.csv", fixture())
     curve = [
@@ -206,6 +207,7 @@ def test_one_command_makes_tables_and_pictures(tmp_path):
         assert (tmp_path / name).stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_one_seed_has_no_intervals(tmp_path):
     write(tmp_path / "returns.csv", [r for r in fixture() if r["seed"] == "0"])
     command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}"]
@@ -215,6 +217,7 @@ def test_one_seed_has_no_intervals(tmp_path):
     assert not (tmp_path / "returns_aggregates.png").exists()
 
 
+@pytest.mark.slow
 def test_runs_of_several_budgets_are_not_set_beside_each_other(tmp_path):
     write(tmp_path / "returns.csv", [row("sac", 0, 1), row("sac", 1, 1, updates="2000")])
     write(tmp_path / "methods.csv", [row("sac", 0, 1)])
@@ -226,6 +229,7 @@ def test_runs_of_several_budgets_are_not_set_beside_each_other(tmp_path):
     assert (tmp_path / "methods.md").exists()
 
 
+@pytest.mark.slow
 def test_a_task_of_one_s_own_is_scored_by_returns_of_its_own(tmp_path):
     (tmp_path / "methods_aggregates.png").write_text("of other runs")
     write(tmp_path / "methods.csv", [r | {"env": "Hopper-v5"} for r in fixture()])

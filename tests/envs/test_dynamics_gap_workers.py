@@ -45,6 +45,7 @@ def test_parallel_workers_step_as_serial_ones_do():
     assert (serial["next", "observation"] - without["next", "observation"]).abs().max() > 0.1
 
 
+@pytest.mark.slow
 def test_specs_hold_in_parallel_and_noise_differs_between_seeded_workers():
     env = ParallelEnv(2, partial(make, DynamicsGap(ActionNoise(1.0))))
     check_env_specs(env)

@@ -196,6 +196,7 @@ def test_copies_state_dicts_discount_and_targets_are_a_loss_s(parts, batch):
     assert (loss.loss.target_qvalue_network_params != before).any()
 
 
+@pytest.mark.slow
 def test_the_compiled_term_is_the_eager_one(parts, batch):
     loss, batch = h2o(parts), weighted(parts, batch)
     torch._dynamo.reset()

@@ -133,6 +133,7 @@ def test_conversion_to_float64_converts_everything(name):
     assert all(value.dtype == torch.float64 for value in loss(full_batch()).values())
 
 
+@pytest.mark.slow
 @losses
 def test_compiled_fullgraph_equals_eager(name):
     loss, batch = make(name), full_batch()

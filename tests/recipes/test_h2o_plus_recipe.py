@@ -23,6 +23,7 @@ from torchrl_h2o.training.trained_policy import load_policy
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
 
 
+@pytest.mark.slow
 def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
     printed = run(command(*SMALL, *ROBOT, "hydra.run.dir=out"))
     out = tmp_path / "out"
@@ -53,6 +54,7 @@ def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
     assert evaluation["episodes"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interruption", [signal.SIGKILL, signal.SIGINT])
 def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption):
     small = [*SMALL, *ROBOT, "baseline=false", "updates=100"]
@@ -75,6 +77,7 @@ def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, i
     assert rows(broken) == rows(tmp_path / "unbroken")
 
 
+@pytest.mark.slow
 def test_every_job_of_a_multirun_has_a_folder_and_a_seed_of_its_own(command, tmp_path):
     run(command("--multirun", *SMALL, *ROBOT, "baseline=false", "updates=20", "seed=0,1"))
     summaries = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/multirun/*/*/summary.json")]
@@ -82,6 +85,7 @@ def test_every_job_of_a_multirun_has_a_folder_and_a_seed_of_its_own(command, tmp
     assert summaries[0]["return_real"] != summaries[1]["return_real"]
 
 
+@pytest.mark.slow
 def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(command, tmp_path):
     run(command(*SMALL, *ROBOT, "baseline=false", "updates=20"))
     (summary,) = tmp_path.glob("outputs/wheel_legged/*/summary.json")
@@ -93,6 +97,7 @@ def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(co
     assert "leave out mixing=0.9" in other.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
@@ -117,6 +122,7 @@ def test_recorded_data_can_be_named_by_their_folder(compose, tmp_path):
     assert again.observation_norm == cfg.observation_norm
 
 
+@pytest.mark.slow
 def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
     chosen = [(), ("backbone=sparse",), ("backbone=exponential",), ("mixing=0.9",), ("ratio=false",), ("gamma=0.5",)]
     losses = []
@@ -127,6 +133,7 @@ def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
     assert len(set(losses)) == len(chosen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [H2O_PLUS, SAC])
 def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, method, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1")
@@ -140,6 +147,7 @@ def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, 
     assert trained(tmp_path / "parts", name) == trained(tmp_path / "whole", name)
 
 
+@pytest.mark.slow
 def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
     cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=1")
     policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
@@ -159,6 +167,7 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_ctrl_c_waits_until_the_checkpoint_is_written(compose, tmp_path, monkeypatch):
     cfg, real = compose("updates=60")
     save = CheckpointRotation.save
@@ -174,6 +183,7 @@ def test_ctrl_c_waits_until_the_checkpoint_is_written(compose, tmp_path, monkeyp
     assert Checkpoint.manifest(latest)["metadata"]["progress"]["epoch"] == 1
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
     cfg, real = compose("updates=20")
     train(SAC, cfg, real, tmp_path)
@@ -186,6 +196,7 @@ def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured data are not there: {DATA}")
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_real_robot_s_log_is_an_override(command, tmp_path):
     log = DATA / "wheel_legged" / "standing_still.txt"
@@ -193,6 +204,7 @@ def test_the_real_robot_s_log_is_an_override(command, tmp_path):
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["transitions"] > 16_000
 
 
+@pytest.mark.slow
 @needs_data
 def test_data_of_another_task_are_refused(command):
     data = DATA / "minari" / "halfcheetah" / "medium-v0"
@@ -201,6 +213,7 @@ def test_data_of_another_task_are_refused(command):
     assert "recorded in HalfCheetah-v5, not in Walker2d-v5" in done.stdout
 
 
+@pytest.mark.slow
 @needs_data
 def test_a_minari_dataset_and_a_gap_are_overrides(command, tmp_path):
     data = DATA / "minari" / "walker2d" / "medium-replay-v0"

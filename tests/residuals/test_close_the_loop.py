@@ -33,6 +33,7 @@ def closed(measured, simulation=SIMULATION, catalogue=None, **kwargs):
     return close_the_loop(simulation, measured, catalogue, progress=False, settings=SETTINGS, **kwargs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "truth",
     [Gravity(1.3), JointFrictionLoss(0.05), ActionDelay(0.013)],
@@ -58,6 +59,7 @@ def test_where_nothing_is_missing_nothing_is_named():
     assert report.sentence().startswith("Nothing is missing")
 
 
+@pytest.mark.slow
 def test_noise_of_the_sensors_is_no_effect():
     report = closed(recorded(SIMULATION, 2000, noise=0.01))
     assert report.effects == ()
@@ -95,6 +97,7 @@ def test_mass_and_gain_are_told_apart_where_weight_shows():
     assert report.indistinguishable == ()
 
 
+@pytest.mark.slow
 def test_a_torque_on_no_list_is_marked_so_and_explained():
     ripple = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
     report = closed(recorded(SIMULATION.with_effects(ripple), ROWS))
@@ -113,6 +116,7 @@ def test_two_effects_are_found_together():
     assert len(found) == len(report.effects) == 2
 
 
+@pytest.mark.slow
 def test_noise_of_the_action_is_named():
     free = with_xml(('ctrlrange="-1 1"', ""))
     (noise,) = closed(recorded(free.with_effects(ActionNoise(0.2)), 3000), free).effects
@@ -120,6 +124,7 @@ def test_noise_of_the_action_is_named():
     assert noise.std == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.slow
 def test_noise_of_the_action_that_the_control_range_cuts_off_is_no_saturation():
     (noise,) = closed(recorded(SIMULATION.with_effects(ActionNoise(0.2)), 3000, seed=3)).effects
     assert isinstance(noise, ActionNoise)
@@ -173,6 +178,7 @@ def test_a_progress_bar_is_shown_only_if_asked(capsys):
     assert "reporting" in shown.err
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_report():
     measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 600, noise=0.005)
     first, again = (replace(closed(measured, catalogue=[GRAVITY, FRICTION], seed=3), wall_s=None) for _ in range(2))

@@ -22,6 +22,7 @@ def explained(*truth, simulation=SIMULATION, catalogue=(GRAVITY, FRICTION), rows
         return explain(evidence, catalogue, rng=np.random.default_rng(0), progress=progress)
 
 
+@pytest.mark.slow
 def test_a_force_that_nobody_declared_stands_beside_declared_effects():
     gravity, ripple = explained(Gravity(1.3), RIPPLE, rows=2500).parts
     assert (gravity.declared, ripple.declared) == (True, False)
@@ -54,12 +55,14 @@ def test_where_the_catalogue_explains_all_no_force_is_made():
     assert explanation.trace.exact
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_parameters_that_were_fitted():
     (part,) = explained(Gravity(1.3), noise=0.002).parts
     low, high = part.ci95["scale"]
     assert low < part.effect.scale < high
 
 
+@pytest.mark.slow
 def test_noise_of_the_action_stands_behind_what_else_is_missing():
     parts = explained(Gravity(2.0), ActionNoise(0.2), rows=3000).parts
     assert [type(part.effect) for part in parts] == [Gravity, ActionNoise]

@@ -26,6 +26,7 @@ def test_noise_of_the_action_is_found_on_a_pendulum(std):
     assert found.action_std == pytest.approx(std, rel=0.1)
 
 
+@pytest.mark.slow
 def test_noise_of_the_action_is_found_on_hopper():
     env = TransformedEnv(GymEnv("Hopper-v5"), DynamicsGap(ActionNoise(0.2)))
     torch.manual_seed(0)

@@ -80,12 +80,14 @@ def test_noise_alone_is_no_effect(seed):
     assert not trace.exact
 
 
+@pytest.mark.slow
 def test_effects_are_found_under_noise():
     trace = traced(Gravity(1.3), rows=2500, noise=0.01)
     assert names(trace.entries) == [GRAVITY.name]
     assert trace.fit.effects[0].scale == pytest.approx(1.3, rel=0.1)
 
 
+@pytest.mark.slow
 def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
     trace = traced(Armature(0.01), catalogue=[GRAVITY, INERTIA, ARMATURE, GAIN])
     ((other,),) = trace.groups

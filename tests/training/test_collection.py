@@ -36,6 +36,7 @@ def open_collector(cfg, actor):
     return collecting(cfg, make_simulator(cfg, 1), actor, TRANSITION_KEYS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", WORKERS)
 def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind, monkeypatch):
     cfg, real = compose(f"collector={kind}", "gap=joint_noise")
@@ -59,6 +60,7 @@ def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind,
     assert torch.get_num_threads() == threads
 
 
+@pytest.mark.slow
 @needs_ray
 def test_an_epoch_is_drawn_from_its_seed_and_the_weights_that_were_sent(compose, actor):
     import ray

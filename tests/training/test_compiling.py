@@ -30,6 +30,7 @@ def updated(learner, updates=4):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
 def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     cfg, real = compose("compiled=true")
@@ -51,6 +52,7 @@ def no_compiler():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_compiler")
 def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, capsys):
     cfg, real = compose("compiled=auto", f"updates={PAYS_FROM}")
@@ -61,6 +63,7 @@ def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, 
     assert capsys.readouterr().out.count("cannot be compiled here") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_compiler")
 def test_where_compiled_losses_are_asked_for_it_is_an_error_that_there_can_be_none(compose):
     cfg, real = compose("compiled=true")

@@ -19,6 +19,7 @@ methods = pytest.mark.parametrize("name", METHODS)
 OFFLINE = ("cql", "iql")
 
 
+@pytest.mark.slow
 def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):
     printed = run(command("method=darc", *SMALL, *ROBOT, "hydra.run.dir=out", script="train.py"))
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -31,12 +32,14 @@ def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):
     assert "DARC in reality" in replayed
 
 
+@pytest.mark.slow
 def test_a_method_that_there_is_not_is_said(command):
     done = subprocess.run(**command("method=ppo", script="train.py"), text=True, check=False)
     assert done.returncode != 0
     assert "choose sac, cql, iql" in done.stdout
 
 
+@pytest.mark.slow
 @methods
 def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1", config="train")
@@ -63,6 +66,7 @@ def method_policy(method, cfg, real, directory):
     return train(method, still, real, directory)[0]
 
 
+@pytest.mark.slow
 @methods
 def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=20", config="train")
@@ -87,6 +91,7 @@ def recorded(sizes):
     return recording
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OFFLINE)
 def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_path, name):
     returns = []
@@ -148,6 +153,7 @@ def test_cql_s_policy_is_not_also_told_to_copy(compose):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OFFLINE)
 def test_a_method_that_learns_from_real_data_alone_has_no_simulator(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=20", "keep=best_in_simulator", config="train")

@@ -195,6 +195,7 @@ def test_evaluation_mode_draws_no_noise_for_the_discriminators():
     assert set(loss.draw_noise(make_batch()).keys()) == {"next_action", "action"}
 
 
+@pytest.mark.slow
 def test_compiled_losses_of_a_population_are_the_eager_ones():
     runs = [Run(seed) for seed in range(2)]
     population = Population(runs)

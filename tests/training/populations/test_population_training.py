@@ -46,6 +46,7 @@ def test_every_combination_is_a_member_with_a_name(compose):
             members_of(compose(wrong)[0])
 
 
+@pytest.mark.slow
 def test_each_member_learns_what_a_single_run_learns(compose, tmp_path):
     cfg, real = compose("seeds=[0,1]", "gaps=[null,gravity]", "mixings=[0.2]")
     outcomes = train_all(cfg, real, tmp_path / "population")
@@ -61,6 +62,7 @@ def test_each_member_learns_what_a_single_run_learns(compose, tmp_path):
     assert len(figures) == 2
 
 
+@pytest.mark.slow
 def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path, monkeypatch):
     cfg, real = compose("seeds=[0,1]", "keep=best_in_simulator")
     train_all(cfg, real, tmp_path / "whole")
@@ -101,6 +103,7 @@ def break_seed_1(monkeypatch, at_epoch):
     return simulated
 
 
+@pytest.mark.slow
 def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(compose, tmp_path, monkeypatch):
     cfg, real = compose("seeds=[0,1,2]")
     healthy = train_all(cfg, real, tmp_path / "healthy")
@@ -120,6 +123,7 @@ def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(c
     assert again["seed_0"].rows == healthy["seed_0"].rows
 
 
+@pytest.mark.slow
 def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(compose, tmp_path, monkeypatch, capsys):
     cfg, _ = compose("seeds=[0,1]", "updates=10")
     update = PopulationLearner.update
@@ -142,6 +146,7 @@ def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(com
     assert float(table["seed_0"])
 
 
+@pytest.mark.slow
 def test_one_command_leaves_a_folder_a_member_and_one_table(command, tmp_path):
     small = [*SMALL, *ROBOT, *SMALLER, "updates=10", "hydra.run.dir=out"]
     printed = run(command(*small, "seeds=[0,1]", "gaps=[gravity]"))
