@@ -80,8 +80,8 @@ loss = H2OPlusLoss(
     value_loss=BACKBONES[args.backbone](value),
     ratio_loss=DynamicsRatioLoss(make_dynamics_ratio_estimator(4, 1, WIDTHS)),
 )
-optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
-targets = SoftUpdate(loss, tau=0.005)
+optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
+targets = SoftUpdate(loss, tau=0.02)
 
 # Training: a hundred simulated steps, then as many updates
 collector = Collector(simulator, actor, frames_per_batch=100, total_frames=args.updates)

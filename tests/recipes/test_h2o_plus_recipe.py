@@ -11,7 +11,6 @@ import torch
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
-from torchrl_h2o.training.trained_policy import load_policy
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.training.environments import make_simulator
 from torchrl_h2o.training.loop import train
@@ -19,6 +18,7 @@ from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
 from torchrl_h2o.training.methods.sac import SAC
 from torchrl_h2o.training.returns import evaluate
 from torchrl_h2o.training.run_folder import Training
+from torchrl_h2o.training.trained_policy import load_policy
 
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
 

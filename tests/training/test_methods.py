@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from tests.small_runs import ROBOT, SMALL, interrupt_at, rows, run, trained
-from torchrl_h2o.training.trained_policy import load_policy
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.environments import as_observed, make_reality
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.run_folder import Training
+from torchrl_h2o.training.trained_policy import load_policy
 
 methods = pytest.mark.parametrize("name", METHODS)
 OFFLINE = ("cql", "iql")

@@ -63,7 +63,9 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
     names = {entry.name: type(entry.effect).__name__ for entry in entries}
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in names.values()):
-            raise ValueError(f"catalogue={pattern} matches no effect; choose from {', '.join(sorted(set(names.values())))}")
+            raise ValueError(
+                f"catalogue={pattern} matches no effect; choose from {', '.join(sorted(set(names.values())))}"
+            )
     return [entry for entry in entries if any(fnmatchcase(names[entry.name], pattern) for pattern in patterns)]
 
 
