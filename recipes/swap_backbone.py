@@ -96,6 +96,5 @@ with tqdm(total=args.updates, unit=" updates") as bar:
             targets.step()
         bar.update(100)
 
-episodes = int(real["next", "done"].sum())
 print(f"\nreturn in reality, of at most 1000\n  {args.backbone:<12} {mean_return(reality, actor):6.0f}")
-print(f"  {'data':<12} {len(real) / episodes:6.0f}")
+print(f"  {'data':<12} {len(real) / int(real['next', 'done'].sum()):6.0f}")
