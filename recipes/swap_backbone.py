@@ -80,8 +80,8 @@ loss = H2OPlusLoss(
     value_loss=BACKBONES[args.backbone](value),
     ratio_loss=DynamicsRatioLoss(make_dynamics_ratio_estimator(4, 1, WIDTHS)),
 )
-optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
-targets = SoftUpdate(loss, tau=0.005)
+optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
+targets = SoftUpdate(loss, tau=0.02)
 
 # Training: a hundred simulated steps, then as many updates
 collector = Collector(simulator, actor, frames_per_batch=100, total_frames=args.updates)
@@ -96,6 +96,5 @@ with tqdm(total=args.updates, unit=" updates") as bar:
             targets.step()
         bar.update(100)
 
-episodes = int(real["next", "done"].sum())
 print(f"\nreturn in reality, of at most 1000\n  {args.backbone:<12} {mean_return(reality, actor):6.0f}")
-print(f"  {'data':<12} {len(real) / episodes:6.0f}")
+print(f"  {'data':<12} {len(real) / int(real['next', 'done'].sum()):6.0f}")

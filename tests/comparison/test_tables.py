@@ -213,7 +213,7 @@ def test_one_seed_has_no_intervals(tmp_path):
     command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "take two seeds" in (tmp_path / "returns.md").read_text()
+    assert "need at least two seeds" in (tmp_path / "returns.md").read_text()
     assert not (tmp_path / "returns_aggregates.png").exists()
 
 

@@ -1,1 +1,1 @@
-"""Grids of runs, files of results, scores over tasks, and the figures of the paper's tables."""
+"""Compares methods: grids of runs, result files, scores over tasks, tables and figures."""

@@ -1,4 +1,8 @@
-"""Over all tasks of a group: interquartile mean and probability of improvement, with intervals, by rliable."""
+"""Interquartile mean and probability of improvement over all tasks of a group, with bootstrap intervals, by rliable.
+
+Methods as in Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice (2021), arXiv
+2108.13264.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,13 +30,13 @@ class Interval:
 
 @dataclass(frozen=True)
 class Scores:
-    """Normalised scores of some methods on the tasks and seeds that all of them have.
+    """Normalised scores of several methods on their common tasks and seeds.
 
     Args:
-        runs: by method, ``[num_seeds, num_runs]``. A method without simulator has one run for all gaps of its data.
-        columns: by method, which of its runs each task reads, ``[num_tasks]``.
-        tasks: that are compared.
-        seeds: of the rows.
+        runs: scores by method, ``[num_seeds, num_runs]``. An offline method has one run for all gaps of its data.
+        columns: by method, the column of ``runs`` that belongs to each task, ``[num_tasks]``.
+        tasks: the tasks compared.
+        seeds: the seed of each row of ``runs``.
     """
 
     runs: dict[str, np.ndarray]
@@ -41,39 +45,49 @@ class Scores:
     seeds: list[int]
 
     def by_task(self, name: str) -> Callable[[np.ndarray], np.ndarray]:
-        """What spreads a method's runs, or runs drawn anew of them, over the tasks: ``[num_seeds, num_tasks]``."""
+        """A function that maps (resampled) runs of a method to scores by task, ``[num_seeds, num_tasks]``."""
         return lambda runs: runs[:, self.columns[name]]
 
 
 def common_scores(table: dict[Task, dict[str, Cell]], references: Mapping[str, Reference] = REFERENCES) -> Scores:
-    """The tasks that every method of the paper has that is there at all, and the seeds that they all have in these.
+    """Select the tasks and seeds that all present methods of the paper share.
 
-    Further methods are in if they have all of these tasks and seeds.
+    Methods that the paper does not compare are included only if they have all of these tasks and seeds.
+
+    Args:
+        table: cells by task and method.
+        references: by environment, the returns that score 0 and 100.
     """
-    there = {name for cells in table.values() for name in cells}
-    methods = [name for name in SIX if name in there] or sorted(there)
+    present = {name for cells in table.values() for name in cells}
+    methods = [name for name in SIX if name in present] or sorted(present)
     tasks = sorted(task for task, cells in table.items() if set(methods) <= set(cells))
     seeds = sorted(set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods))) if tasks else []
-    further = sorted(there - set(methods))
+    further = sorted(present - set(methods))
     methods += [m for m in further if all(m in table[t] and set(seeds) <= set(table[t][m].returns) for t in tasks)]
     runs, columns = {}, {}
     for name in methods:
-        seen = [_seen(name, task) for task in tasks]
-        own = dict(zip(seen, tasks, strict=True))  # one task of each run's
+        seen = [_run_of(name, task) for task in tasks]
+        own = dict(zip(seen, tasks, strict=True))  # one task for each distinct run
         cells = [(task[0], table[task][name]) for task in own.values()]
         runs[name] = np.array([[normalised(cell.returns[s], references[env]) for env, cell in cells] for s in seeds])
         columns[name] = np.array([list(own).index(run) for run in seen], dtype=int)
     return Scores(runs, columns, tasks, seeds)
 
 
-def _seen(name: str, task: Task) -> Task:
-    """What of a task a method's run depends on: without a simulator, not on its gap."""
+def _run_of(name: str, task: Task) -> Task:
+    """The parts of a task that a method's run depends on; an offline method's run does not depend on the gap."""
     env, data, gap, *variant = task
     return (env, data, "" if name in OFFLINE else gap, *variant)
 
 
 def interquartile_means(scores: Scores, reps: int, seed: int = 0) -> dict[str, Interval]:
-    """Of each method, with an interval from runs drawn anew among the seeds."""
+    """Interquartile mean of each method, with an interval from resampling its seeds.
+
+    Args:
+        scores: normalised scores.
+        reps: bootstrap samples.
+        seed: of the bootstrap.
+    """
 
     def statistic(name: str) -> Callable:
         spread = scores.by_task(name)
@@ -83,7 +97,14 @@ def interquartile_means(scores: Scores, reps: int, seed: int = 0) -> dict[str, I
 
 
 def improvements(scores: Scores, reps: int, seed: int = 0, base: str = BASE) -> dict[str, Interval]:
-    """The probability that a run of ``base`` does better than one of each other method, averaged over tasks."""
+    """Probability that a run of ``base`` has a higher score than a run of each other method, averaged over tasks.
+
+    Args:
+        scores: normalised scores.
+        reps: bootstrap samples.
+        seed: of the bootstrap.
+        base: the method that the others are compared with.
+    """
 
     def statistic(name: str) -> Callable:
         ours, theirs = scores.by_task(base), scores.by_task(name)
@@ -95,7 +116,7 @@ def improvements(scores: Scores, reps: int, seed: int = 0, base: str = BASE) -> 
 
 def _interval(runs: np.ndarray | tuple[np.ndarray, ...], statistic: Callable, reps: int, seed: int) -> Interval:
     state = np.random.get_state()
-    np.random.seed(seed)  # rliable draws from the global generator, whatever random_state it is given
+    np.random.seed(seed)  # rliable ignores random_state and draws from the global generator
     try:
         points, bounds = library.get_interval_estimates({"": runs}, statistic, reps=reps)
     finally:

@@ -1,4 +1,4 @@
-"""Pictures of a group of runs: learning curves with bands, and the scores over all tasks with their intervals."""
+"""Draws learning curves with bands over seeds, and aggregate scores with their intervals."""
 
 import math
 from collections import defaultdict
@@ -17,11 +17,11 @@ from torchrl_h2o.training.learning_curve import COLOURS
 
 
 def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> None:
-    """Returns over the updates, an axis a task: the seeds' mean, and a band from the lowest to the highest.
+    """Draw return against updates, one panel a task: mean over seeds, and a band from the lowest to the highest seed.
 
     Args:
-        path: of the PNG.
-        rows: of a group's curves, one an evaluation, where they are to be read.
+        path: PNG file to write.
+        rows: one evaluation each, as :func:`~torchrl_h2o.comparison.scores.placed` returns them.
         titles: of the methods, in the order of the legend.
     """
     curves = _curves(rows)
@@ -49,15 +49,15 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
         axis.set_ylabel("return in reality")
     handles = {label: handle for a in axes.flat for handle, label in zip(*a.get_legend_handles_labels(), strict=True)}
     labels = [title for title in titles.values() if title in handles]
-    beside = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
-    figure.legend([handles[label] for label in labels], labels, **beside)
-    said = "The policy in training, at each evaluation;\nbands from the lowest seed to the highest"
-    figure.suptitle(said, fontsize=8)
+    legend = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
+    figure.legend([handles[label] for label in labels], labels, **legend)
+    title = "The policy in training, at each evaluation;\nbands from the lowest seed to the highest"
+    figure.suptitle(title, fontsize=8)
     _save(figure, path)
 
 
 def _curves(rows: Sequence[Row]) -> dict[tuple[Task, str], dict[int, list[float]]]:
-    """By task and method: after so many updates, the returns of all seeds."""
+    """Returns of all seeds by task and method, then by number of updates."""
     curves: dict[tuple[Task, str], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         curves[task_of(row), row["method"]][int(row["at"])].append(float(row["return_mean"]))
@@ -78,14 +78,14 @@ def draw_aggregates(
     titles: Mapping[str, str],
     note: str,
 ) -> None:
-    """Interquartile means, and the probability that H2O+ does better, each with its 95 % interval.
+    """Draw interquartile means and the probability that H2O+ does better, each with its 95 % interval.
 
     Args:
-        path: of the PNG.
-        means: by method.
-        better: by the other method.
-        titles: of the methods, from the top.
-        note: what tasks and seeds these are.
+        path: PNG file to write.
+        means: interquartile mean by method.
+        better: probability that H2O+ does better, by the method it is compared with.
+        titles: of the methods, from top to bottom.
+        note: title, naming tasks and seeds.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 0.45 * len(means) + 1.6), layout="constrained")
     _draw_intervals(left, means, titles)

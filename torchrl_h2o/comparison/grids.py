@@ -1,4 +1,7 @@
-"""The paper's tables and figures as grids of runs: each run is a list of overrides of train.py."""
+"""Grids of runs for the paper's tables and figures. A run is a list of overrides of recipes/train.py.
+
+The paper is H2O+, Niu et al. (2023), arXiv 2309.12716.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,22 +14,22 @@ from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.training.methods import METHODS
 
 SIX = ("sac", "cql", "iql", "darc", "h2o", "h2o_plus")
-OFFLINE = ("cql", "iql")  # no simulator, so no gap: one run serves the whole row
+OFFLINE = ("cql", "iql")  # without a simulator there is no gap, so one run counts for every gap
 MEDIUM, REPLAY = "halfcheetah/medium-v0", "halfcheetah/medium-replay-v0"
 ENVS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d"}
 
 
 @dataclass(frozen=True)
 class Grid:
-    """What a table or figure of the paper is made of.
+    """The factors of a table or figure; its runs are all combinations.
 
     Args:
-        methods: by the names of methods.py.
-        datasets: Minari names or files, in whose name the environment's stands; none for the robot's own.
-        gaps: by the names of the paper; those that an environment has not are left out.
+        methods: names in :data:`torchrl_h2o.training.methods.METHODS`.
+        datasets: Minari names or files whose name contains that of the environment.
+        gaps: names of the paper's gaps; combinations that an environment does not support are skipped.
         strengths: of the gap; None is the paper's.
-        tasks: environments with data of their own, instead of data sets and gaps.
-        variants: further overrides, one run each.
+        tasks: environments with their own data, used instead of data sets and gaps.
+        variants: further overrides, one tuple a run.
     """
 
     methods: tuple[str, ...] = ("h2o_plus",)
@@ -37,7 +40,11 @@ class Grid:
     variants: tuple[tuple[str, ...], ...] = field(default=((),))
 
     def runs(self, seeds: tuple[int, ...]) -> Iterator[list[str]]:
-        """The overrides of each run, seed by seed, so that a grid that is broken off has every cell once."""
+        """Yield the overrides of each run, seed by seed, so that an interrupted grid has complete seeds.
+
+        Args:
+            seeds: of the runs.
+        """
         for seed in seeds:
             worlds = [*product(self.datasets, self.gaps, self.strengths), *product(self.tasks, (None,), (None,))]
             done = set()
@@ -51,7 +58,7 @@ class Grid:
 
 
 def env_of(data: str) -> str | None:
-    """The environment whose name stands in that of a data set."""
+    """The environment whose name occurs in the data set's name, or None."""
     return next((env for env in ENVS if env in data), None)
 
 
@@ -76,7 +83,7 @@ TABLES = {
         variants=(*((f"mixing={value}",) for value in (0.0, 0.1, 0.2, 0.5, 1.0)), WITHOUT_RATIO),
     ),
     "gaps": Grid(("h2o", "h2o_plus"), (REPLAY,), strengths=(1.25, 1.5, 2.0, 3.0)),
-    "methods": Grid(SIX),  # not the paper's: on tasks of one's own
+    "methods": Grid(SIX),  # not in the paper: for tasks of your own
 }
 FIGURES = {
     "backbones": Grid(
@@ -89,58 +96,63 @@ FIGURES = {
 
 
 def group_name(cfg: DictConfig) -> str:
-    """The table or figure that was asked for.
+    """The name of the requested table or figure.
 
     Raises:
-        ValueError: if there is none of that name, or not exactly one was asked for.
+        ValueError: for an unknown name, or unless exactly one table or figure is named.
     """
     if (cfg.table is None) == (cfg.figure is None):
         raise ValueError(f"name one: table={' | '.join(TABLES)}, or figure={' | '.join(FIGURES)}")
-    kind, name, there = ("table", cfg.table, TABLES) if cfg.figure is None else ("figure", cfg.figure, FIGURES)
-    if name not in there:
-        raise ValueError(f"{kind}={name}: choose {', '.join(there)}")
+    kind, name, known = ("table", cfg.table, TABLES) if cfg.figure is None else ("figure", cfg.figure, FIGURES)
+    if name not in known:
+        raise ValueError(f"{kind}={name}: choose {', '.join(known)}")
     return name
 
 
 def chosen_grid(cfg: DictConfig) -> Grid:
-    """The grid that was asked for, with the choices of the command line in the place of the paper's.
+    """The requested grid, with the command line's choices in place of the paper's.
 
     Raises:
-        ValueError: for a choice that there is not, or that these runs would not read.
+        ValueError: for an unknown choice, or one that has no effect on these runs.
     """
     name = group_name(cfg)
-    asked = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
-    for key, value in asked.items():
+    lists = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
+    for key, value in lists.items():
         if not OmegaConf.is_list(value):
             raise ValueError(f"{key}={value}: give a list, {key}=[{value}]")
-    chosen = {key: tuple(value) for key, value in asked.items()}
-    there = {"methods": METHODS, "gaps": PAPER_GAPS}
-    for key, names in there.items():
+    chosen = {key: tuple(value) for key, value in lists.items()}
+    for key, names in {"methods": METHODS, "gaps": PAPER_GAPS}.items():
         for unknown in set(chosen.get(key, ())) - set(names):
             raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}")
     for data in chosen.get("datasets", ()):
         if env_of(data) is None:
-            raise ValueError(f"datasets=[{data}]: {' or '.join(ENVS)} is to stand in its name; see tasks=[...] too")
+            raise ValueError(
+                f"datasets=[{data}]: its name must contain {' or '.join(ENVS)}; for other environments see tasks=[...]"
+            )
     grid = Grid(**(vars((TABLES | FIGURES)[name]) | chosen))
     if not grid.datasets and not grid.tasks:
-        raise ValueError(f"{name} is of no environment yet: name tasks=[...], files in recipes/config/env/")
+        raise ValueError(f"{name} has no environment yet: name tasks=[...], files in recipes/config/env/")
     if not grid.datasets and (idle := [key for key in ("gaps", "strengths") if key in chosen]):
-        raise ValueError(f"{name} has no data sets that {' and '.join(idle)} would be put to: leave that out")
+        raise ValueError(f"{name} has no data sets, so {' and '.join(idle)} would have no effect: leave that out")
     return grid
 
 
 def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
-    """Refuses what each run of a grid says for itself.
+    """Reject overrides of settings that each run of the grid sets itself.
+
+    Args:
+        overrides: meant for all runs.
+        runs: own overrides of each run.
 
     Raises:
-        ValueError: naming what chooses among the runs.
+        ValueError: naming the option that selects runs instead.
     """
-    chooses = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
-    chooses["seed"] = "seeds"
+    selects = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
+    selects["seed"] = "seeds"
     of_runs = {key_of(override) for run in runs for override in run}
     if "gap" in of_runs:
-        of_runs.add("gap_strength")  # some of them have no gap
+        of_runs.add("gap_strength")  # runs without a gap would reject it
     for override in overrides:
         if (key := key_of(override)) in of_runs:
-            instead = f"choose with {chooses[key]}=[...]" if key in chooses else "leave it out, or take another grid"
+            instead = f"choose with {selects[key]}=[...]" if key in selects else "leave it out, or take another grid"
             raise ValueError(f"{override}: the runs of this grid set {key} themselves; {instead}")

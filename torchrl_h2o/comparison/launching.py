@@ -108,7 +108,7 @@ class GridLauncher:
         return {folder: error for folder, error in errors.items() if error is not None}
 
     def _folder(self, run: Run) -> str:
-        """The run's folder below the sweep's; a function of the run alone, so that an interrupted run is found again."""
+        """The run's folder below the sweep's, determined by the run alone, so that an interrupted run is found."""
         who = self.identity(run)
         others = who.pop("others")
         names = [f"{key}_{value}" if key in ("seed", "updates") else value for key, value in who.items() if value]

@@ -1,6 +1,7 @@
-"""The CSV of a group of runs, beside the paper's figures in recipes/results/: a row a run, and what tells runs apart.
+"""Reads and writes the results of a group of runs as CSV, such as recipes/results/returns.csv.
 
-Beside ``returns.csv`` stands ``returns_curves.csv``, a row an evaluation, for learning curves.
+Each row is one run, identified by the columns :data:`IDENTITY`. A second file, ``returns_curves.csv``, has one row an
+evaluation, for learning curves.
 """
 
 import csv
@@ -26,16 +27,16 @@ RESULT = (
     "versions",
     "command",
 )
-#: overrides that other columns tell of, or that change nothing but how numbers round
+#: overrides not listed in the column ``others``: recorded in other columns, or without effect beyond rounding
 TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
-#: overrides of paper.py, which choose among runs
+#: overrides of paper.py that choose runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "seeds", "retries"}
 EVALUATED = {"mean": "return_real", "std": "return_real_std"}
 CURVE = ("at", "return_mean", "return_std")
 
 
 def identity(cfg: DictConfig) -> dict[str, str]:
-    """What tells a run from all others of its group, as the CSV says it."""
+    """The columns that identify a run within its group, as text."""
     h2o_plus = cfg.method == "h2o_plus"
     task = cfg.env.make.get("task")
     return {
@@ -54,12 +55,12 @@ def identity(cfg: DictConfig) -> dict[str, str]:
 
 
 def key_of(override: str) -> str:
-    """What an override sets."""
+    """The key that an override sets."""
     return override.lstrip("+~").partition("=")[0]
 
 
 def repeating_command(cfg: DictConfig) -> str:
-    """What repeats a run, wherever its results go."""
+    """The command that repeats a run, without the options for results and folders."""
     chosen = [o for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
     return shlex.join(["python", "recipes/train.py", *chosen])
 
@@ -69,18 +70,18 @@ def _strength(cfg: DictConfig) -> float:
 
 
 def _short(data: str) -> str:
-    """A data set's name; of a path the last two parts, which are what a Minari name consists of."""
+    """The data set's name; for an absolute path its last two parts, as in a Minari name."""
     path = Path(data)
     return "/".join(path.parts[-2:]) if path.is_absolute() else data
 
 
 def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
-    """Appends a run that is done, from the files in its folder; a run that is in the CSV already stays as it is.
+    """Append a finished run from the files in its folder, unless the CSV already has it.
 
     Args:
-        path: the CSV of the group; made if it is not there. Several runs may append at once.
+        path: CSV of the group, created if missing. Several processes may append at once.
         cfg: the run's configuration.
-        directory: its folder, with summary.json and metrics.csv.
+        directory: the run's folder, with summary.json and metrics.csv.
     """
     summary = json.loads((directory / "summary.json").read_text())
     who = identity(cfg)
@@ -104,20 +105,26 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
 
 
 def _append(path: Path, result: Mapping, curve: Iterable[Mapping]) -> None:
-    """Appends a run's curve and its result, which says that the run is done: last, should it be killed here."""
+    """Append a run's curve, then its result: a run without a result counts as unfinished if the process is killed."""
     with uninterrupted():
         append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, result)
         append_rows(path, (*IDENTITY, *RESULT), [result], result)
 
 
 def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who: Mapping[str, str]) -> None:
-    """Appends a run's rows to a CSV, once: nothing happens if it has rows of that run."""
+    """Append a run's rows to a CSV, unless it has rows of that run.
+
+    Args:
+        path: CSV file, created if missing.
+        columns: its columns.
+        rows: the rows to append.
+        who: the run's identity.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+", newline="") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may be done at the same moment
+        fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may finish at the same time
         file.seek(0)
-        there = list(csv.DictReader(file))
-        if any(_key(row) == _key(who) for row in there):
+        if any(_key(row) == _key(who) for row in csv.DictReader(file)):
             return
         writer = csv.DictWriter(file, list(columns))
         if file.seek(0, 2) == 0:
@@ -126,7 +133,12 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
 
 
 def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
-    """Takes what other groups of the same folder have done of some runs, with the curves."""
+    """Copy results and curves of the given runs from other groups' files in the same folder.
+
+    Args:
+        path: CSV to copy to.
+        runs: identities of the runs wanted.
+    """
     missing = {_key(who) for who in runs} - recorded(path)
     for other in sorted(path.parent.glob("*.csv")):
         if other == path or not _is_group(other):
@@ -138,18 +150,18 @@ def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
 
 
 def _is_group(path: Path) -> bool:
-    """Whether a CSV, which may be anybody's, is that of a group of runs."""
+    """Whether a CSV has the columns of a results file; the folder may hold other files."""
     with open(path, newline="", errors="replace") as file:
         return next(csv.reader(file), None) == [*IDENTITY, *RESULT]
 
 
 def curves_of(path: Path) -> Path:
-    """Where the learning curves of a group stand."""
+    """Path of a group's learning curves."""
     return path.with_name(f"{path.stem}_curves.csv")
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV; none if it is not there."""
+    """The rows of a CSV; an empty list if the file is missing."""
     if not path.exists():
         return []
     with open(path, newline="") as file:
@@ -157,7 +169,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def recorded(path: Path) -> set[tuple[str, ...]]:
-    """The identities, as tuples in the order of :data:`IDENTITY`, of the runs that stand in the CSV."""
+    """Identities of the runs in the CSV, as tuples in the order of :data:`IDENTITY`."""
     return {_key(row) for row in read_rows(path)}
 
 

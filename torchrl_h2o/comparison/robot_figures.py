@@ -1,4 +1,4 @@
-"""The paper's Figures 3 and 4: how the wheel-legged robot moves in reality, and where it was in the simulator."""
+"""Draws the paper's Figures 3 and 4: the robot's motion in reality, and the states visited in the simulator."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,11 +19,11 @@ LABELS = {"standing_still": "displacement (m)", "moving_forward": "velocity (m/s
 
 
 def draw_robot(to: Path, kept: Mapping[str, np.ndarray]) -> None:
-    """Draws wheel_legged_trajectories.png and wheel_legged_diversity.png.
+    """Draw wheel_legged_trajectories.png and wheel_legged_diversity.png.
 
     Args:
-        to: where the pictures go.
-        kept: what :func:`robot_results.kept_results` gave.
+        to: folder to write to.
+        kept: arrays from :func:`~torchrl_h2o.comparison.robot_trajectories.kept_results`.
     """
     by_kind: dict[str, dict[tuple[str, str], list[np.ndarray]]] = {"way": {}, "states": {}}
     for key, array in sorted(kept.items()):
@@ -36,11 +36,11 @@ def draw_robot(to: Path, kept: Mapping[str, np.ndarray]) -> None:
 
 
 def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray]]) -> None:
-    """Figure 3: displacement standing still and velocity moving forward; a line an episode, a cross where it fell.
+    """Draw Figure 3: displacement or velocity over time, one line an episode, with a cross where the robot fell.
 
     Args:
-        path: of the PNG.
-        ways: of each run, ``[episodes, T]``, by task and method.
+        path: PNG file to write.
+        ways: trajectories ``[episodes, T]`` of each run, m or m/s, by task and method.
     """
     tasks = [task for task in SHOWN if any(key[0] == task for key in ways)]
     methods = [name for name in METHODS if any(key[1] == name for key in ways)]
@@ -61,7 +61,7 @@ def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray
         row[0].set_ylabel(f"{task.replace('_', ' ')}\n{LABELS[task]}")
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
-    figure.suptitle("In reality: a line an episode, × where the robot fell, dashed where it should be", fontsize=9)
+    figure.suptitle("In reality: one line an episode, × where the robot fell, dashed the target", fontsize=9)
     _save(figure, path)
 
 
@@ -74,11 +74,11 @@ def _draw_episode(axis: plt.Axes, value: np.ndarray, limits: tuple[float, float]
 
 
 def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]]) -> None:
-    """Figure 4: where in pitch and pitch rate the simulated data lie, and over how many nats they spread.
+    """Draw Figure 4: histogram of pitch and pitch rate in the simulated data, with its entropy.
 
     Args:
-        path: of the PNG.
-        states: of each run, counts by cell, by task and method.
+        path: PNG file to write.
+        states: histograms ``[pitch, pitch rate]`` of each run, by task and method.
     """
     tasks = [task for task in SHOWN if any(key[0] == task for key in states)]
     size = {"figsize": (9, 3.6 * len(tasks)), "layout": "constrained", "squeeze": False}

@@ -1,8 +1,8 @@
-"""What the paper's Figures 3 and 4 are drawn of: the robot's way in reality, and where it was in the simulator.
+"""Extracts the data of the paper's Figures 3 and 4 from runs: trajectories in reality, states in the simulator.
 
-Kept beside the results, in wheel_legged_figures.npz, as runs' folders do not last: for each run, by its identity in
-the CSV with ``-`` for what is empty, ``way <run>``, ``[episodes, T]``, every 0.2 s, NaN once it fell, and
-``states <run>``, ``[pitch, pitch rate]``, counts.
+They are stored in wheel_legged_figures.npz beside the results, because run folders are temporary. For each run, named
+by its identity in the CSV with ``-`` for empty columns, there is ``way <run>``, a trajectory ``[episodes, T]`` sampled
+every 0.2 s with NaN after a fall, and ``states <run>``, a histogram ``[pitch, pitch rate]``.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,21 +25,21 @@ from torchrl_h2o.training.trained_policy import load_policy
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
 EVERY = 0.2  # s
-EPISODES = 5  # the first of the run's own table
-COMPARED = ("h2o", "h2o_plus")  # whose simulated data the paper compares
+EPISODES = 5  # the first episodes of the run's own table
+COMPARED = ("h2o", "h2o_plus")  # the methods whose simulated data the paper compares
 BINS = (np.linspace(-0.55, 0.55, 56), np.linspace(-8.0, 8.0, 65))  # of pitch (rad) and pitch rate (rad/s)
 
 
 def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> dict[str, np.ndarray]:
-    """What the file holds of some runs, after what their folders hold has been added to it.
+    """Add runs that are missing in the NPZ file from their folders, and return the arrays of the requested runs.
 
     Args:
-        path: of the NPZ.
-        runs: the folder of the group's runs.
-        told: the rows of the results that are asked for; folders of other runs are left alone.
+        path: NPZ file, created if missing.
+        runs: folder of the group's runs.
+        told: rows of the results file for the requested runs; other runs are ignored.
 
     Returns:
-        The arrays by ``way`` or ``states`` and the run's identity.
+        Arrays by ``way <run>`` and ``states <run>``.
     """
     asked = {tuple(row[key] for key in IDENTITY): _name(row) for row in told}
     arrays = dict(np.load(path)) if path.exists() else {}
@@ -61,7 +61,7 @@ def _name(row: Mapping[str, str]) -> str:
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
-    """What the policy does in the first episodes of its table, ``[episodes, T]``: metres, or metres a second."""
+    """Trajectories of the policy in reality, ``[episodes, T]``: position (m) or velocity (m/s), NaN after a fall."""
     env = make_reality(cfg, EPISODES)
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         torch.manual_seed(SEED)
@@ -69,14 +69,14 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
         policy = load_policy(cfg, folder, METHODS[cfg.method].title)
         steps = env.rollout(cfg.env.make.max_episode_steps, policy, break_when_any_done=False)
     done = steps["next", "done"].squeeze(-1).long()
-    first = done.cumsum(1) - done == 0  # up to the first end, with it
+    first = done.cumsum(1) - done == 0  # up to and including the first end
     value = _in_units(cfg, steps["next", "observation"], (SHOWN[cfg.env.make.task],)).squeeze(-1)
     every = round(EVERY / cfg.env.seconds_per_step)
     return torch.where(first, value, torch.nan)[:, every - 1 :: every].float().numpy()
 
 
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
-    """Pitch (rad) and pitch rate (rad/s) of the simulated transitions that the run ended with, ``[N, 2]``."""
+    """Pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
     real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns))
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     title = METHODS[cfg.method].title
@@ -85,7 +85,7 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
 
 
 def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str]) -> torch.Tensor:
-    """Some dimensions of what a learner observed ``[*B, n]``, of the last of its frames and in their own units."""
+    """Select dimensions of the last frame of the learner's observations ``[*B, n]`` and undo their normalisation."""
     names = OBSERVATIONS[cfg.env.make.task]
     last = observation[..., -len(names) :].double()
     if cfg.observation_norm is not None:
@@ -94,12 +94,12 @@ def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str])
 
 
 def counted(states: np.ndarray) -> np.ndarray:
-    """How many of the states ``[N, 2]`` are in each cell of :data:`BINS`."""
+    """Histogram of states ``[N, 2]`` over :data:`BINS`."""
     counts, *_ = np.histogram2d(states[:, 0], states[:, 1], bins=BINS)
     return counts.astype(np.int32)
 
 
 def spread_entropy(counts: np.ndarray) -> float:
-    """Entropy (nats) of counted states: the logarithm of how many cells they fill evenly."""
+    """Entropy of a histogram, nats; its exponential is the number of evenly filled cells with the same entropy."""
     share = counts[counts > 0] / counts.sum()
     return float(-(share * np.log(share)).sum())

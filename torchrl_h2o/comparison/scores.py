@@ -1,4 +1,4 @@
-"""The rows of a group's CSV as cells of a table: what was asked (a row), by which method (a column), over the seeds."""
+"""Arranges the rows of a results file as a table: a row a task, a column a method, a cell all seeds."""
 
 import statistics
 from collections import defaultdict
@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from torchrl_h2o.comparison.grids import OFFLINE
 
-Reference = tuple[float, float]  # returns that count as 0 and as 100
-#: Returns that count as 0 and as 100: D4RL's random and expert policies (Fu et al., 2020, arXiv 2004.07219); for the
-#: robot nothing, and 30 s without a fault.
+Reference = tuple[float, float]  # returns that score 0 and 100
+#: Returns that score 0 and 100: those of D4RL's random and expert policies (Fu et al., 2020, arXiv 2004.07219); for the
+#: robot a return of 0 and 30 s without a fault.
 REFERENCES = {
     "HalfCheetah-v5": (-280.178953, 12135.0),
     "Walker2d-v5": (1.629008, 4592.3),
@@ -22,7 +22,7 @@ Task = tuple[str, ...]
 
 
 class MixedRunsError(ValueError):
-    """Runs that one table cannot hold."""
+    """Runs that cannot stand in one table."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Cell:
     """The returns of one method in one task, by seed.
 
     Args:
-        returns: mean return of each run, by its seed.
-        within: standard deviation over the episodes of each run.
-        seconds: how long an episode lasts on average, of each run.
+        returns: mean return of each run.
+        within: standard deviation over each run's episodes.
+        seconds: mean length of each run's episodes, s.
     """
 
     returns: dict[int, float] = field(default_factory=dict)
@@ -40,26 +40,26 @@ class Cell:
     seconds: dict[int, float] = field(default_factory=dict)
 
     def text(self) -> str:
-        """Mean and standard deviation over the seeds; of a single seed, over its episodes."""
+        """Mean and standard deviation over seeds (for a single seed, over its episodes), and the number of seeds."""
         values = list(self.returns.values())
         spread = statistics.stdev(values) if len(values) > 1 else next(iter(self.within.values()))
         return f"{statistics.mean(values):,.0f} ± {spread:,.0f} ({len(values)})"
 
     def lasts(self) -> str:
-        """Mean length of an episode, in s."""
+        """Mean length of an episode, s."""
         return f"{statistics.mean(self.seconds.values()):.1f}" if self.seconds else ""
 
     def score(self, reference: Reference) -> str:
-        """The mean return, normalised."""
+        """Normalised score of the mean return."""
         return f"{normalised(statistics.mean(self.returns.values()), reference):.1f}" if self.returns else ""
 
 
-#: what tells H2O+'s variants apart in the ablations, and how a table says it
+#: columns in which H2O+'s variants differ in the ablations, and their labels in tables
 VARIANTS = {"backbone": "", "mixing": "λ", "ratio": "ratio"}
 
 
 def task_of(row: Row) -> Task:
-    """What is compared across methods: environment, data, gap and strength, and then whatever else was chosen."""
+    """The task of a row, within which methods are compared: environment, data, gap, variant, other overrides."""
     variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
     gap = f"{row['gap']} {float(row['strength']):g}" if row["gap"] else ""
     others = [row["others"]] if row.get("others") else []
@@ -67,26 +67,26 @@ def task_of(row: Row) -> Task:
 
 
 def placed(rows: Iterable[Row], variants: bool) -> list[Row]:
-    """Rows where they are to be read: those of a method that saw no simulator in every gap of its data.
+    """Repeat each row of an offline method for every gap of its data, since that run counts for all of them.
 
     Args:
-        rows: of a group's CSV.
-        variants: whether H2O+'s backbone, λ and ratio tell tasks apart, as in the ablations; else they are left out.
+        rows: of a results file.
+        variants: whether H2O+'s backbone, λ and ratio separate tasks, as in the ablations; otherwise they are ignored.
     """
     rows = [dict(row) if variants else {**row, **dict.fromkeys(VARIANTS, "")} for row in rows]
     gaps = {(row["env"], row["data"], row["others"], row["gap"], row["strength"]) for row in rows if row["gap"]}
     read = []
     for row in rows:
-        there = [where[3:] for where in sorted(gaps) if where[:3] == (row["env"], row["data"], row["others"])]
-        if row["method"] in OFFLINE and not row["gap"] and there:
-            read += [{**row, "gap": gap, "strength": strength} for gap, strength in there]
+        present = [gap[3:] for gap in sorted(gaps) if gap[:3] == (row["env"], row["data"], row["others"])]
+        if row["method"] in OFFLINE and not row["gap"] and present:
+            read += [{**row, "gap": gap, "strength": strength} for gap, strength in present]
         else:
             read.append(row)
     return read
 
 
 def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
-    """Cells by task and method, of rows that are :func:`placed`.
+    """Collect rows returned by :func:`placed` into cells by task and method.
 
     Raises:
         MixedRunsError: if a method has two runs of a seed in a task.
@@ -96,8 +96,8 @@ def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
         cell, seed = table[task_of(row)].setdefault(row["method"], Cell()), int(row["seed"])
         if seed in cell.returns:
             raise MixedRunsError(
-                f"{row['method']} has two runs of seed {seed} in {' '.join(filter(None, task_of(row)))}, of another "
-                f"{', '.join(VARIANTS)}: give those a file of their own, results=..."
+                f"{row['method']} has two runs of seed {seed} in {' '.join(filter(None, task_of(row)))} that differ in "
+                f"{', '.join(VARIANTS)}: record them in a separate file with results=..."
             )
         cell.returns[seed] = float(row["return_mean"])
         cell.within[seed] = float(row["return_std"])
@@ -106,7 +106,7 @@ def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
 
 
 def normalised(value: float, reference: Reference) -> float:
-    """A return on the scale of an environment's reference, as of :data:`REFERENCES`."""
+    """Score of a return, linear between the two returns of ``reference``, which score 0 and 100."""
     low, high = reference
     return 100 * (value - low) / (high - low)
 
@@ -117,13 +117,13 @@ def markdown(
     paper: dict[Task, dict[str, str]],
     references: Mapping[str, Reference] = REFERENCES,
 ) -> str:
-    """The table, ours above the paper's, as GitHub shows it.
+    """Format the table as Markdown, our results above the paper's.
 
     Args:
-        table: of :func:`cells`.
-        titles: methods in the order of the columns, with their titles.
-        paper: the paper's cells, as text.
-        references: by environment; without one, no scores.
+        table: as :func:`cells` returns it.
+        titles: of the methods, in the order of the columns.
+        paper: the paper's cells by task and method, as text.
+        references: by environment, the returns that score 0 and 100; tasks without one get no scores.
     """
     present = [name for name in titles if any(name in methods for methods in table.values())]
     head = ["environment", "data", "gap", "variant", "", *(titles[name] for name in present)]

@@ -1,4 +1,4 @@
-"""A group's tables, learning curves and aggregates, ours beside the paper's."""
+"""Writes a group's table, learning curves and aggregate scores, with the paper's numbers for comparison."""
 
 from pathlib import Path
 
@@ -19,17 +19,17 @@ from torchrl_h2o.training.methods import METHODS
 
 TITLES = {name: method.title for name, method in METHODS.items()}
 SCORES = (
-    "Scores are returns on a scale from D4RL's random policy, 0, to its expert, 100; the robot's from nothing to 30 s "
-    "without a fault, a scale of ours."
+    "Scores are returns scaled so that D4RL's random policy scores 0 and its expert 100. For the robot, a return of 0 "
+    "scores 0 and 30 s without a fault scores 100; that scale is ours."
 )
-ABLATIONS = ("mixing", "backbones")  # one method, whose variants are compared
+ABLATIONS = ("mixing", "backbones")  # groups that compare variants of H2O+
 
 
 def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:
-    """The runs of one number of updates, so that none is set beside one that learnt for longer.
+    """Select the runs trained for one number of updates, so that only equal budgets are compared.
 
     Raises:
-        MixedRunsError: if there are several numbers and none is asked for.
+        MixedRunsError: if runs differ in their number of updates and ``updates`` is None.
     """
     budgets = sorted({int(row["updates"]) for row in rows})
     if updates is None and len(budgets) > 1:
@@ -38,7 +38,15 @@ def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]
 
 
 def report(group: str, rows: list[Row], results: Path, to: Path, references: dict[str, Reference], reps: int) -> None:
-    """Writes a group's table, learning curves and aggregates, and prints the table.
+    """Write a group's table, learning curves and aggregate scores, and print the table.
+
+    Args:
+        group: name of the table or figure.
+        rows: of its results file, all of one number of updates.
+        results: folder of the results files.
+        to: folder to write to.
+        references: by environment, the returns that score 0 and 100.
+        reps: bootstrap samples.
 
     Raises:
         MixedRunsError: if a method has two runs of a seed in a task.
@@ -48,16 +56,16 @@ def report(group: str, rows: list[Row], results: Path, to: Path, references: dic
     theirs = paper_cells(read_rows(results / "paper.csv"), group, table)
     lines = [markdown(table, TITLES, theirs, references), ""]
     lines.append(
-        "Returns in reality: mean ± standard deviation over the seeds (how many); of one seed, over its episodes."
+        "Returns in reality: mean ± standard deviation over seeds (number of seeds); for one seed, over its episodes."
     )
-    kept = "" if any("keep=" in row["others"] for row in rows) else ", by the last policy"
+    kept = "" if any("keep=" in row["others"] for row in rows) else ", with the last policy"
     lines.append(f"After {int(rows[0]['updates']):,} updates{kept}.")
     if theirs:
-        lines.append("The paper's: five seeds, 1,000,000 updates, D4RL's data.")
+        lines.append("The paper's results: five seeds, 1,000,000 updates, D4RL's data.")
     lines.append(SCORES)
-    (to / f"{group}_aggregates.png").unlink(missing_ok=True)  # of other runs, perhaps
+    (to / f"{group}_aggregates.png").unlink(missing_ok=True)  # it may show earlier runs
     if unknown := sorted({task[0] for task in table} - references.keys()):
-        lines.append(f"No scores without returns that count as 0 and 100: +references.{unknown[0]}=[...,...].")
+        lines.append(f"Scores need the returns that score 0 and 100: +references.{unknown[0]}=[...,...].")
     elif len({name for methods in table.values() for name in methods}) > 1:
         lines += ["", *aggregate_lines(group, common_scores(table, references), len(table), to, reps)]
     text = "\n".join(lines) + "\n"
@@ -71,11 +79,11 @@ def report(group: str, rows: list[Row], results: Path, to: Path, references: dic
 
 
 def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:
-    """What the methods come to over all tasks, drawn too; of one seed, whose intervals would have no width, nothing."""
+    """Draw the aggregate scores and return them as lines of text; with a single seed, return the reason for none."""
     if not scores.tasks:
-        return ["Interquartile means take a task that every method has done."]
+        return ["Interquartile means need a task that every method has finished."]
     if len(scores.seeds) < 2:
-        return ["Interquartile means and their intervals take two seeds of every method, or more."]
+        return ["Interquartile means and their intervals need at least two seeds of every method."]
     means = interquartile_means(scores, reps)
     better = improvements(scores, reps) if BASE in scores.runs else {}
     number = f"{len(scores.tasks)} of {num_tasks} tasks" if len(scores.tasks) < num_tasks else f"{num_tasks} tasks"
@@ -85,7 +93,7 @@ def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: 
 
 
 def aggregate_table(means: dict, better: dict) -> str:
-    """Interquartile means and probabilities of improvement, a line a method."""
+    """Format interquartile means and probabilities of improvement as a Markdown table, one line a method."""
     lines = ["| method | interquartile mean of the normalised score | P(H2O+ does better) |", "| --- | --- | --- |"]
     for name in (name for name in TITLES if name in means):
         chance = better[name].text() if name in better else ""
@@ -94,7 +102,13 @@ def aggregate_table(means: dict, better: dict) -> str:
 
 
 def paper_cells(rows: list[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
-    """The paper's figures for the tasks of a table."""
+    """The paper's results for the tasks of a table, as text by task and method.
+
+    Args:
+        rows: of results/paper.csv.
+        group: name of the table or figure.
+        table: our cells.
+    """
     cells: dict[Task, dict[str, str]] = {}
     for row in rows:
         if row["group"] != group:

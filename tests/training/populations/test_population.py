@@ -5,6 +5,7 @@ import torch
 from torch import nn
 from torch.distributions import Gumbel
 from torchrl.objectives import SoftUpdate
+from torchrl_h2o.objectives.functional import sample_from_noise
 
 from tests.objectives.conftest import Parts, make_batch
 from torchrl_h2o.objectives import (
@@ -15,7 +16,6 @@ from torchrl_h2o.objectives import (
     SparseValueLoss,
     total_loss,
 )
-from torchrl_h2o.objectives.functional import sample_from_noise
 from torchrl_h2o.training.populations import Population
 
 LR, TAU = 3e-3, 0.05
