@@ -186,12 +186,12 @@ def test_the_catalogue_is_filtered_by_names_of_classes(compose, robot):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["simulator=Hopper-v5"], "data=recorded is for the wheel-legged robot"),
+        (["simulator=Hopper-v5"], "data=recorded requires the wheel-legged robot"),
         (["simulator=wheel_legged", "simulator.gap_strength=2", "data=log.csv"], "belongs to a gap"),
         (["simulator=robot.xml", "data=log.csv"], "angle"),
         (["simulator=robot.xml", "data=log.csv", "simulator.coordinates={pitch: pivot}"], "the log observes angle"),
         (["simulator=nowhere.xml", "data=log.csv"], "nowhere.xml"),
-        (["simulator=robot.xml", "data=log.csv", "first_row=5000"], "take nothing of the 799 rows"),
+        (["simulator=robot.xml", "data=log.csv", "first_row=5000"], "select none of the 799 rows"),
         (
             ["simulator=robot.xml", "data=log.csv", "catalogue=[Gravitas]", "simulator.coordinates={angle: pivot}"],
             "Gra",

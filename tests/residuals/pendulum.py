@@ -1,4 +1,4 @@
-"""A motored pendulum with forces that the code under test does not know of, and data recorded from it."""
+"""A motored pendulum with forces that are in no catalogue, and data recorded from it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ Law = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class UnknownForce(ForceEffect):
-    """A law of nature: a torque as a function of position, velocity and time."""
+    """A torque as an arbitrary function of position, velocity and time."""
 
     wording: ClassVar[str] = "{size} of what nobody knows"
     size: float = parameter(unit="N·m", bounds=(-10.0, 10.0), neutral=0.0)

@@ -1,4 +1,4 @@
-"""The loop closed, end to end and blind: what was put into the real pendulum is named first, and nothing else is."""
+"""End to end: the effect put into the real pendulum is the only one reported, with its value."""
 
 from dataclasses import replace
 
@@ -75,7 +75,7 @@ def with_xml(*changes: tuple[str, str]) -> Simulation:
 
 
 def test_mass_and_gain_are_one_group_where_the_data_cannot_tell_them_apart():
-    """About a vertical axle no weight shows; without damping twice the mass is half the motor's torque."""
+    """About a vertical axle gravity has no effect; without damping, doubling the mass equals halving the gain."""
     flat = with_xml(('axis="0 1 0" damping="0.1"', 'axis="0 0 1"'), ("0 0 0 0 0 -0.5", "0 0 0 0 -0.5 0"))
     mass = CatalogueEntry(BodyMass(), ({"scale": 0.8}, {"scale": 1.25}))
     gain = CatalogueEntry(ActionGain(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -193,7 +193,7 @@ def test_what_is_in_the_simulator_is_not_found_again():
 
 
 def test_held_out_rows_are_not_fitted():
-    """From row 700 on, gravity is another one: what is fitted is that of the rows before."""
+    """Gravity changes at row 700, the first held-out one; the fit returns the value before it."""
     before, after = (recorded(SIMULATION.with_effects(Gravity(scale)), 1000) for scale in (1.3, 1.5))
     late = before.held_out[:, None]
     measured = replace(

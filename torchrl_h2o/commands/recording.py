@@ -1,4 +1,4 @@
-"""The measured data that ``close_the_loop.py`` reads: transitions, and what a log's columns say of them."""
+"""Reads the measured data of ``close-the-loop``: transitions and, for a log, the description of its columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from torchrl_h2o.training.task import Task
 
 @dataclass(frozen=True)
 class Recording:
-    """Measured transitions as tracing takes them.
+    """Measured transitions and their origin.
 
     Args:
-        transitions: TED, ``[T]``.
-        source: where they come from and which rows they are.
-        columns: of a log, None for other data.
+        transitions: TED, batch size (T,).
+        source: name of the data and of the selected rows.
+        columns: description of the log's columns; None for data that is not a log.
     """
 
     transitions: TensorDictBase
@@ -30,66 +30,72 @@ class Recording:
     columns: LogColumns | None = None
 
     def coordinates(self, chosen: Mapping[str, str] | Sequence[str] | None) -> Mapping[str, str] | list[str]:
-        """The coordinate of the model that each observation is, in the data's order, by the name of its column.
+        """Maps each observed column, in the data's order, to a coordinate of the model.
 
         Args:
-            chosen: ``simulator.coordinates``: a list of them, a mapping of those columns that have another name, or
-                None.
+            chosen: ``simulator.coordinates``: a list of coordinates, a mapping from columns whose name differs from
+                their coordinate, or None.
+
+        Returns:
+            The list itself, or a mapping from columns to coordinates.
 
         Raises:
-            ValueError: for a mapping of columns that there are not, or data whose columns have no names.
+            ValueError: if the mapping names a column that the log does not observe, or the columns have no names.
         """
         if isinstance(chosen, Sequence | ListConfig):
             return list(chosen)
         if self.columns is None:
             raise ValueError(
-                f"{self.source} does not name its columns: say which coordinates of the model they are, such as "
+                f"{self.source} does not name its columns; list the coordinates of the model that they are, such as "
                 "simulator.coordinates=[hip,hip_velocity]"
             )
         names, other = self.columns.observation, dict(chosen or {})
         unknown = [column for column in other if column not in names]
         if unknown:
-            raise ValueError(f"simulator.coordinates names {unknown[0]!r}, the log observes {', '.join(names)}")
+            raise ValueError(f"simulator.coordinates names {unknown[0]!r}, but the log observes {', '.join(names)}")
         return {name: other.get(name, name) for name in names}
 
     def control_step(self) -> float:
-        """The time between two rows, in s, as the log has it.
+        """Time between two rows, in s, from the description of the columns or the time stamps.
 
         Raises:
-            ValueError: if the data do not say.
+            ValueError: if the data contain neither.
         """
         if self.columns is not None and self.columns.dt is not None:
             return self.columns.dt
         if "time" in self.transitions.keys():
             return float(torch.diff(self.transitions["time"].flatten()).median())
-        raise ValueError(f"{self.source} does not say when its rows were taken: give simulator.control_step, in s")
+        raise ValueError(f"{self.source} has no time stamps; give simulator.control_step, in s")
 
     def check_actuators(self, model: mujoco.MjModel) -> None:
-        """Complains of actions that go by the names of the model's actuators, but in another order.
+        """Checks that actions named after the model's actuators are in the model's order.
 
         Raises:
-            ValueError: naming the right order.
+            ValueError: if they are in another order.
         """
         actions = [] if self.columns is None else list(self.columns.action)
         actuators = [model.actuator(i).name for i in range(model.nu)]
         if sorted(actions) == sorted(actuators) and actions != actuators:
             raise ValueError(
-                f"the log's actions are {', '.join(actions)}, the model's actuators {', '.join(actuators)}: put "
-                f"action: [{', '.join(actuators)}] into the columns' YAML"
+                f"the log's actions are {', '.join(actions)}, but the model's actuators are {', '.join(actuators)}; "
+                f"write action: [{', '.join(actuators)}] in the YAML file of the columns"
             )
 
 
 def read_recording(cfg: DictConfig) -> Recording:
-    """Reads what ``data`` names and takes the rows that are asked for.
+    """Reads the data that the configuration names and selects its rows.
+
+    Args:
+        cfg: configuration with ``data``, ``columns``, ``simulator``, ``first_row`` and ``transitions``.
 
     Raises:
-        ValueError: for rows that there are not, or data=recorded where there is nobody to record.
-        torchrl_h2o.data.DataError: for data that cannot be read.
+        ValueError: if no row is selected, or data=recorded is given for a simulator without a recording controller.
+        torchrl_h2o.data.DataError: if the data cannot be read.
     """
     columns = None
     if cfg.data == RECORDED:
         if cfg.simulator.get("recorded") is None:
-            raise ValueError("data=recorded is for the wheel-legged robot: name a data set, or a log and its columns")
+            raise ValueError("data=recorded requires the wheel-legged robot; name a data set, or a log and its columns")
         recorded = hydra.compose("recorded", [f"env={cfg.simulator.recorded}"])
         transitions = Task.from_config(recorded.env).read_real_data(RECORDED)
     else:
@@ -102,7 +108,7 @@ def read_recording(cfg: DictConfig) -> Recording:
         last = min(last, first + cfg.transitions)
     if not 0 <= first < last:
         raise ValueError(
-            f"first_row={first} transitions={cfg.transitions} take nothing of the {len(transitions)} rows of {cfg.data}"
+            f"first_row={first} transitions={cfg.transitions} select none of the {len(transitions)} rows of {cfg.data}"
         )
     whole = last - first == len(transitions)
     rows = f"all {last} rows" if whole else f"rows {first} to {last - 1} of {len(transitions)}"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 
-from torchrl_h2o.residuals.evidence import DISTURBED, Evidence
+from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import Judgement
+from torchrl_h2o.residuals.measured.outside import DISTURBED
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_intervals, outside_rows
+from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_intervals, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-DISTURBED = "disturbed from outside"
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,5 +52,4 @@ def gather_evidence(simulation: Simulation, measured: Measured, settings: LoopSe
         settings: thresholds of a disturbance.
     """
     suspected = outside_intervals(simulation, measured, settings=settings.outside)
-    undisturbed = measured.without(outside_rows(suspected, len(measured)), DISTURBED)
-    return Evidence(simulation, measured, undisturbed, tuple(suspected))
+    return Evidence(simulation, measured, without_intervals(measured, suspected), tuple(suspected))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from torchrl_h2o.effects import Effect
-from torchrl_h2o.residuals.evidence import DISTURBED, Evidence
+from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
 from torchrl_h2o.residuals.judge.separation import separated_by
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
-from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_rows, still_outside
+from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -74,7 +74,7 @@ def judge(
     """
     simulation, effects = evidence.simulation, explanation.effects
     disturbed = _remaining_disturbances(evidence, explanation, settings)
-    measured = evidence.measured.without(outside_rows(disturbed, len(evidence.measured)), DISTURBED)
+    measured = without_intervals(evidence.measured, disturbed)
     mended = simulation.with_effects(*_without_noise(effects))
     return Judgement(
         measured=measured,

@@ -17,6 +17,8 @@ from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, OutsideSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+DISTURBED = "disturbed from outside"  # reason for excluded rows
+
 
 @dataclass(frozen=True)
 class OutsideInterval:
@@ -56,10 +58,9 @@ def outside_intervals(
         The intervals in order, each with a margin of one window on either side; none where large residuals are
         frequent.
     """
-    starts = measured.windows(settings.horizon)
+    starts, size = _window_sizes(simulation, measured, settings, states)
     if len(starts) <= settings.neighbours:
         return []
-    size = _sizes(simulation, measured, starts, settings, states)
     surprising = np.flatnonzero(size > settings.threshold)
     if not _exceptional(starts[surprising], len(starts), settings):
         return []
@@ -89,10 +90,9 @@ def still_outside(
     Returns:
         The remaining intervals, with their sizes under the mended simulator.
     """
-    starts = measured.windows(settings.horizon)
-    if not intervals or not len(starts):
+    if not intervals:
         return []
-    size = _sizes(simulation, measured, starts, settings, None)
+    starts, size = _window_sizes(simulation, measured, settings)
     remaining = []
     for interval in intervals:
         inside = (starts >= interval.start) & (starts < interval.stop)
@@ -100,6 +100,12 @@ def still_outside(
         if largest > settings.threshold:
             remaining.append(replace(interval, size=largest))
     return remaining
+
+
+def without_intervals(measured: Measured, intervals: Sequence[OutsideInterval]) -> Measured:
+    """The data with some intervals excluded as disturbed from outside."""
+    rows = outside_rows(intervals, len(measured))
+    return measured.without(rows, DISTURBED)
 
 
 def outside_rows(intervals: Sequence[OutsideInterval], rows: int) -> np.ndarray:
@@ -117,19 +123,21 @@ def _exceptional(surprising: np.ndarray, windows: int, settings: OutsideSettings
     return 0 < len(surprising) <= settings.max_share * windows and few_events
 
 
-def _sizes(
-    simulation: Simulation,
-    measured: Measured,
-    starts: np.ndarray,
-    settings: OutsideSettings,
-    states: np.ndarray | None,
-) -> np.ndarray:
-    """Residual at the end of each window, (W): its largest dimension, in robust standard deviations."""
+def _window_sizes(
+    simulation: Simulation, measured: Measured, settings: OutsideSettings, states: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """First rows, (W), of all windows, and the residuals at their ends, (W).
+
+    The size of a residual is that of its largest dimension, in robust standard deviations.
+    """
+    starts = measured.windows(settings.horizon)
+    if not len(starts):
+        return starts, np.zeros(0)
     residual = residuals(simulation, measured, starts, settings.horizon, states=states)[:, -1]
     usual = np.nanmedian(np.abs(residual), axis=0) / 0.6745
     usual = np.maximum(usual, settings.rounding * measured.observation.std(0) + 1e-12)
     size = (np.abs(residual) / usual).max(1)
-    return np.where(np.isfinite(size), size, 0.0)  # a divergence is no evidence of a push
+    return starts, np.where(np.isfinite(size), size, 0.0)  # a divergence is no evidence of a push
 
 
 def _beginnings(

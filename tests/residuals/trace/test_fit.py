@@ -1,4 +1,4 @@
-"""Fits: parameters of one and of two effects come back, with intervals that hold, whatever values are tried."""
+"""Fits recover the parameters of one and two effects, with valid intervals, from any start."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def test_the_parameters_of_two_effects_come_back():
 
 
 def test_the_gain_of_a_sensor_comes_back():
-    """The states that windows start from are read by that sensor too."""
+    """The start states of the windows are read by the same sensor."""
     real = recorded(SIMULATION, 600)
     seen = replace(real, observation=real.observation * [1.0, 0.8], following=real.following * [1.0, 0.8])
     (found,) = fitted(Problem.pose(SIMULATION, seen), ObservationGain(0.9, entries=(1,))).effects
@@ -75,11 +75,11 @@ def test_the_95_percent_interval_holds_the_truth_in_95_percent_of_the_draws():
         for index, (name, truth) in enumerate((("scale", 1.2), ("damping", 0.05))):
             low, high = result.ci95(index)[name]
             holds.append(low < truth < high)
-    assert 0.9 < np.mean(holds) < 1.0  # those that always hold are too wide
+    assert 0.9 < np.mean(holds) < 1.0  # intervals that always hold would be too wide
 
 
 def test_values_that_the_model_cannot_have_do_not_stop_a_fit():
-    """More damping seems to be missing than the joint has: 0.1 N·m·s/rad."""
+    """The best fit, -0.11, would make the joint's total damping of 0.1 N·m·s/rad negative."""
     pushed_on = UnknownForce(0.11, lambda q, v, t: v)
     result = fitted(pose(pushed_on, rows=300), JointDamping(-0.03))
     assert result.effects[0].damping == pytest.approx(-0.1, rel=0.01)
@@ -87,7 +87,7 @@ def test_values_that_the_model_cannot_have_do_not_stop_a_fit():
 
 
 def test_bounds_of_a_parameter_are_kept():
-    """Late by less than nothing, the actions would come early."""
+    """The best fit would be a negative delay."""
     real = recorded(SIMULATION, 300)
     early = replace(real, action=np.vstack([np.zeros((1, 1)), real.action[:-1]]))
     assert fitted(Problem.pose(SIMULATION, early), ActionDelay(0.006)).effects[0].delay == pytest.approx(0.0, abs=1e-3)

@@ -1,4 +1,4 @@
-"""Screening: the entry that is missing promises most, starts near the truth, and impossible entries are passed over."""
+"""Screening: the missing entry has the highest promise and starts near the truth; impossible entries are skipped."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_effects_that_are_known_are_in_already():
 
 
 def test_an_entry_without_a_part_in_it_promises_little():
-    """A fit could not start where it stands: at nothing, the way down cannot be seen."""
+    """Its start is not neutral, because a fit would see no gradient there."""
     leads = {lead.entry.name: lead for lead in screened([Gravity(1.3)], [GRAVITY, FRICTION])}
     assert leads[FRICTION.name].promise < 0.2 < leads[GRAVITY.name].promise
     assert not leads[FRICTION.name].effect.is_neutral

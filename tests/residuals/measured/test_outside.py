@@ -1,4 +1,4 @@
-"""What happened from outside: pushes are found; what the simulator lacks is not taken for one."""
+"""Disturbances from outside: pushes are found, and missing effects are not mistaken for pushes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ from torchrl_h2o.effects import Gravity, JointFrictionLoss, JointRange
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 
-PENDULUM = Path(__file__).parents[2] / "recipes" / "models" / "simple_pendulum.xml"
+PENDULUM = Path(__file__).parents[3] / "recipes" / "models" / "simple_pendulum.xml"
 ROWS = 3000
 PUSHES = ((700, 730), (1900, 1925), (2500, 2530))  # rows
 
@@ -58,7 +58,7 @@ def test_what_the_simulator_lacks_is_no_push(simulation, effects):
 
 
 def stopped(directory, quantile):
-    """A pendulum that a stop, which the simulator has further away, keeps from a share of where it would swing."""
+    """Data of a pendulum with a stop inside its swing; in the simulator the stop is further away."""
     path = directory / "stopped.xml"
     path.write_text(PENDULUM.read_text().replace('name="hinge" type', 'name="hinge" range="-3 3" type'))
     simulation = Simulation.from_mjcf(path, ["hinge", "hinge_velocity"], 0.005)
@@ -75,7 +75,7 @@ def test_a_limit_that_is_hit_again_and_again_is_no_push(tmp_path):
 
 
 def test_a_limit_that_is_hit_twice_in_held_out_rows_is_set_aside_there_and_nowhere_else(tmp_path):
-    """Two events are no pattern yet, and no effect may be fitted to rows that are held out."""
+    """Two events do not count as recurring, and effects may not be fitted to held-out rows."""
     simulation, data, at_the_stop = stopped(tmp_path, 0.97)
     assert data.held_out[at_the_stop].all()
     intervals = outside_intervals(simulation, data)

@@ -1,4 +1,4 @@
-"""What would tell effects apart: where their predictions differ, in words, or nothing if they never do."""
+"""Description of the data that tell effects apart, or that no such data exist."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def test_the_size_of_the_difference_is_given_in_its_unit(measured):
 
 
 def test_other_effects_stay_in_beside_each_alternative(measured):
-    """Of a motor that is dead, no gain can be told."""
+    """A motor without torque has no identifiable gain."""
     alternatives = (ActionGain(1.0), ActionGain(1.1))
     free = separated_by(SIMULATION, measured, alternatives, [])
     dead = separated_by(SIMULATION, measured, alternatives, [ActionGain(0.0)])
@@ -36,7 +36,7 @@ def test_other_effects_stay_in_beside_each_alternative(measured):
 
 
 def test_other_effects_keep_their_places(measured):
-    """A bias before a motor that is dead is not seen, one behind it is."""
+    """A bias before a motor without torque has no effect; one after it has."""
     alternatives, dead = (ActionBias(0.1), ActionBias(0.2)), [ActionGain(0.0)]
     assert separated_by(SIMULATION, measured, alternatives, after=dead).startswith("no data of these sensors")
     assert "differ" in separated_by(SIMULATION, measured, alternatives, before=dead)

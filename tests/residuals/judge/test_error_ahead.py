@@ -1,4 +1,4 @@
-"""Errors so many steps ahead, and the linear floor beside them."""
+"""Errors several steps ahead, and the linear predictor for comparison."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def measured(simulation):
 
 
 def linear_system(rows=500, noise=0.0):
-    """x' = 0.9 x + 0.5 u, seen with noise."""
+    """x' = 0.9 x + 0.5 u, observed with noise."""
     rng = np.random.default_rng(0)
     action, x = rng.standard_normal((rows, 1)), np.zeros((rows + 1, 1))
     for t in range(rows):
@@ -68,7 +68,7 @@ def test_a_horizon_longer_than_the_data_has_no_figures(simulation, measured):
 
 def test_the_floor_of_a_linear_system_is_its_noise():
     assert linear_floor(linear_system(), 4).rmse[0] < 1e-6
-    # the noise of the last observation, and what is left of that of the first
+    # noise of the last observation, plus the decayed noise of the first
     expected = 0.1 * np.sqrt(1.0 + 0.9**8)
     assert linear_floor(linear_system(5000, noise=0.1), 4).rmse[0] == pytest.approx(expected, rel=0.05)
 

@@ -1,4 +1,4 @@
-"""Explanations: declared effects, a force beside them or in their place, and noise that data or simulator lack."""
+"""Explanations: catalogue effects, a force beside or instead of them, and action noise of data or simulator."""
 
 import numpy as np
 import pytest
@@ -33,14 +33,14 @@ def test_a_force_that_nobody_declared_stands_beside_declared_effects():
 
 
 def test_a_force_stands_in_the_place_of_effects_that_it_explains_better():
-    """Nothing of the ripple is left to a catalogue's friction or gravity."""
+    """Friction and gravity of the catalogue do not take a part of the ripple."""
     (part,) = explained(RIPPLE).parts
     assert not part.declared
     assert part.effect.parameters["frequency_1"].value == pytest.approx(7.0, rel=0.01)
 
 
 def test_a_force_that_starts_late_is_not_called_one_that_was_always_there():
-    """What a constant force leaves of it looks like nothing that could be put beside that force."""
+    """After a constant force is fitted, the remaining residual resembles no term beside it."""
     late = UnknownForce(0.2, lambda q, v, t: (t >= 8.0) + 0.0 * q)
     (part,) = explained(late, catalogue=[CONSTANT], rows=2500).parts
     assert not part.declared

@@ -1,4 +1,4 @@
-"""A problem: what it makes of effects does not depend on which of them were in it when its states were found."""
+"""Residuals of a problem do not depend on which effects were put in when its start states were computed."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The report as a page: all there, all escaped, nothing fetched."""
+"""The report as a page: complete, escaped, and without external resources."""
 
 import dataclasses
 import html
@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from tests.residuals.reports import full_report, no_conclusion, nothing_missing, renamed, trace
+from tests.residuals.report.made_up_reports import full_report, no_conclusion, nothing_missing, renamed, trace
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals.report import plots
 from torchrl_h2o.residuals.report.contents import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
@@ -81,7 +81,7 @@ def test_the_page_tells_of_the_data_and_of_the_test(full):
 
 
 def test_every_dimension_is_drawn(full):
-    # errors by unit, each dimension ahead and in time, twelve against the states
+    # errors per unit, each dimension over horizons and over time, twelve pictures against states
     assert full.count("svg") == 2 + 4 + 4 + 12
     for name in full_report().trace.names:
         assert f"residual of {name} (" in full.text
@@ -157,7 +157,7 @@ def test_residuals_that_are_not_numbers_are_not_drawn():
 def test_the_same_report_gives_the_same_page():
     report = dataclasses.replace(full_report(), trace=trace(rows=50))
     equal = report_page(report) == report_page(report)
-    assert equal  # a difference of a megabyte is nothing to print
+    assert equal  # keeps pytest from printing a difference of a megabyte
 
 
 def test_each_state_is_drawn_against_the_residual_that_depends_on_it():

@@ -1,4 +1,4 @@
-"""Noise: that of the action found by the scatter that it makes, that of the sensors told apart from it."""
+"""Action noise is estimated from the residuals' covariance and separated from sensor noise."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_without_noise_there_is_none():
 
 
 def test_the_simulator_s_own_noise_is_left_out():
-    """Data scatter by 0.3; the estimate says so, however much the simulator itself scatters."""
+    """The data have a standard deviation of 0.3; the simulator's own noise does not change the estimate."""
     simulation = pendulum()
     measured = recorded(simulation.with_effects(ActionNoise(0.3)), 2000)
     plain, noisy = (estimate_noise(s, measured) for s in (simulation, simulation.with_effects(ActionNoise(1.0))))
@@ -79,7 +79,7 @@ def test_derivatives_are_those_of_one_step():
 
 
 def test_noise_is_that_before_the_control_range_cuts_it_off():
-    """A third of the actions lie at the end of their range, where the model lets only a part of the noise through."""
+    """A third of the actions are at the end of their range, where the model clamps part of the noise."""
     real = pendulum().with_effects(ActionGain(1.3), ActionNoise(0.5))
     simulation = pendulum().with_effects(ActionGain(1.3))
     found = estimate_noise(simulation, recorded(real, 4000))
@@ -89,7 +89,7 @@ def test_noise_is_that_before_the_control_range_cuts_it_off():
 
 
 def test_what_scatters_more_than_the_actuators_do_is_not_theirs():
-    """As of a velocity that is read off a slow encoder: its noise is not white, and no model of a reading's is it."""
+    """A velocity from a slow encoder has coloured noise, which neither noise model describes."""
     simulation = pendulum()
     measured = recorded(simulation.with_effects(ActionNoise(0.2)), 3000)
     weak = replace(measured, action=0.1 * measured.action)

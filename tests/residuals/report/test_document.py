@@ -1,4 +1,4 @@
-"""The report as data: what it says in one sentence, and what of it a file keeps."""
+"""The report as a document: its sentence and its JSON file."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.residuals.reports import DATA, full_report, no_conclusion, nothing_missing, trace
+from tests.residuals.report.made_up_reports import DATA, full_report, no_conclusion, nothing_missing, trace
 from torchrl_h2o.data import DataError
 from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, ResidualForce, paper_gap
 from torchrl_h2o.envs import DynamicsGap
@@ -27,7 +27,7 @@ NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])
 
 
 def same(value, other):
-    """Equality by which NaN equals NaN, in dataclasses too."""
+    """Equality in which NaN equals NaN, also within dataclasses."""
     if isinstance(value, float) and isinstance(other, float):
         return value == other or (math.isnan(value) and math.isnan(other))
     if dataclasses.is_dataclass(value):
@@ -153,7 +153,7 @@ def test_the_file_is_strict_json_and_reads_back_what_it_was_given(number, option
 
 
 def expected(value):
-    """What JSON can keep of a report: a float that is not finite is NaN, or None where None may stand."""
+    """The report as JSON keeps it: floats that are not finite are NaN, or None in optional fields."""
     if isinstance(value, float):
         return value if math.isfinite(value) else math.nan
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Measured transitions: cut into runs, windows that cross nothing, and a reason where they say too little."""
+"""Measured transitions: runs, windows within runs, and a reason where they allow no conclusion."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ SIMULATION = pendulum()
 
 
 def ted(rows=300, width=2, actions=1):
-    """Every observation follows from the one before."""
+    """Each observation equals the following observation of the row before."""
     rng = torch.Generator().manual_seed(0)
     observed = torch.randn(rows + 1, width, generator=rng)
     flags = {name: torch.zeros(rows, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}

@@ -1,4 +1,4 @@
-"""The search: what explains most first, nothing that chance explains, out with what others make up for, and groups."""
+"""The search: order of the effects, no effect from noise, elimination, and groups of alternatives."""
 
 import io
 from dataclasses import replace
@@ -98,7 +98,7 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
 
 
 def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_reality():
-    """What is late and then has play is not what has play and then is late; by itself, the play shows more."""
+    """Delay and backlash do not commute; alone, backlash explains more than the delay."""
     play, late = ActionBacklash(0.4), ActionDelay(0.013)
     catalogue = [
         CatalogueEntry(ActionBacklash(), ({"width": 0.1}, {"width": 0.5})),
@@ -113,7 +113,7 @@ def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_rea
 
 
 def test_what_was_as_good_once_makes_way_for_what_is_better_now():
-    """An effect may be chosen while another is not in yet; of a group the first in the catalogue is."""
+    """An effect that was chosen before another was found is replaced by a better alternative."""
     measured = recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(0.03)), 1000)
     catalogue = [DAMPING, FRICTION, GRAVITY]
     state = SearchState.begin(Problem.pose(SIMULATION, measured), catalogue, np.random.default_rng(0))
@@ -138,7 +138,7 @@ def test_what_was_tried_is_told_with_its_loss_and_chance():
 
 
 def test_an_effect_that_only_the_fitted_rows_have_is_not_kept():
-    """Friction that is gone in the held-out rows would only harm there."""
+    """The held-out rows have no friction, so its fit increases their loss."""
     rough, smooth = (recorded(SIMULATION.with_effects(*e), 1000) for e in ((JointFrictionLoss(0.05),), ()))
     late = smooth.held_out[:, None]
     changed = {

@@ -1,4 +1,4 @@
-"""A force that nobody declared is found from data, put into words, and only where it pays."""
+"""A force outside the catalogue is found from data and described, and only where it lowers the held-out loss."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def test_perfect_simulator_lacks_nothing():
 
 
 def test_force_that_ceases_before_the_held_out_data_is_not_kept():
-    """It explains the rows that were fitted, but would only harm what comes after."""
+    """It explains the fitted rows and increases the error of the held-out ones."""
     simulation = pendulum()
     burst = UnknownForce(0.2, lambda q, v, t: (t < 21.0) * np.sin(5.0 * q))
     assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None

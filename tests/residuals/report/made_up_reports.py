@@ -1,4 +1,4 @@
-"""Made-up reports for the tests: one with something of everything, and two that name no effect."""
+"""Made-up reports: one with an entry of every kind, and two without effects."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ DATA = DataSummary("swing_up.csv", 5000, 1500, {"a gap in time": 12, "velocity c
 
 
 def full_report() -> Report:
-    """Two effects, one of them undeclared and one that cannot be told from another, and all pictures."""
+    """Three effects, one of them undeclared and one with an alternative, and the data of all pictures."""
     gravity = FoundEffect(Gravity(0.500123), True, {"scale": (0.4991, 0.5012)}, 0.011)
     mass = FoundEffect(BodyMass(1.2, "pole"), True, {"scale": (1.15, 1.26)}, 0.006)
     friction = FoundEffect(JointFrictionLoss(0.0412, "elbow"), False, {"torque": (0.0391, 0.0433)}, 0.004)
@@ -71,7 +71,7 @@ def error() -> ErrorSummary:
 
 
 def trace(rows: int = 5000) -> ResidualTrace:
-    """A residual of sin and sign before and of noise after, and a push."""
+    """A residual with a sine and a sign before, noise after, and one push."""
     rng = np.random.default_rng(0)
     time = np.arange(rows) * 0.01
     q = np.stack([2.0 * np.sin(time), np.sin(2.3 * time + 1.0)], -1)
@@ -91,7 +91,7 @@ def trace(rows: int = 5000) -> ResidualTrace:
 
 
 def nothing_missing() -> Report:
-    """Only noise: the error stands at its floor."""
+    """Noise only: the error equals its floor."""
     summary = ErrorSummary("held-out one-step RMSE", "rad/s", 0.0041, 0.0041, 0.004)
     return Report(simulator="HalfCheetah-v5", data=DATA, error=summary, two_sample=TwoSample(0.5, 0.5))
 
@@ -102,7 +102,7 @@ def no_conclusion() -> Report:
 
 
 def renamed(report: Report, text: str) -> Report:
-    """The report with a text of its reader's in every place that takes one."""
+    """The report with the same text in every field that holds a name, a unit or a description."""
     summary = report.error
     dimensions = [dataclasses.replace(d, name=f"{text}{d.name}", unit=text) for d in summary.per_dimension]
     horizons = [

@@ -1,4 +1,4 @@
-"""Whether the residual that is left is white: it is, or nearly, where nothing but noise is left."""
+"""Autocorrelation of the remaining residual: about zero where only noise remains."""
 
 import numpy as np
 

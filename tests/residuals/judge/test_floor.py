@@ -1,4 +1,4 @@
-"""The floor is what stays when a network has explained what it can."""
+"""The floor is the error that remains after a network has explained what it can."""
 
 import numpy as np
 import torch

@@ -1,4 +1,4 @@
-"""Residuals: nothing where data come from the very same simulator, also with effects of every kind in it."""
+"""Residuals are zero for data of the same simulator, also with effects of every kind put in."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ CONTROL_STEP = {"HalfCheetah-v5": 0.05, "Hopper-v5": 0.008}
 
 
 def of_every_kind(task, steps_late=2.0):
-    """The delay reaches over rows, and Hopper falls often: no run may leak into the next."""
+    """A delay carries actions over rows, and Hopper falls often: actions of one run may not enter the next."""
     return (
         Gravity(1.3),
         BodyMass(1.5, bodies="torso"),
@@ -57,9 +57,9 @@ def test_data_of_the_very_same_simulator_leave_no_residual(task, steps_late, hor
     measured = Measured.from_ted(rollout(env), simulation)
     assert len(measured.runs) > 2 or task != "Hopper-v5"
     missed = np.abs(residuals(simulation, measured, measured.windows(horizon), horizon)).max((1, 2))
-    # an env's actions are single precision, which shows where they are interpolated
+    # the env's actions are single precision, which is visible where they are interpolated
     assert np.median(missed) < (1e-6 if steps_late == 1.4 else 1e-9)
-    # an env's solver starts from its last solution, which shows in some contacts
+    # the env's solver starts from its last solution, which is visible in some contacts
     assert missed.max() < 1e-4
 
 
@@ -73,7 +73,7 @@ def test_an_effect_of_any_kind_that_is_missing_leaves_a_residual(missing):
 
 
 def exact_wheel_legged(*effects, steps=80):
-    """Measured in double precision, though the env observes in single precision, and the states that it was in."""
+    """Double-precision data of an env that observes in single precision, and its true states."""
     env = TransformedEnv(WheelLeggedEnv(), DynamicsGap(*effects)) if effects else WheelLeggedEnv()
     simulation = Simulation.from_env(env)
     data = find_backend(env).owner.data
@@ -112,7 +112,7 @@ def test_wheel_legged_robot_leaves_no_residual(effects):
 
 
 def test_hidden_coordinates_are_carried_along():
-    """How deep the wheels sink into the floor is not observed, and found by running some rows before."""
+    """The wheels' depth in the floor is not observed; it is simulated from some rows before."""
     simulation, measured, _ = exact_wheel_legged()
     at_rest = simulation.state_map.states(measured.observation)
     starts = measured.windows(1)[20:]

@@ -1,4 +1,4 @@
-"""The residual read as a force is the force that acted."""
+"""Inverse dynamics of the residual return the force that acted."""
 
 import numpy as np
 
@@ -38,7 +38,7 @@ def test_response_of_a_hinge_is_time_over_inertia():
     measured = recorded(simulation, transitions=50)
     response = force_response(simulation, measured, measured.windows(1))
     expected = simulation.control_step / simulation.model.dof_M0[0]
-    np.testing.assert_allclose(response[:, 1, 0], expected, rtol=0.05)  # damping and gravity take a little
+    np.testing.assert_allclose(response[:, 1, 0], expected, rtol=0.05)  # damping and gravity reduce it slightly
 
 
 def test_row_that_diverged_has_no_weight():

@@ -1,4 +1,4 @@
-"""States estimated from noisy sensors: nearer to the truth, not from the future, and as measured without noise."""
+"""State estimates: closer to the truth than noisy readings, causal, and equal to readings without noise."""
 
 from dataclasses import replace
 
@@ -80,7 +80,7 @@ def test_an_estimate_knows_nothing_of_the_rows_behind_it(simulation, recorded):
 def test_hidden_and_related_coordinates_follow_the_estimate(simulation, recorded):
     states = estimate_states(simulation, with_noise(Measured.from_ted(recorded, simulation)))
     np.testing.assert_allclose(states[:, 7], states[:, 4] / 0.065 - states[:, 6])  # the wheels roll
-    assert np.abs(states[20:, 1] - states[400, 1]).max() < 1e-3  # and stay sunk into the floor
+    assert np.abs(states[20:, 1] - states[400, 1]).max() < 1e-3  # and stay at the same depth in the floor
 
 
 def test_sensor_and_action_effects_of_the_simulation_are_respected(simulation, recorded):

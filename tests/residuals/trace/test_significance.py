@@ -1,4 +1,4 @@
-"""The paired test: p-values of nothing are uniform, neighbours that depend on each other no evidence."""
+"""The paired test: p-values are valid under the null hypothesis, also for dependent neighbours."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_p_values_of_no_gain_are_as_small_as_they_say_and_no_oftener(level):
 
 def test_what_is_small_and_everywhere_is_seen_beside_what_is_large_and_rare():
     everywhere = 0.01 + 0.001 * noise(0)
-    everywhere[::60] -= 0.1  # rare and the other way
+    everywhere[::60] -= 0.1  # rare, with the opposite sign
     assert p_value(everywhere) < 1e-3
     rare = np.zeros(300)
     rare[5::20] = 1.0
@@ -67,7 +67,7 @@ def robust(residual):
 @pytest.mark.parametrize("dimensions", [1, 3])
 @pytest.mark.parametrize("change", [0.1, 1.0, 10.0])
 def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_be(dimensions, change):
-    """Residuals of very different sizes, moved by what has nothing to do with them."""
+    """Residuals of very different sizes, changed by independent noise."""
     significant = 0
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -78,7 +78,7 @@ def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_b
 
 
 def test_what_vanishes_now_and_then_is_seen():
-    """In three blocks of thirty: tests on means cannot tell that from chance."""
+    """The loss vanishes in three blocks of thirty, too few for tests on means."""
     before, after = np.full(300, 1e-9), np.full(300, 1e-9)
     before[[5, 6, 7, 105, 106, 205]] = 5.0
     assert p_value(before - after) > 0.01

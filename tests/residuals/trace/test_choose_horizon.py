@@ -1,4 +1,4 @@
-"""The horizon: one step where sensors are good, further where what is missing must stand out of their noise."""
+"""Choice of the horizon: one step with good sensors, longer where a gap must exceed the sensors' noise."""
 
 import numpy as np
 
