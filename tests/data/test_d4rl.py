@@ -164,7 +164,7 @@ def test_cut_off_file_is_refused(tmp_path, share):
     path = write(tmp_path / "a.hdf5")
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(DataError, match=r"a.hdf5: .*(cut off|empty)"):
+    with pytest.raises(DataError, match=r"a.hdf5: .*(truncated|empty)"):
         load(path)
 
 

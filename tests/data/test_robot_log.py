@@ -122,7 +122,7 @@ def test_reward_column_is_what_the_action_of_its_row_earned(tmp_path):
 
 def test_reward_function_is_checked(tmp_path):
     path = write(tmp_path, "0 0 0\n1 0 0\n2 0 0\n")
-    with pytest.raises(DataError, match=r"gave the shape \[3\].*must give \[2\]"):
+    with pytest.raises(DataError, match=r"returned the shape \[3\].*must return \[2\]"):
         read_robot_log(path, WHEELS, reward=lambda *transition: np.zeros(3))
     with pytest.raises(DataError, match="the value is nan") as caught:
         read_robot_log(path, WHEELS, reward=lambda *transition: np.array([0, np.nan]))
@@ -222,7 +222,7 @@ def test_any_bad_value_is_named_by_line_and_column(tmp_path_factory, row, column
         ("t,q,q,u\n0,1,1,1\n", "q", 1, "two columns have this name"),
         ("t,q,u\n0,1,2\n1,1,2,3\n2,1,2\n", "column 4", 3, "has 4 columns, 3 are expected"),
         ("t,q,u\n0,1,2\n1,1\n2,1,2\n", "u", 3, "has 2 columns, 3 are expected"),
-        ("t,q,u\n0,1,2\n1,1,2\n2,1", "u", 4, "the file is cut off"),
+        ("t,q,u\n0,1,2\n1,1,2\n2,1", "u", 4, "the file is truncated"),
         ("t,q,u\n", None, None, "0 rows of data"),
         ("t,q,u\n0,1,2\n", None, None, "1 rows of data"),
         ("", None, None, "the file is empty"),
@@ -245,7 +245,7 @@ def test_done_other_than_zero_and_one_is_refused(tmp_path):
 def test_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "log.txt"
     path.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(DataError, match="no text"):
+    with pytest.raises(DataError, match="not text"):
         read_robot_log(path, WHEELS)
 
 

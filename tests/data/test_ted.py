@@ -70,7 +70,7 @@ def test_cut_off_file_is_refused_and_not_grown(tmp_path):
     folder = write_ted(make_recording(), tmp_path / "recording")
     file = folder / "next" / "observation.memmap"
     file.write_bytes(file.read_bytes()[:20])
-    with pytest.raises(DataError, match=r"observation.memmap.*has 20 bytes.*promises 96.*cut off"):
+    with pytest.raises(DataError, match=r"observation.memmap.*has 20 bytes.*states 96.*truncated"):
         read_ted(folder)
     assert file.stat().st_size == 20
 
@@ -215,7 +215,7 @@ def test_flags_other_than_bool_are_refused(key):
 def test_end_without_done_is_named_by_its_row(flag):
     td = make_recording()
     td["next", flag][5] = True
-    with pytest.raises(DataError, match=f"{flag} holds and done does not") as caught:
+    with pytest.raises(DataError, match=f"{flag} is true but done is false") as caught:
         require_ted(td)
     assert (caught.value.column, caught.value.row) == ("next.done", 6)
 

@@ -156,10 +156,10 @@ def test_what_a_task_writes_at_its_reset_is_no_change_by_hand(task):
 @pytest.mark.parametrize(
     ("task", "complaint"),
     [
-        (("swimmer", "swimmer6"), r"swimmer6.* builds a model from arguments \(n_joints\)"),
+        (("swimmer", "swimmer6"), r"swimmer6.* builds the model from arguments \(n_joints\)"),
         (("lqr", "lqr_2_1"), r"lqr_2_1.* from arguments \(n_bodies, n_actuators, random\)"),
         (("quadruped", "walk"), r"quadruped, task=walk.* has no function get_model_and_assets"),
-        (("dog", "walk"), r"dog, task=walk.* built with arguments of its own"),
+        (("dog", "walk"), r"dog, task=walk.* built with other arguments"),
     ],
 )
 def test_a_task_whose_model_cannot_be_built_anew_is_named(task, complaint):

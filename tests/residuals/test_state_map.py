@@ -79,14 +79,14 @@ def test_clipped_rows_are_left_out_and_counted():
 
 @pytest.mark.parametrize("task", ["Reacher-v5", "InvertedDoublePendulum-v5"])
 def test_an_observation_that_is_no_coordinate_is_refused(task):
-    with pytest.raises(ValueError, match=r"does not observe coordinates.*StateMap of your own"):
+    with pytest.raises(ValueError, match=r"does not consist of single coordinates.*StateMap of your own"):
         Simulation.from_env(GymEnv(task))
 
 
 def test_an_observation_that_mixes_coordinates_is_refused():
     task = find_backend(GymEnv("InvertedPendulum-v5")).owner
     task._get_obs = lambda: np.array([task.data.qpos.sum(), *task.data.qvel])
-    with pytest.raises(ValueError, match="does not observe coordinates"):
+    with pytest.raises(ValueError, match="does not consist of single coordinates"):
         probe_gymnasium(task, np.random.default_rng(0))
 
 
