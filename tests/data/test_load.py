@@ -1,4 +1,4 @@
-"""One call for every source, and one error for every source that cannot be used."""
+"""load(): all kinds of sources, and errors for invalid ones."""
 
 import io
 import pickle

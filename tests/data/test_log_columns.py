@@ -1,4 +1,4 @@
-"""The YAML that says what a log's columns mean, and its units."""
+"""YAML layouts of logs, and units."""
 
 import math
 
@@ -29,7 +29,7 @@ def test_yaml_is_read(tmp_path):
     layout = load(tmp_path, GOOD)
     assert layout.observation == ("wheel", "pitch")
     assert layout.action == ("torque",)
-    assert layout.dt == 0.005  # YAML 1.1 reads 5e-3 as a text
+    assert layout.dt == 0.005  # YAML 1.1 reads 5e-3 as a string
     assert layout.columns[1].factor == pytest.approx(-0.5 * 2 * math.pi / 60)
     assert layout.columns[2].bounds == (-3.0, 3.0)
 

@@ -1,4 +1,4 @@
-"""How the text of a log is cut into cells and numbers: quotes, comments, decimal commas, other columns."""
+"""Parsing of log files into cells and numbers: quotes, comments, decimal commas, other columns."""
 
 import gzip
 
@@ -49,7 +49,9 @@ def test_decimal_comma_is_read_when_asked_for(tmp_path):
     assert table(tmp_path, text, separator=";", decimal=",")[0] == [[1.5, -2], [0.3, 0.25]]
     with pytest.raises(DataError, match=r"'1,5' is not a number; .*decimal \('.'\)"):
         table(tmp_path, text, separator=";")
-    with pytest.raises(DataError, match=r"'1\.500' is not a number") as caught:  # thousands, or another decimal
+    with pytest.raises(
+        DataError, match=r"'1\.500' is not a number"
+    ) as caught:  # ambiguous: thousands or a decimal point
         table(tmp_path, text.replace("1,5", "1.500"), separator=";", decimal=",")
     assert (caught.value.column, caught.value.row) == ("q", 2)
 

@@ -1,4 +1,4 @@
-"""Minari in and out, against h5py and minari itself."""
+"""Reading and writing Minari datasets, compared with h5py and minari."""
 
 import hashlib
 import json

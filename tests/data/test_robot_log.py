@@ -1,4 +1,4 @@
-"""Robot logs: what a row means, what is left out, and where a bad value stands."""
+"""Robot logs: transitions from rows, dropped rows, and the location of invalid values."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ TIMED = LogColumns(
 
 
 def changed(layout, **changes):
-    """A layout with some options changed."""
+    """Returns a layout with some options changed."""
     return LogColumns(**{**vars(layout), **changes})
 
 
@@ -176,7 +176,7 @@ def test_stated_dt_is_held_against_the_time_column(tmp_path):
         with pytest.raises(DataError, match=f"median time step is 0.01 s, dt is {wrong:g} s") as caught:
             read_robot_log(path, changed(TIMED, dt=wrong))
         assert caught.value.column == "t"
-    coarse = timed(tmp_path, [(10 * i // 3, i, 0) for i in range(31)])  # 300 Hz by a clock of 1 ms
+    coarse = timed(tmp_path, [(10 * i // 3, i, 0) for i in range(31)])  # 300 Hz with a clock resolution of 1 ms
     assert len(read_robot_log(coarse, changed(TIMED, dt=1 / 300))) == 30
 
 
@@ -266,7 +266,7 @@ def test_real_wheel_legged_robot(shared_data, log_messages, layout, order):
     path = shared_data / "wheel_legged" / "standing_still.txt"
     td = read_robot_log(path, layout)
     raw = np.loadtxt(path)
-    end = int(np.argmax(raw[:, 5]))  # the robot is lost here
+    end = int(np.argmax(raw[:, 5]))  # the robot has fallen here
     states = torch.from_numpy(raw[: end + 1, order]).float()
     assert torch.equal(td["observation"], states[:-1])
     assert torch.equal(td["next", "observation"], states[1:])
@@ -288,6 +288,6 @@ def test_real_pendulum(shared_data, name, transitions, dt):
     steps = td["time"].diff(dim=0)
     torch.testing.assert_close(steps.median(), torch.tensor(dt).double(), rtol=1e-3, atol=0)
     assert steps.max() < 1.5 * dt
-    # the logged velocity is that of the position, up to its noise
+    # the logged velocity is the derivative of the position, up to noise
     moved = (td["next", "observation"] - td["observation"])[:, 0] / dt
     assert torch.corrcoef(torch.stack([moved, td["observation"][:, 1]]))[0, 1] > 0.9

@@ -1,4 +1,4 @@
-"""DynamicsGap on single environments: what it changes, what it leaves, when it complains."""
+"""DynamicsGap on single environments: its changes, what stays unchanged, and its errors."""
 
 import copy
 import pickle
@@ -109,7 +109,7 @@ def test_gaps_compose_and_are_counted_once():
         Compose(DynamicsGap(Gravity(2.0)), StepCounter(), DynamicsGap(Gravity(1.5))),
     )
     assert mujoco_model(both).opt.gravity[2] == pytest.approx(3 * -9.81)
-    both.rollout(2)  # StepCounter builds envs of clones of the gaps above it
+    both.rollout(2)  # StepCounter builds envs from clones of the gaps
     wrapped = TransformedEnv(both, StepCounter(step_count_key="again"), auto_unwrap=True)
     wrapped.rollout(2)
     nested = TransformedEnv(wrapped, DynamicsGap(Gravity(0.5)), auto_unwrap=False)
