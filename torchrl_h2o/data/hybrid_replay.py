@@ -102,7 +102,7 @@ class HybridReplayBuffer:
         self._sim_rows: list[torch.Tensor] = []
 
     def __len__(self) -> int:
-        """Returns the number of transitions of both streams."""
+        """Return the number of transitions of both streams."""
         return len(self.real) + len(self.sim)
 
     def __repr__(self) -> str:
@@ -167,7 +167,7 @@ class HybridReplayBuffer:
         return TensorDict(batch, batch_size=[n_real + n_sim], device=self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the simulated stream. The real data are not included, because they can be read again."""
+        """Return the simulated stream. The real data are not included, because they can be read again."""
         return {
             "real": self._fingerprint(),
             "cursor": self.sim.writer.state_dict(),
@@ -232,7 +232,7 @@ class HybridReplayBuffer:
         return torch.randint(len(rows[0]), (count,), device=self.device, generator=generator)
 
     def _find_sim_rows(self) -> None:
-        """Stores the filled part of each tensor, because looking it up is slower than gathering rows."""
+        """Store the filled part of each tensor, because looking it up is slower than gathering rows."""
         stored = self.sim.storage[:] if len(self.sim) else None
         self._sim_rows = [] if stored is None else [stored.get(key) for key in self.keys]
 

@@ -23,7 +23,7 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
     Both classes are arguments, so that :class:`LogColumns` can call this function without an import circle.
 
     Args:
-        source: a YAML file, or the name of one in the package.
+        source: a YAML file, or the name of a layout in the package.
         layout: the class of the layout, :class:`LogColumns`.
         column: the class of a column, :class:`Column`, with the field ``name``.
 

@@ -137,7 +137,7 @@ def _flags(values: np.ndarray, name: str, path: Path) -> np.ndarray:
 
 
 def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
-    """Returns the timeouts, extended by rows whose next observation differs from the following row."""
+    """Return the timeouts, extended by rows whose next observation differs from the following row."""
     led, found = (
         arrays[name][rows].astype(np.float32)
         for name, rows in (("next_observations", slice(-1)), ("observations", slice(1, None)))
@@ -152,7 +152,7 @@ def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray
 
 
 def _link_rows(arrays: dict[str, np.ndarray], path: Path) -> tuple:
-    """Returns the rows with a known next observation, that observation, and both flags."""
+    """Return the rows with a known next observation, that observation, and both flags."""
     ends = arrays["terminals"] | arrays["timeouts"]
     ends[-1] = True
     rows = np.flatnonzero(~ends)

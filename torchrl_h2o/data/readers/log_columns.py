@@ -157,7 +157,7 @@ class LogColumns:
                 raise ValueError(f"{name} {getattr(self, name)!r} must be one of {allowed}")
 
     def named(self, role: str) -> Column | None:
-        """Returns the column of a role that occurs at most once, or None."""
+        """Return the column of a role that occurs at most once, or None."""
         return next((column for column in self.columns if column.role == role), None)
 
     def _names(self, role: str) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ class LogTable:
     zero_rows: int
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """Returns the named columns in the given order, (rows, len(names))."""
+        """Return the named columns in the given order, (rows, len(names))."""
         return self.values[:, [self.names.index(name) for name in names]]
 
 

@@ -152,7 +152,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndar
 
 
 def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings) -> np.ndarray:
-    """Returns where the time between two linked rows is not dt; raises DataError unless on_time_jump is split."""
+    """Return where the time between two linked rows is not dt; raises DataError unless on_time_jump is split."""
     column = layout.named("time")
     if column is None:
         return np.zeros(len(linked), bool)
@@ -183,7 +183,7 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
 
 
 def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, str], settings: ReaderSettings) -> float:
-    """Returns the layout's dt after comparing it with the steps between linked rows, or else their median."""
+    """Return the layout's dt after comparing it with the steps between linked rows, or else their median."""
     if layout.dt is None or not len(steps):
         return float(np.median(steps)) if len(steps) else 0.0
     median = float(np.median(steps))
