@@ -1,4 +1,4 @@
-"""Recordings that the data tests share: made up and seeded, or other people's where they stand."""
+"""Recordings shared by the data tests: generated ones, and published ones if present."""
 
 import logging
 import os
@@ -10,7 +10,7 @@ from torchrl import torchrl_logger
 
 @pytest.fixture
 def shared_data():
-    """Where other people's recordings stand; they are no part of the repository."""
+    """Returns the folder of published recordings, which are not part of the repository."""
     beside = Path(__file__).parents[3] / "shared" / "data"
     folder = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", beside))
     if not folder.is_dir():
@@ -20,7 +20,7 @@ def shared_data():
 
 @pytest.fixture
 def log_messages():
-    """What the library has logged."""
+    """Returns the messages that the library has logged."""
     messages = []
     handler = logging.Handler()
     handler.emit = lambda record: messages.append(record.getMessage())

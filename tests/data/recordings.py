@@ -1,4 +1,4 @@
-"""Made-up recordings: episodes of given lengths whose every number is different."""
+"""Generated recordings: episodes of given lengths in which all numbers differ."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from torchrl_h2o.data.readers.ted import to_ted
 
 
 def make_arrays(lengths, endings, seed=0, observations=3, actions=2):
-    """Arrays of whole episodes; ``endings`` says of each whether it terminated."""
+    """Returns arrays of whole episodes; ``endings`` states for each whether it terminated."""
     rng = np.random.default_rng(seed)
     states = [rng.normal(size=(length + 1, observations)).astype(np.float32) for length in lengths]
     steps = sum(lengths)
@@ -27,18 +27,18 @@ def make_arrays(lengths, endings, seed=0, observations=3, actions=2):
 
 
 def make_recording(lengths=(4, 1, 3), endings=(True, False, False), **kwargs) -> TensorDict:
-    """The same as one flat TED TensorDict."""
+    """Returns the same episodes as a flat TED TensorDict."""
     return to_ted(**make_arrays(lengths, endings, **kwargs))
 
 
 def assert_same(found: TensorDict, expected: TensorDict) -> None:
-    """Every entry of ``expected``, bit for bit and of the same type."""
+    """Asserts that every entry equals that of ``expected``, including its dtype."""
     for key in expected.keys(True, True):
         torch.testing.assert_close(found[key], expected[key], rtol=0, atol=0, msg=str(key))
 
 
 def recordings() -> st.SearchStrategy[TensorDict]:
-    """Any few episodes, each terminated or truncated."""
+    """A strategy for a few episodes, each terminated or truncated."""
     episode = st.tuples(st.integers(1, 5), st.booleans())
     return st.builds(
         lambda drawn, seed: make_recording(*zip(*drawn, strict=True), seed=seed),

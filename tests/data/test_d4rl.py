@@ -1,4 +1,4 @@
-"""D4RL's layout, with and without next_observations."""
+"""D4RL files, with and without next_observations."""
 
 import h5py
 import numpy as np
@@ -15,7 +15,7 @@ LENGTHS = (4, 1, 3)
 
 
 def write(path, **changes):
-    """A file in D4RL's layout; ``changes`` replaces arrays, None leaves one out."""
+    """Writes a D4RL file; ``changes`` replaces arrays, None omits one."""
     made = make_arrays(LENGTHS, ENDINGS)
     arrays = {
         "observations": made["observation"],
@@ -41,7 +41,7 @@ def test_file_with_next_observations_is_read_whole(tmp_path):
 
 def test_without_next_observations_no_row_links_two_episodes(tmp_path, log_messages):
     td = read_d4rl(write(tmp_path / "a.hdf5", next_observations=None))
-    rows = torch.tensor([0, 1, 2, 5, 6])  # 3, 4 and 7 are the last of their episodes
+    rows = torch.tensor([0, 1, 2, 5, 6])  # 3, 4 and 7 are the last rows of their episodes
     whole = make_recording(LENGTHS, ENDINGS)
     for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
         assert torch.equal(td[key], whole[key][rows])
@@ -164,7 +164,7 @@ def test_cut_off_file_is_refused(tmp_path, share):
     path = write(tmp_path / "a.hdf5")
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(DataError, match=r"a.hdf5: .*(cut off|empty)"):
+    with pytest.raises(DataError, match=r"a.hdf5: .*(truncated|empty)"):
         load(path)
 
 

@@ -1,4 +1,4 @@
-"""Both streams in one batch: shares, marks, seeds, room, and a resume that continues exactly."""
+"""HybridReplayBuffer: shares of both streams, marks, seeds, capacity, and exact resumption."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS
 
 
 def stream(steps, offset=0.0, seed=0):
-    """Transitions whose every float entry tells its row: observation, action, reward are row ids."""
+    """Returns transitions whose observation, action and reward identify their row."""
     td = make_recording((steps,), (False,), seed=seed)
     ids = torch.arange(steps, dtype=torch.float32)[:, None] + offset
     for key in ("observation", "action", ("next", "observation"), ("next", "reward")):
@@ -170,7 +170,7 @@ def test_resumed_buffer_goes_on_as_the_unbroken_one(tmp_path, sim, way, scratch)
     generator = torch.get_rng_state()
     unbroken = go_on(buffer)
 
-    resumed = new("second", sim=13)  # what it held before must be forgotten
+    resumed = new("second", sim=13)  # its previous content must be discarded
     if way == "dumps":
         resumed.loads(tmp_path / "checkpoint")
     else:

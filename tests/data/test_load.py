@@ -1,4 +1,4 @@
-"""One call for every source, and one error for every source that cannot be used."""
+"""load(): all kinds of sources, and errors for invalid ones."""
 
 import io
 import pickle
@@ -35,10 +35,13 @@ def test_task_that_cannot_be_checked_is_warned_of(tmp_path, log_messages):
     for source in sources:
         log_messages.clear()
         load(source)
-        assert not any("which task" in message for message in log_messages)
+        assert not any("does not name the task" in message for message in log_messages)
         load(source, task="HalfCheetah-v5")
-        (warning,) = (message for message in log_messages if "which task" in message)
-        assert warning == f"{source} does not say which task it was recorded in: not checked to be HalfCheetah-v5"
+        (warning,) = (message for message in log_messages if "does not name the task" in message)
+        assert (
+            warning
+            == f"{source} does not name the task it was recorded in; whether it is HalfCheetah-v5 was not checked"
+        )
 
 
 def test_columns_for_what_is_no_log_are_refused(tmp_path):
@@ -46,7 +49,7 @@ def test_columns_for_what_is_no_log_are_refused(tmp_path):
     (tmp_path / "a.hdf5").write_bytes(b"\x89HDF\r\n\x1a\n")
     sources = [tmp_path / "a.hdf5", write_ted(td, tmp_path / "ted"), write_minari(td, "test-v0", root=tmp_path)]
     for source in [*sources, "halfcheetah/medium-v0"]:
-        with pytest.raises(DataError, match="columns were given, and this is no log") as caught:
+        with pytest.raises(DataError, match="columns were given, but the source is not a log") as caught:
             load(source, columns="simple_pendulum")
         assert caught.value.source == str(source)
 
@@ -123,7 +126,7 @@ def test_wrong_action_dimensions_are_refused():
 def test_integer_actions_do_not_fit_a_continuous_environment():
     td = make_recording(observations=3, actions=1)
     td["action"] = td["action"].long()
-    with pytest.raises(DataError, match=r"int64, the environment takes torch.float32"):
+    with pytest.raises(DataError, match=r"int64, the environment uses torch.float32"):
         check_specs(td, GymEnv("Pendulum-v1"))
 
 

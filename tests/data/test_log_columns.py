@@ -1,4 +1,4 @@
-"""The YAML that says what a log's columns mean, and its units."""
+"""YAML layouts of logs, and units."""
 
 import math
 
@@ -29,7 +29,7 @@ def test_yaml_is_read(tmp_path):
     layout = load(tmp_path, GOOD)
     assert layout.observation == ("wheel", "pitch")
     assert layout.action == ("torque",)
-    assert layout.dt == 0.005  # YAML 1.1 reads 5e-3 as a text
+    assert layout.dt == 0.005  # YAML 1.1 reads 5e-3 as a string
     assert layout.columns[1].factor == pytest.approx(-0.5 * 2 * math.pi / 60)
     assert layout.columns[2].bounds == (-3.0, 3.0)
 
@@ -39,12 +39,12 @@ def test_yaml_is_read(tmp_path):
     [
         ("dt: 5e-3", "dt: 0", "dt 0.0 must be a positive"),
         ("dt: 5e-3", "", "dt is missing"),
-        ("dt: 5e-3", "dt: fast", "dt: 'fast' is no number"),
-        ("dt: 5e-3", "rate: 200", "unknown entry 'rate'; known are columns, dt"),
+        ("dt: 5e-3", "dt: fast", "dt: 'fast' is not a number"),
+        ("dt: 5e-3", "rate: 200", "unknown entry 'rate'; choose from columns, dt"),
         ("unit: deg", "units: deg", "unknown entry 'units'"),
-        ("unit: deg", "unit: furlong", "'pitch'.*unknown unit 'furlong'; known are .*deg"),
-        ("name: wheel", "name: pitch", "column name 'pitch' stands there 2 times"),
-        ("role: action", "role: motor", "unknown role 'motor'; known are observation"),
+        ("unit: deg", "unit: furlong", "'pitch'.*unknown unit 'furlong'; choose from .*deg"),
+        ("name: wheel", "name: pitch", "column name 'pitch' occurs 2 times"),
+        ("role: action", "role: motor", "unknown role 'motor'; choose from observation"),
         ("role: action", "role: ignore", "bounds are for actions only"),
         (", bounds: [-3, 3]", ", bounds: [3, -3]", "must be .lowest, highest."),
         (", bounds: [-3, 3]", ", bounds: [3]", r"bounds: \[3\] must be \[lowest, highest\]"),
@@ -54,22 +54,22 @@ def test_yaml_is_read(tmp_path):
         ("scale: -0.5", "scale: 0", "scale 0.0 must be finite and not zero"),
         ('separator: ","', 'separator: "ab"', "separator 'ab'"),
         ("header: true", "header: perhaps", "header 'perhaps' must be one of"),
-        ("role: observation, unit: deg", "role: time, unit: deg", "none of time"),
+        ("role: observation, unit: deg", "role: time, unit: deg", "is not a unit of time"),
         ("role: observation, unit: deg", "unit: deg", "role"),
-        ("columns:", "columns: [", "no YAML"),
-        ("dt: 5e-3", "dt: 5e-3\ndt: 1", "row 5: the entry 'dt' stands there twice"),
-        ("unit: deg", "unit: deg, unit: rad", "the entry 'unit' stands there twice"),
+        ("columns:", "columns: [", "invalid YAML"),
+        ("dt: 5e-3", "dt: 5e-3\ndt: 1", "row 5: duplicate entry 'dt'"),
+        ("unit: deg", "unit: deg, unit: rad", "duplicate entry 'unit'"),
         ("dt: 5e-3", "? [dt]\n: 1", "row 4: found unhashable key"),
-        ("dt: 5e-3", "dt: 5ms", "dt: '5ms' is no number"),
-        ("dt: 5e-3", "dt: yes", "dt: True is no number"),
-        ("dt: 5e-3", "dt: 1\ntime_tolerance: wide", "time_tolerance: 'wide' is no number"),
+        ("dt: 5e-3", "dt: 5ms", "dt: '5ms' is not a number"),
+        ("dt: 5e-3", "dt: yes", "dt: True is not a number"),
+        ("dt: 5e-3", "dt: 1\ntime_tolerance: wide", "time_tolerance: 'wide' is not a number"),
         ("dt: 5e-3", "dt: 1\ntime_tolerance: .nan", "time_tolerance nan must be positive"),
-        ("scale: -0.5", "scale: left", "'wheel'.*scale: 'left' is no number"),
-        ("scale: -0.5", "scale: [1]", r"scale: \[1\] is no number"),
+        ("scale: -0.5", "scale: left", "'wheel'.*scale: 'left' is not a number"),
+        ("scale: -0.5", "scale: [1]", r"scale: \[1\] is not a number"),
         ("[-3, 3]", "3", r"bounds: 3 must be \[lowest, highest\]"),
-        ("[-3, 3]", "[-3, x]", "bounds: 'x' is no number"),
-        ("name: wheel", "name: on", "'True'.*name True is no text: put it in quotes"),
-        ("name: wheel", "name: 1", "name 1 is no text: put it in quotes"),
+        ("[-3, 3]", "[-3, x]", "bounds: 'x' is not a number"),
+        ("name: wheel", "name: on", "'True'.*name True is not a string: quote it"),
+        ("name: wheel", "name: 1", "name 1 is not a string: quote it"),
         ("[wheel, pitch]", "[wheel, on]", "observation: .*True.* must be a list of column names"),
         ("[wheel, pitch]", "wheel", "observation: 'wheel' must be a list of column names"),
         ('separator: ","', "separator: 1", "separator 1 must be"),
@@ -85,7 +85,7 @@ def test_contradiction_is_refused(tmp_path, old, new, message):
 
 @pytest.mark.parametrize("text", ["", "- a", "columns: 3", "columns: [a, b]"])
 def test_other_yaml_is_refused(tmp_path, text):
-    with pytest.raises(DataError, match=r"no mapping|no list"):
+    with pytest.raises(DataError, match=r"not a mapping|not a list"):
         load(tmp_path, text)
 
 

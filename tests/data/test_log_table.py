@@ -1,4 +1,4 @@
-"""How the text of a log is cut into cells and numbers: quotes, comments, decimal commas, other columns."""
+"""Parsing of log files into cells and numbers: quotes, comments, decimal commas, other columns."""
 
 import gzip
 
@@ -24,7 +24,7 @@ def test_quoted_cells_may_hold_the_separator(tmp_path):
 
 @pytest.mark.parametrize("line", ['1,"2', '"1"0,2', '"1,2'])
 def test_broken_quotes_are_named_by_their_line(tmp_path, line):
-    with pytest.raises(DataError, match="cannot be cut into cells") as caught:
+    with pytest.raises(DataError, match="cannot be split into cells") as caught:
         table(tmp_path, f"q,u\n1,2\n{line}\n3,4\n")
     assert caught.value.row == 3
 
@@ -47,9 +47,11 @@ def test_comments_are_skipped_when_asked_for_and_counted_as_lines(tmp_path, sepa
 def test_decimal_comma_is_read_when_asked_for(tmp_path):
     text = "q;u\n1,5;-2\n3e-1;,25\n"
     assert table(tmp_path, text, separator=";", decimal=",")[0] == [[1.5, -2], [0.3, 0.25]]
-    with pytest.raises(DataError, match=r"'1,5' is no number; .*decimal \('.'\)"):
+    with pytest.raises(DataError, match=r"'1,5' is not a number; .*decimal \('.'\)"):
         table(tmp_path, text, separator=";")
-    with pytest.raises(DataError, match=r"'1\.500' is no number") as caught:  # thousands, or another decimal
+    with pytest.raises(
+        DataError, match=r"'1\.500' is not a number"
+    ) as caught:  # ambiguous: thousands or a decimal point
         table(tmp_path, text.replace("1,5", "1.500"), separator=";", decimal=",")
     assert (caught.value.column, caught.value.row) == ("q", 2)
 
@@ -68,7 +70,7 @@ def test_other_columns_are_ignored_when_asked_for(tmp_path):
 
 
 def test_underscore_in_a_number_is_refused(tmp_path):
-    with pytest.raises(DataError, match="'1_5' is no number") as caught:
+    with pytest.raises(DataError, match="'1_5' is not a number") as caught:
         table(tmp_path, "q,u\n1,2\n3,1_5\n")
     assert (caught.value.column, caught.value.row) == ("u", 3)
 
@@ -76,7 +78,7 @@ def test_underscore_in_a_number_is_refused(tmp_path):
 def test_compressed_file_is_named_under_any_name(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(gzip.compress(b"q,u\n1,2\n3,4\n"))
-    with pytest.raises(DataError, match="compressed by gzip; unpack"):
+    with pytest.raises(DataError, match="compressed with gzip; unpack"):
         read_table(path, LogColumns(COLUMNS, dt=0.01, separator=",", header=True))
 
 
@@ -88,8 +90,8 @@ def test_compressed_file_is_named_under_any_name(tmp_path):
         ({"decimal": ";"}, "decimal ';' must be one of"),
         ({"decimal": ",", "separator": ","}, "decimal and separator are both ','"),
         ({"other_columns": "drop"}, "other_columns 'drop' must be one of"),
-        ({"other_columns": "ignore"}, "other_columns: ignore needs a header"),
-        ({"separator": '"'}, "cannot stand between cells"),
+        ({"other_columns": "ignore"}, "other_columns: ignore requires a header"),
+        ({"separator": '"'}, "cannot separate cells"),
     ],
 )
 def test_contradicting_options_are_refused(options, message):

@@ -1,4 +1,4 @@
-"""Minari in and out, against h5py and minari itself."""
+"""Reading and writing Minari datasets, compared with h5py and minari."""
 
 import hashlib
 import json
@@ -152,7 +152,7 @@ def test_recording_without_reward_is_not_written(tmp_path):
 
 @pytest.mark.parametrize("name", ["no-version", "bad name-v0"])
 def test_name_that_minari_would_not_take_is_refused(tmp_path, name):
-    with pytest.raises(DataError, match="not a name that Minari takes"):
+    with pytest.raises(DataError, match="not a valid Minari name"):
         write_minari(make_recording(), name, root=tmp_path)
 
 
@@ -168,7 +168,7 @@ def test_cut_off_file_is_refused(tmp_path, share):
     file = folder / "data" / "main_data.hdf5"
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(DataError, match=r"cannot be read.*cut off"):
+    with pytest.raises(DataError, match=r"cannot be read.*truncated"):
         read_minari(folder)
 
 
@@ -184,7 +184,7 @@ def test_metadata_that_promise_more_are_refused(tmp_path):
     folder = write_minari(make_recording(), "test-v0", root=tmp_path)
     file = folder / "data" / "metadata.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "total_steps": 9}))
-    with pytest.raises(DataError, match="promise 9 steps, the file holds 8"):
+    with pytest.raises(DataError, match="state 9 steps, the file contains 8"):
         read_minari(folder)
 
 

@@ -1,4 +1,4 @@
-"""Robot logs: what a row means, what is left out, and where a bad value stands."""
+"""Robot logs: transitions from rows, dropped rows, and the location of invalid values."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ TIMED = LogColumns(
 
 
 def changed(layout, **changes):
-    """A layout with some options changed."""
+    """Returns a layout with some options changed."""
     return LogColumns(**{**vars(layout), **changes})
 
 
@@ -122,7 +122,7 @@ def test_reward_column_is_what_the_action_of_its_row_earned(tmp_path):
 
 def test_reward_function_is_checked(tmp_path):
     path = write(tmp_path, "0 0 0\n1 0 0\n2 0 0\n")
-    with pytest.raises(DataError, match=r"gave the shape \[3\].*must give \[2\]"):
+    with pytest.raises(DataError, match=r"returned the shape \[3\].*must return \[2\]"):
         read_robot_log(path, WHEELS, reward=lambda *transition: np.zeros(3))
     with pytest.raises(DataError, match="the value is nan") as caught:
         read_robot_log(path, WHEELS, reward=lambda *transition: np.array([0, np.nan]))
@@ -176,7 +176,7 @@ def test_stated_dt_is_held_against_the_time_column(tmp_path):
         with pytest.raises(DataError, match=f"median time step is 0.01 s, dt is {wrong:g} s") as caught:
             read_robot_log(path, changed(TIMED, dt=wrong))
         assert caught.value.column == "t"
-    coarse = timed(tmp_path, [(10 * i // 3, i, 0) for i in range(31)])  # 300 Hz by a clock of 1 ms
+    coarse = timed(tmp_path, [(10 * i // 3, i, 0) for i in range(31)])  # 300 Hz with a clock resolution of 1 ms
     assert len(read_robot_log(coarse, changed(TIMED, dt=1 / 300))) == 30
 
 
@@ -222,7 +222,7 @@ def test_any_bad_value_is_named_by_line_and_column(tmp_path_factory, row, column
         ("t,q,q,u\n0,1,1,1\n", "q", 1, "two columns have this name"),
         ("t,q,u\n0,1,2\n1,1,2,3\n2,1,2\n", "column 4", 3, "has 4 columns, 3 are expected"),
         ("t,q,u\n0,1,2\n1,1\n2,1,2\n", "u", 3, "has 2 columns, 3 are expected"),
-        ("t,q,u\n0,1,2\n1,1,2\n2,1", "u", 4, "the file is cut off"),
+        ("t,q,u\n0,1,2\n1,1,2\n2,1", "u", 4, "the file is truncated"),
         ("t,q,u\n", None, None, "0 rows of data"),
         ("t,q,u\n0,1,2\n", None, None, "1 rows of data"),
         ("", None, None, "the file is empty"),
@@ -245,7 +245,7 @@ def test_done_other_than_zero_and_one_is_refused(tmp_path):
 def test_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "log.txt"
     path.write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(DataError, match="no text"):
+    with pytest.raises(DataError, match="not text"):
         read_robot_log(path, WHEELS)
 
 
@@ -266,7 +266,7 @@ def test_real_wheel_legged_robot(shared_data, log_messages, layout, order):
     path = shared_data / "wheel_legged" / "standing_still.txt"
     td = read_robot_log(path, layout)
     raw = np.loadtxt(path)
-    end = int(np.argmax(raw[:, 5]))  # the robot is lost here
+    end = int(np.argmax(raw[:, 5]))  # the robot has fallen here
     states = torch.from_numpy(raw[: end + 1, order]).float()
     assert torch.equal(td["observation"], states[:-1])
     assert torch.equal(td["next", "observation"], states[1:])
@@ -288,6 +288,6 @@ def test_real_pendulum(shared_data, name, transitions, dt):
     steps = td["time"].diff(dim=0)
     torch.testing.assert_close(steps.median(), torch.tensor(dt).double(), rtol=1e-3, atol=0)
     assert steps.max() < 1.5 * dt
-    # the logged velocity is that of the position, up to its noise
+    # the logged velocity is the derivative of the position, up to noise
     moved = (td["next", "observation"] - td["observation"])[:, 0] / dt
     assert torch.corrcoef(torch.stack([moved, td["observation"][:, 1]]))[0, 1] > 0.9

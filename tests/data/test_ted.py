@@ -1,4 +1,4 @@
-"""The common form, its memory map, and what is refused before it is opened."""
+"""TED, its memory map, and files that are rejected before they are opened."""
 
 import pickle
 import shutil
@@ -70,7 +70,7 @@ def test_cut_off_file_is_refused_and_not_grown(tmp_path):
     folder = write_ted(make_recording(), tmp_path / "recording")
     file = folder / "next" / "observation.memmap"
     file.write_bytes(file.read_bytes()[:20])
-    with pytest.raises(DataError, match=r"observation.memmap.*has 20 bytes.*promises 96.*cut off"):
+    with pytest.raises(DataError, match=r"observation.memmap.*has 20 bytes.*states 96.*truncated"):
         read_ted(folder)
     assert file.stat().st_size == 20
 
@@ -175,7 +175,7 @@ def test_reward_of_the_wrong_shape_is_refused():
 
 @pytest.fixture
 def float64_folder(tmp_path):
-    """What a MuJoCo simulator records: float64."""
+    """Returns the folder of a float64 recording from a MuJoCo simulator."""
     recorded = GymEnv("InvertedPendulum-v5").rollout(5)
     assert recorded["observation"].dtype == torch.float64
     return write_ted(recorded, tmp_path / "float64")
@@ -215,7 +215,7 @@ def test_flags_other_than_bool_are_refused(key):
 def test_end_without_done_is_named_by_its_row(flag):
     td = make_recording()
     td["next", flag][5] = True
-    with pytest.raises(DataError, match=f"{flag} holds and done does not") as caught:
+    with pytest.raises(DataError, match=f"{flag} is true but done is false") as caught:
         require_ted(td)
     assert (caught.value.column, caught.value.row) == ("next.done", 6)
 
@@ -238,7 +238,7 @@ def test_whole_episodes_are_continuous(td):
 
 @pytest.mark.parametrize("row", [1, 3, 6])
 def test_row_that_begins_elsewhere_is_named(row):
-    td = make_recording()  # episodes begin in the rows 0, 4 and 5
+    td = make_recording()  # episodes begin at rows 0, 4 and 5
     td["observation"][row, 1] += 1e-3
     with pytest.raises(DataError, match="not the next observation") as caught:
         require_continuous(td, source="here")
@@ -246,7 +246,7 @@ def test_row_that_begins_elsewhere_is_named(row):
 
 
 def test_killed_writer_is_no_obstacle(tmp_path):
-    """A partial folder that a killed process left does not stop the next one."""
+    """A partial folder left by a killed process does not prevent the next write."""
     (tmp_path / ".recording.partial").mkdir()
     (tmp_path / ".recording.partial" / "junk").write_text("junk")
     folder = write_ted(make_recording(), tmp_path / "recording")

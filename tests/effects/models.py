@@ -1,4 +1,4 @@
-"""Small models for the tests, and what is needed to compare compiled ones."""
+"""Small models for the tests, and functions that compare compiled models."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The catalogue that is generated for a model."""
+"""The catalogue of a model: its entries, selections and trials."""
 
 from pathlib import Path
 
@@ -114,13 +114,13 @@ def test_an_undriven_hinge_on_the_world_is_a_bearing():
 def test_what_can_change_nothing_is_left_out():
     kinds = {type(entry.effect) for entry in entries_of("wheel_legged")}
     assert JointRange not in kinds  # no joint has a range
-    assert JointStiffness not in kinds  # nor a spring
+    assert JointStiffness not in kinds  # no joint has a spring
     kinds = {type(entry.effect) for entry in entries_of("InvertedPendulum")}
     assert GeomFriction not in kinds  # nothing collides
     sizes = [entry.effect.geoms for entry in entries_of("wheel_legged") if isinstance(entry.effect, GeomSize)]
-    assert not {"floor", "face", "left_hip"} & set(sizes)  # the world's, massless ones
+    assert not {"floor", "face", "left_hip"} & set(sizes)  # geoms of the world, and geoms without mass
     frictions = [entry for entry in entries_of("HalfCheetah") if entry.name == "GeomFriction bfoot"]
-    # the floor's friction is as large: only more of it is felt
+    # the floor has the same friction, so only an increase changes the contacts
     assert [trial["scale"] for trial in frictions[0].trials] == [1.25, 2.0]
 
 

@@ -1,4 +1,4 @@
-"""Every effect: checked parameters, a neutral value, words."""
+"""Properties of all effects: validated parameters, neutral values and descriptions."""
 
 import dataclasses
 import math
@@ -47,7 +47,7 @@ def test_an_effect_off_its_neutral_value_says_so_in_words_with_units(effect):
     for name, parameter in effect().parameters.items():
         off = [effect(**{name: bound}) for bound in parameter.bounds if bound != parameter.neutral]
         assert not any(changed.is_neutral for changed in off)
-        # less than none may be said in words
+        # a description may word a negative value differently
         assert all(str(changed.parameters[name]).lstrip("-") in changed.describe() for changed in off)
         assert len({changed.describe() for changed in [effect(), *off]}) == 1 + len(off)
 
@@ -71,7 +71,7 @@ def test_a_value_that_is_no_number_is_refused():
 
 
 def test_an_effect_is_a_frozen_value():
-    effect = GeomSize(2, geoms=["a", "b"])  # as a configuration file gives it
+    effect = GeomSize(2, geoms=["a", "b"])  # a list, as from a configuration file
     assert effect == GeomSize(2.0, geoms=("a", "b"))
     assert hash(effect) == hash(GeomSize(2.0, geoms=("a", "b")))
     assert pickle.loads(pickle.dumps(effect)) == effect

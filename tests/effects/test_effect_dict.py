@@ -1,4 +1,4 @@
-"""Effects as dictionaries that JSON can hold."""
+"""Conversion of effects to JSON-compatible dictionaries and back."""
 
 import json
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Effects on where the mass of bodies lies."""
+"""Effects on mass, centre of mass and inertia of bodies."""
 
 import mujoco
 import numpy as np
@@ -8,7 +8,7 @@ from tests.effects.models import CART, as_bytes, spec
 from torchrl_h2o.effects import BodyCentreOfMass, BodyInertia, BodyMass, GeomSize, Payload, compile_model
 
 INERTIAL = ("body_mass", "body_ipos", "body_inertia")
-# as the compiler is told, the inertial of "derived" does not count and that of "given" does
+# with inertiafromgeom="true" the compiler ignores the inertial of "derived", which has a geom, and uses that of "given"
 IGNORED = """
 <mujoco model="ignored"><compiler inertiafromgeom="true"/><worldbody>
   <body name="given"><joint axis="0 1 0"/><inertial pos=".1 0 0" mass="3" diaginertia="1 2 2.5"/>
@@ -21,7 +21,7 @@ MODELS = ["HalfCheetah", "Walker2d", "Ant", CART, IGNORED]
 
 
 def inertia_of(model: mujoco.MjModel, body: str) -> np.ndarray:
-    """The inertia (3, 3) about the centre of mass, in the body's frame."""
+    """Returns the inertia (3, 3) about the centre of mass, in the body's frame."""
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, model.body(body).iquat)
     axes = axes.reshape(3, 3)
@@ -68,7 +68,7 @@ def test_a_payload_is_what_a_small_heavy_ball_is(model):
     after = compile_model(spec(model), [Payload(2.0, x=0.3, y=0.1, z=-0.2, bodies=name)])
     assert (after.nbody, after.ngeom) == (before.nbody, before.ngeom)
     np.testing.assert_allclose(after.body_mass.sum(), before.body_mass.sum() + 2.0, rtol=1e-9)
-    # the same two masses as bodies of their own, welded together: their common inertia at the joint
+    # reference: the two masses as separate bodies welded together, with their common inertia at the joint
     welded = mujoco.MjSpec()
     root = welded.worldbody.add_body()
     root.add_freejoint()

@@ -1,4 +1,4 @@
-"""Effects that edit the model."""
+"""Effects on the model."""
 
 import mujoco
 import numpy as np
@@ -117,7 +117,7 @@ def test_rolling_resistance_slows_a_rolling_wheel_by_its_coefficient():
         model = compile_model(mujoco.MjSpec.from_string(wheel), effects)
         data = mujoco.MjData(model)
         data.qvel[:] = 1.0, 0.0, 10.0
-        mujoco.mj_step(model, data, nstep=400)  # contact settles
+        mujoco.mj_step(model, data, nstep=400)  # until the contact has settled
         start = data.qvel[0]
         mujoco.mj_step(model, data, nstep=400)
         return (start - data.qvel[0]) / 0.2
@@ -171,7 +171,7 @@ def test_an_exact_name_is_no_pattern():
 
 def test_edits_are_made_in_their_order():
     doubled = compile_model(spec("HalfCheetah"), [BodyMass(2.0), GeomSize(2.0, geoms="bfoot")])
-    # BodyMass doubles the total that the compiler then shares out over the larger foot
+    # BodyMass doubles the total mass, which the compiler distributes over the larger foot
     assert doubled.body_mass.sum() == pytest.approx(28.0)
     model = compile_model(spec(CART), [GeomFriction(0.5), GeomFriction(0.5)])
     np.testing.assert_array_equal(model.geom("rod").friction, [0.25, 0.00125, 0.000025])

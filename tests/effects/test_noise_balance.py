@@ -1,4 +1,4 @@
-"""Noise that is taken away: what is left of the noise before it, and when there is not enough."""
+"""Negative noise: the remaining noise of the effects before it, and errors if there is too little."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The paper's gaps against the authors' text edit of the MJCF, written anew here."""
+"""The paper's gaps, compared with a reimplementation of the authors' text edit of the MJCF."""
 
 import re
 
@@ -9,7 +9,7 @@ import pytest
 from tests.effects.models import as_bytes, spec, task_xml
 from torchrl_h2o.effects import PAPER_GAPS, compile_model, paper_gap
 
-# gap: the attribute whose numbers are multiplied, in lines that hold the word
+# gap: the attribute whose numbers are multiplied, and a word that selects the lines
 TEXT_EDITS = {
     "gravity": ("gravity", "", 2.0),
     "friction": ("friction", "", 0.3),
@@ -26,7 +26,7 @@ COMPARED += ("geom_friction", "jnt_range", "jnt_stiffness", "actuator_ctrlrange"
 
 
 def edited_text(xml: str, attribute: str, word: str, factor: float) -> str:
-    # Walker2d leaves its gravity to MuJoCo's default, which a text edit needs to see
+    # Walker2d uses MuJoCo's default gravity, which must be written out for a text edit
     if "gravity=" not in xml:
         xml = xml.replace("<option ", '<option gravity="0 0 -9.81" ')
 
@@ -34,7 +34,7 @@ def edited_text(xml: str, attribute: str, word: str, factor: float) -> str:
         numbers = " ".join(repr(factor * float(number)) for number in match[1].split())
         return f'{attribute}="{numbers}"'
 
-    # the look-behind spares ctrlrange, which the authors' own pattern hits by accident
+    # the look-behind excludes ctrlrange, which the authors' pattern changes unintentionally
     pattern = rf'(?<![a-z]){attribute}="(.*?)"'
     return "\n".join(re.sub(pattern, multiplied, line) if word in line else line for line in xml.splitlines())
 

@@ -1,4 +1,4 @@
-"""ResidualForce: a force written as text acts as it reads, and survives a JSON file."""
+"""ResidualForce: the force equals its text form and is preserved by JSON."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Effects on springs, contacts, the direction of gravity and the clock, by what they do to a motion."""
+"""Effects on springs, contacts, the direction of gravity and the timestep, tested by the resulting motion."""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,4 @@
-"""Effects on whole recorded runs and on many states at once, against what they do step by step."""
+"""Effects on whole runs and on many states at once, compared with their step-by-step result."""
 
 import mujoco
 import numpy as np
@@ -110,7 +110,7 @@ def test_backlash_moves_only_when_it_is_pushed(commands, width):
     moves = np.diff(executed, prepend=0.0)
     pushed = np.isclose(np.abs(executed - commands), width / 2)
     assert pushed[moves != 0.0].all()
-    # it is dragged along: what moves up stands below the command
+    # the executed action lags: while it increases, it lies below the command
     assert ((executed <= commands + 1e-12) | (moves <= 0.0)).all()
 
 

@@ -1,4 +1,4 @@
-"""Effects as a user would write them, for the tests."""
+"""User-defined effects for the tests."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from torchrl_h2o.effects import ActionEffect, ForceEffect, parameter
 
 @dataclass(frozen=True)
 class ControlForce(ForceEffect):
-    """On the first degree of freedom, in proportion to the first control."""
+    """A force on the first degree of freedom, proportional to the first control."""
 
     wording: ClassVar[str] = "{gain} per control"
     gain: float = parameter(unit="N", bounds=(-1e6, 1e6), neutral=0.0)
@@ -26,7 +26,7 @@ class ControlForce(ForceEffect):
 
 @dataclass(frozen=True)
 class Gust(ForceEffect):
-    """The same force all through an episode, another in the next, and a count of physics steps."""
+    """A force that is constant within an episode and random between episodes; counts its physics steps."""
 
     wording: ClassVar[str] = "gusts of {strength}"
     random: ClassVar[bool] = True
@@ -48,7 +48,7 @@ class Gust(ForceEffect):
 
 @dataclass(frozen=True)
 class ForgetfulNoise(ActionEffect):
-    """Noise whose author forgot to say that it is random."""
+    """Noise whose class is not marked random."""
 
     wording: ClassVar[str] = "forgetful noise of {std}"
     std: float = parameter(unit="1", bounds=(0.0, 1.0), neutral=0.0)

@@ -1,6 +1,6 @@
-"""Draws envs with and without a gap: python -m tests.envs.render_frames FRAMES.npz.
+"""Renders envs with and without a gap: python -m tests.envs.render_frames FRAMES.npz.
 
-A program of its own, because OpenGL aborts the process that it does not like.
+Runs as a separate process, because OpenGL aborts the process on an error.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Envs with a gap and rollouts that can be repeated, for the tests."""
+"""Envs with gaps and repeatable rollouts for the tests."""
 
 import torch
 from tensordict import TensorDict
@@ -11,7 +11,7 @@ CHEETAH = "HalfCheetah-v5"
 
 
 class Executed(GymEnv):
-    """Remembers the actions that reach the simulator."""
+    """An env that records the executed actions."""
 
     def read_action(self, action):
         self.executed = [*getattr(self, "executed", []), action.clone()]

@@ -1,4 +1,4 @@
-"""The balancing controller, the recording of data under it, and the robot's `reality`."""
+"""The balancing controller, recordings under it, and the effects of the robot's real dynamics."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ TASKS = sorted(OBSERVATIONS)
 
 
 def make(world, task="standing_still", **kwargs):
-    """The robot with the effects that the recipes' configuration lists for a world."""
+    """Returns the robot with the effects of `simulator` or `reality` in the configuration."""
     config = OmegaConf.load(CONFIG).env
     env = instantiate(config.make, task=task, **kwargs)
     return TransformedEnv(env, DynamicsGap(*(instantiate(effect) for effect in config[world])))
@@ -150,7 +150,7 @@ def test_controller_balances_in_reality_but_wanders(task):
 
 def test_gains_that_are_best_in_the_simulator_alone_fall_in_reality():
     # the linear-quadratic regulator of the simulator's linearisation with costs of
-    # theta^2 + 300 x^2 + 0.001 tau^2: stiff, and right only if the torque comes at once
+    # theta^2 + 300 x^2 + 0.001 tau^2: stiff, and optimal only without actuation delay
     stiff = {"theta": 207.6, "theta_dot": 36.0, "x": 428.5, "v": 164.0}
     for world, falls in (("simulator", False), ("reality", True)):
         data = record(make(world), BalanceController(gains=stiff), 1200, 0, progress=False)

@@ -1,4 +1,4 @@
-"""Many worlds at once: what Gymnasium's own task does from the same states under the same actions, in each of them."""
+"""BatchedMujocoEnv: each world equals Gymnasium's task from the same states under the same actions."""
 
 import mujoco
 import numpy as np
@@ -162,7 +162,7 @@ def test_noise_that_the_simulator_should_not_have_is_taken_away():
 
 
 def test_a_world_that_goes_on_is_not_read_again_while_another_is_reset():
-    """A sensor that is late by two steps shows after three what it saw in the first, whoever was reset meanwhile."""
+    """A sensor delayed by two steps reports its old reading, also after a reset of another world."""
     env = BatchedMujocoEnv(WheelLeggedEnv(), 2, [ObservationDelay(0.01)])
     td, seen = env.reset(), []
     for step in range(4):

@@ -1,4 +1,4 @@
-"""DynamicsGap on single environments: what it changes, what it leaves, when it complains."""
+"""DynamicsGap on single environments: its changes, what stays unchanged, and its errors."""
 
 import copy
 import pickle
@@ -109,7 +109,7 @@ def test_gaps_compose_and_are_counted_once():
         Compose(DynamicsGap(Gravity(2.0)), StepCounter(), DynamicsGap(Gravity(1.5))),
     )
     assert mujoco_model(both).opt.gravity[2] == pytest.approx(3 * -9.81)
-    both.rollout(2)  # StepCounter builds envs of clones of the gaps above it
+    both.rollout(2)  # StepCounter builds envs from clones of the gaps
     wrapped = TransformedEnv(both, StepCounter(step_count_key="again"), auto_unwrap=True)
     wrapped.rollout(2)
     nested = TransformedEnv(wrapped, DynamicsGap(Gravity(0.5)), auto_unwrap=False)
@@ -128,7 +128,7 @@ def test_a_gap_and_its_clone_on_one_env_are_refused():
 def test_another_gap_on_an_env_that_had_one_is_refused():
     base = GymEnv(CHEETAH)
     env = TransformedEnv(base, DynamicsGap(Gravity(2.0)))
-    complaint = r"not among the transforms of this env \(gravity × 2\).*make a new env"
+    complaint = r"not among the transforms of this env .*before \(gravity × 2\).*make a new env"
     with pytest.raises(ValueError, match=complaint):
         TransformedEnv(base, DynamicsGap(Gravity(3.0)))
     with pytest.raises(ValueError, match=complaint):

@@ -1,4 +1,4 @@
-"""DynamicsGap on tasks of dm_control."""
+"""DynamicsGap on dm_control tasks."""
 
 import copy
 import pickle
@@ -58,7 +58,7 @@ def test_neutral_effects_leave_every_bit_of_a_rollout(task):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_force_of_nothing_leaves_every_bit_of_a_rollout(task):
-    # 1e-320 is not neutral, so the physics steps are taken one by one; the force is lost in rounding
+    # 1e-320 is not neutral, so the physics steps are taken one by one; the force vanishes in rounding
     env = TransformedEnv(DMControlEnv(*task), DynamicsGap(LinearDrag(1e-320)))
     assert (rollout(env) == rollout(DMControlEnv(*task))).all()
 
@@ -69,7 +69,7 @@ def test_task_and_named_views_see_the_changed_simulation():
     physics = env.base_env._env.physics
     assert physics.named.model.geom_size["bthigh", 0] == pytest.approx(2 * 0.046)
     assert physics.model.ptr is mujoco_model(env)
-    # the reward is made of the speed, read through a named view of the new data
+    # the reward depends on the speed, which the task reads through a named view of the new data
     assert physics.named.data.sensordata["torso_subtreelinvel"][0] == physics.speed()
     assert data["next", "reward"][-1].item() == pytest.approx(max(0.0, physics.speed() / 10))
     assert mujoco_model(env).body_mass.sum() == pytest.approx(14.0)
@@ -102,7 +102,7 @@ def test_a_force_sees_the_control_of_its_own_step():
     action = torch.zeros(6, dtype=torch.float64)
     action[0] = 1.0
     env.step(env.reset().set("action", action))
-    # cheetah's control step is one physics step: a force that came a step late would not show
+    # cheetah's control step is one physics step, so it would not reveal a force delayed by one step
     plain = DMControlEnv("cheetah", "run")
     plain.set_seed(0)
     plain.step(plain.reset().set("action", action))
@@ -111,7 +111,7 @@ def test_a_force_sees_the_control_of_its_own_step():
 
 
 def test_the_observation_entries_are_counted_over_all_keys():
-    # position has 8 entries, so that entry 9 is the second velocity
+    # position has 8 entries, so entry 9 is the second velocity
     env = TransformedEnv(DMControlEnv("cheetah", "run"), DynamicsGap(ObservationBias(0.5, entries=(9,))))
     expected, actual = rollout(DMControlEnv("cheetah", "run")), rollout(env)
     offset = torch.zeros(9, dtype=torch.float64)
@@ -156,10 +156,10 @@ def test_what_a_task_writes_at_its_reset_is_no_change_by_hand(task):
 @pytest.mark.parametrize(
     ("task", "complaint"),
     [
-        (("swimmer", "swimmer6"), r"swimmer6.* builds a model from arguments \(n_joints\)"),
+        (("swimmer", "swimmer6"), r"swimmer6.* builds the model from arguments \(n_joints\)"),
         (("lqr", "lqr_2_1"), r"lqr_2_1.* from arguments \(n_bodies, n_actuators, random\)"),
         (("quadruped", "walk"), r"quadruped, task=walk.* has no function get_model_and_assets"),
-        (("dog", "walk"), r"dog, task=walk.* built with arguments of its own"),
+        (("dog", "walk"), r"dog, task=walk.* built with other arguments"),
     ],
 )
 def test_a_task_whose_model_cannot_be_built_anew_is_named(task, complaint):

@@ -1,4 +1,4 @@
-"""DynamicsGap's forces, on a task of one's own from its own file."""
+"""Forces of DynamicsGap, on a user-defined task with its own MJCF."""
 
 from collections.abc import Callable
 
@@ -17,7 +17,7 @@ from torchrl_h2o.envs import DynamicsGap, mujoco_model
 
 
 class Cart(MujocoEnv):
-    """A task of one's own, from its own file; x and its velocity."""
+    """A user-defined task with its own MJCF; observes x and its velocity."""
 
     metadata = {"render_modes": [], "render_fps": 100}  # noqa: RUF012
 
@@ -49,7 +49,7 @@ def cart(tmp_path) -> GymWrapper:
 
 
 def stepped_cart(force: Callable[[float], float], start: float) -> tuple[float, float]:
-    """x and v after one action of zero, with the force on the slider set every physics step."""
+    """Returns x and v after one action of zero, with the force on the slider set at every physics step."""
     model = mujoco.MjModel.from_xml_string(CART_XML)
     data = mujoco.MjData(model)
     data.qpos[0], data.qvel[0] = 0.25, start
@@ -79,7 +79,7 @@ def test_a_force_sees_the_bodies_where_they_are(cart):
     effect = LinearDrag(20.0, "pole")
     env = TransformedEnv(cart, DynamicsGap(effect))
     reset = env.reset()
-    cart._env.unwrapped.data.qvel[:] = 1.0, 20.0  # the pole turns by 0.2 rad an action
+    cart._env.unwrapped.data.qvel[:] = 1.0, 20.0  # the pole turns by 0.2 rad per action
     state = env.step(reset.set("action", torch.zeros(1)))["next", "observation"]
     model = mujoco.MjModel.from_xml_string(CART_XML)
     data, current = mujoco.MjData(model), mujoco.MjData(model)
@@ -103,7 +103,7 @@ def test_a_force_sees_the_control_of_its_own_step(cart):
 def test_a_force_is_made_anew_at_every_reset_and_lasts_for_the_episode(cart):
     log = []
     env = TransformedEnv(cart, DynamicsGap(Gust(1.0, seen=(log,))))
-    log.clear()  # of the rehearsal
+    log.clear()  # removes the entries of the trial episode
     torch.manual_seed(0)
     env.rollout(2)
     first = log.copy()

@@ -1,4 +1,4 @@
-"""DynamicsGap with noise that is taken away: off the same gap, and off gaps nearer to the simulator."""
+"""DynamicsGap with negative noise, settled within one gap and across gaps."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""DynamicsGap's actions and observations: what is executed, what is reported, what is repeated."""
+"""Actions and observations of DynamicsGap: execution, reporting and repeatability."""
 
 import gymnasium
 import numpy as np
@@ -92,7 +92,7 @@ def test_a_clone_has_a_delay_line_of_its_own():
     env.step(env.reset().set("action", torch.ones(6)))
     base = Executed(CHEETAH)
     twin = TransformedEnv(base, env.transform.clone())
-    twin.step(base.reset().set("action", torch.ones(6)))  # no reset that would empty the line
+    twin.step(base.reset().set("action", torch.ones(6)))  # without a reset, which would clear the delay line
     torch.testing.assert_close(base.executed[-1], torch.zeros(6))
     assert twin.transform.effects == (gap,)
 
@@ -154,7 +154,7 @@ def test_a_gap_can_be_put_first_afterwards_but_nothing_before_it():
 
 
 class Grey(ObservationWrapper):
-    """Observes integers only, as an env of pixels does."""
+    """Observes only integers, like an env with pixel observations."""
 
     def __init__(self):
         super().__init__(gymnasium.make(CHEETAH))

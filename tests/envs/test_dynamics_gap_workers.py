@@ -1,4 +1,4 @@
-"""DynamicsGap inside the workers of batched envs and in collectors."""
+"""DynamicsGap in the workers of batched envs and in collectors."""
 
 from functools import partial
 
@@ -54,7 +54,7 @@ def test_specs_hold_in_parallel_and_noise_differs_between_seeded_workers():
     reset = env.reset()
     still = env.step(reset.set("action", torch.zeros(2, 6)))
     env.close()
-    # the reward's control cost, -0.1·|a|², tells the noise apart from the differing first states
+    # the control cost in the reward, -0.1·|a|², separates the noise from the differing initial states
     velocity = still["next", "observation"][:, 8] - reset["observation"][:, 8]
     assert (velocity[0] - velocity[1]).abs() > 0.05
 

@@ -1,4 +1,4 @@
-"""The wheel-legged robot: what it observes, what it is paid for, when it is lost, how it moves."""
+"""The wheel-legged robot: observation, reward, termination and motion."""
 
 import math
 import pickle
@@ -110,8 +110,8 @@ def test_forward_torque_drives_forward_and_pitches_the_body_back(robot):
 
 def test_response_to_torque_is_that_of_the_real_robots_log(robot):
     theta_dot, v = push(robot, 0.5, 4)[[1, 3]] / (0.5 * 0.02)
-    assert v == pytest.approx(6.8, rel=0.05)  # m/s^2 a N·m
-    assert theta_dot == pytest.approx(-34.0, rel=0.1)  # rad/s^2 a N·m
+    assert v == pytest.approx(6.8, rel=0.05)  # m/s^2 per N·m
+    assert theta_dot == pytest.approx(-34.0, rel=0.1)  # rad/s^2 per N·m
 
 
 @pytest.mark.parametrize("lean", [0.01, -0.01])
@@ -165,7 +165,7 @@ def test_robot_is_lost_beyond_thirty_degrees(robot, sign, beyond, lost):
     qpos, qvel = robot.init_qpos.copy(), robot.init_qvel.copy()
     qpos[2] = sign * (math.pi / 6 + beyond)
     robot.set_state(qpos, qvel)
-    robot.model.opt.timestep = 1e-6  # so that it does not fall any further in the step
+    robot.model.opt.timestep = 1e-6  # so that the pitch barely changes within the step
     *_, terminated, truncated, _ = robot.step(np.zeros(1, np.float32))
     assert terminated is lost
     assert truncated is False
@@ -260,7 +260,7 @@ def test_rendering_shows_the_robot_from_the_side():
     try:
         env.reset(seed=0)
         upright = env.render()
-    except Exception as error:  # every GL library has an error of its own
+    except Exception as error:  # each GL library raises its own error
         pytest.skip(f"no OpenGL to render with: {error}")
     assert upright.shape == (120, 160, 3)
     qpos = env.init_qpos.copy()

@@ -1,4 +1,4 @@
-"""An MJCF file as a simulation: names of coordinates, control steps, and errors that say what there is."""
+"""Simulation.from_mjcf: names of coordinates, control steps, and errors that list the alternatives."""
 
 from pathlib import Path
 

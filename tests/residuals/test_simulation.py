@@ -1,4 +1,4 @@
-"""Simulations: many states at once, exactly as MuJoCo steps one; with effects in, and with what diverges marked."""
+"""Simulation: rollouts of many states equal MuJoCo's steps of each; effects; divergence is marked."""
 
 from dataclasses import replace
 
@@ -142,7 +142,10 @@ def test_the_catalogue_is_that_of_the_model_with_its_effects():
     plain, heavy = (trials(simulation, "Payload world/*") for simulation in (pendulum(), mended(BodyMass(4.0))))
     assert [trial["mass"] for trial in heavy] == pytest.approx([4.0 * trial["mass"] for trial in plain])
     damping = [trials(simulation, "JointDamping elbow") for simulation in (pendulum(), mended(JointDamping(-0.1)))]
-    assert [any(trial["damping"] < 0.0 for trial in found) for found in damping] == [True, False]  # none left to take
+    assert [any(trial["damping"] < 0.0 for trial in found) for found in damping] == [
+        True,
+        False,
+    ]  # no damping is left to remove
 
 
 def mended(*effects):

@@ -1,4 +1,4 @@
-"""State maps: a task's observations become states and back; sensors at their ends and hidden coordinates are found."""
+"""State maps: conversion between observations and states, clipped sensors and hidden coordinates."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_observations_become_states_and_back(task):
     observed = rollout(env, 20)["next", "observation"].double().numpy()
     states = state_map.states(observed)
     np.testing.assert_allclose(state_map.observations(states), observed, atol=1e-12)
-    # the task itself observes the very same at these states
+    # the task reports the same observations at these states
     owner = find_backend(env).owner
     for state, expected in zip(states, observed, strict=True):
         owner.set_state(state[: owner.model.nq], state[owner.model.nq :])
@@ -79,19 +79,19 @@ def test_clipped_rows_are_left_out_and_counted():
 
 @pytest.mark.parametrize("task", ["Reacher-v5", "InvertedDoublePendulum-v5"])
 def test_an_observation_that_is_no_coordinate_is_refused(task):
-    with pytest.raises(ValueError, match=r"does not observe coordinates.*StateMap of your own"):
+    with pytest.raises(ValueError, match=r"does not consist of single coordinates.*StateMap of your own"):
         Simulation.from_env(GymEnv(task))
 
 
 def test_an_observation_that_mixes_coordinates_is_refused():
     task = find_backend(GymEnv("InvertedPendulum-v5")).owner
     task._get_obs = lambda: np.array([task.data.qpos.sum(), *task.data.qvel])
-    with pytest.raises(ValueError, match="does not observe coordinates"):
+    with pytest.raises(ValueError, match="does not consist of single coordinates"):
         probe_gymnasium(task, np.random.default_rng(0))
 
 
 def test_axle_follows_from_velocity_and_pitch_rate():
-    """The wheels, 0.065 m in radius, roll without slip and turn against the body."""
+    """The wheels, of 0.065 m radius, roll without slip and turn relative to the body."""
     state_map = Simulation.from_env(WheelLeggedEnv()).state_map
     velocity, pitch_velocity = 0.4, 1.5
     observed = np.zeros(4)
@@ -102,13 +102,13 @@ def test_axle_follows_from_velocity_and_pitch_rate():
 
 
 def test_hidden_coordinates_are_those_that_matter():
-    """How deep the wheels sink into the floor, z and its velocity; not how far they have rolled."""
+    """Hidden are z and its velocity, the depth of the wheels in the floor; the rolled distance is not."""
     assert Simulation.from_env(WheelLeggedEnv()).state_map.hidden == (1, 5)
 
 
 @pytest.mark.parametrize("task", ["HalfCheetah-v5", "Walker2d-v5", "Swimmer-v5"])
 def test_a_coordinate_that_changes_nothing_is_not_hidden(task):
-    """How far it has run."""
+    """The unobserved distance affects no later observation."""
     assert Simulation.from_env(GymEnv(task)).state_map.hidden == ()
 
 

@@ -1,6 +1,7 @@
-"""Measured data in, hybrid real and simulated replay out.
+"""Readers of measured data, and a replay buffer of real and simulated transitions.
 
-Readers return one flat TED TensorDict of float32; :func:`load` picks the reader.
+Every reader returns a flat TensorDict in TorchRL's episode data format (TED) with float32 numbers; :func:`load`
+selects the reader.
 """
 
 from torchrl_h2o.data.hybrid_replay import HybridReplayBuffer

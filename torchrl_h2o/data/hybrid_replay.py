@@ -1,11 +1,10 @@
-"""Real and simulated transitions in one batch, with ``real`` saying which is which.
+"""A replay buffer whose batches contain real and simulated transitions, marked by the entry ``real``.
 
-Why not TorchRL's ``ReplayBufferEnsemble`` or ``OfflineToOnlineReplayBuffer``: the first stacks
-equal shares into [2, B/2], does not write to one member only, and dumps the real data with every
-checkpoint; the second marks nothing and saves nothing; and both need three to five times as long
-for a batch, which they gather as TensorDicts of views first. So this is a composition of two plain
-``ReplayBuffer`` objects, whose storages and writers are used as they are, with a ``sample`` that
-gathers each entry once a stream, straight from the storage.
+TorchRL's ``ReplayBufferEnsemble`` and ``OfflineToOnlineReplayBuffer`` do not serve here. The first stacks equal shares
+into [2, B/2], cannot write to a single member and saves the real data with every checkpoint. The second does not mark
+the rows and has no checkpoint. Both need three to five times as long per batch, because they first gather TensorDicts
+of views. This buffer is composed of two plain ``ReplayBuffer`` objects, and its ``sample`` gathers each entry once per
+stream, directly from the storage.
 """
 
 from __future__ import annotations
@@ -40,25 +39,23 @@ TRANSITION_KEYS: tuple[NestedKey, ...] = (
 
 
 class HybridReplayBuffer:
-    """Real data that stay and simulated data that roll over, sampled side by side.
+    """A replay buffer of fixed real data and a ring buffer of simulated data, sampled together.
 
-    Draws come from torch's global generator (the one of ``device``), so ``torch.manual_seed``
-    repeats them and a restored generator state continues them.
+    Random indices are drawn from torch's global generator of ``device``, so ``torch.manual_seed`` repeats them and a
+    restored generator state continues them.
 
     Args:
-        real: flat TED transitions, batch size [T]; kept as they are (also memory-mapped), not
-            copied unless to another device.
-        sim_capacity: how many simulated transitions are kept; then the oldest go.
-        batch_size: (real, simulated) rows of a batch.
-        keys: the entries of a batch; both streams must have them, what else they have is left out.
-        device: where the data are kept and the batches are made.
-        scratch_dir: keep the simulated data in memory-mapped files there, for more than fits in
-            memory.
-        sim_memory: keep the simulated data in these tensors, of batch size [sim_capacity]; what
-            they hold does not count.
+        real: flat TED transitions of batch size [T], in memory or memory-mapped; copied only to another device.
+        sim_capacity: number of simulated transitions that are kept; then the oldest are overwritten.
+        batch_size: numbers of real and simulated rows in a batch.
+        keys: the entries of a batch, which both streams must have; their other entries are ignored.
+        device: device of the data and the batches.
+        scratch_dir: folder for memory-mapped simulated data, for capacities beyond the memory.
+        sim_memory: tensors of batch size [sim_capacity] that hold the simulated data; their initial values are
+            ignored.
 
     Raises:
-        ValueError: an entry that the real data lack, with what to do.
+        ValueError: if the real data lack an entry of ``keys``; the message gives a remedy.
 
     Example:
         >>> import torch
@@ -70,7 +67,7 @@ class HybridReplayBuffer:
         >>> buffer.sample()["real"].tolist()
         [True, True, True, True, False, False, False, False]
 
-    Source: H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716): 𝒟 and B of Eq. (8), 128 rows of each.
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716: 𝒟 and B of Eq. (8), with 128 rows of each.
     """
 
     def __init__(
@@ -85,7 +82,7 @@ class HybridReplayBuffer:
         sim_memory: TensorDictBase | None = None,
     ):
         if sim_capacity < 1:
-            raise ValueError(f"sim_capacity is {sim_capacity}, it must be at least 1")
+            raise ValueError(f"sim_capacity is {sim_capacity}; it must be at least 1")
         if real.ndim != 1 or not len(real):
             raise ValueError(f"the real data have the batch size {list(real.batch_size)}, expected [T], T > 0")
         self.batch_size = _require_sizes(batch_size)
@@ -105,7 +102,7 @@ class HybridReplayBuffer:
         self._sim_rows: list[torch.Tensor] = []
 
     def __len__(self) -> int:
-        """The number of transitions of both streams."""
+        """Return the number of transitions of both streams."""
         return len(self.real) + len(self.sim)
 
     def __repr__(self) -> str:
@@ -118,10 +115,10 @@ class HybridReplayBuffer:
         """Add simulated transitions.
 
         Args:
-            transitions: any batch size that holds transitions, such as a collector's [N, T].
+            transitions: transitions of any batch size, such as a collector's [N, T].
 
         Raises:
-            ValueError: an entry that is missing or has another shape than the real data's.
+            ValueError: if an entry is missing or its shape differs from that of the real data.
         """
         rows = _select(transitions.reshape(-1), self.keys, "simulated")
         for key, like in zip(self.keys, self._real_rows, strict=True):
@@ -129,10 +126,9 @@ class HybridReplayBuffer:
             if value.shape[1:] != like.shape[1:]:
                 raise ValueError(
                     f"{key!r} has the shape {list(value.shape[1:])} in the simulated data and "
-                    f"{list(like.shape[1:])} in the real data; simulator and data must be of one "
-                    "task"
+                    f"{list(like.shape[1:])} in the real data; simulator and data must be of the same task"
                 )
-            # the real data's dtype: Gymnasium observes in float64, a batch has one dtype
+            # converted to the dtype of the real data, because Gymnasium's observations are float64
             rows.set(key, value.detach().to(like))
         self.sim.extend(rows)
         self._find_sim_rows()
@@ -141,22 +137,22 @@ class HybridReplayBuffer:
         """Draw real and simulated rows, each uniformly with replacement.
 
         Args:
-            batch_size: (real, simulated) rows, instead of the buffer's own. (n, 0) draws real rows
-                alone, which works before there are simulated ones.
-            generator: where the draws come from, instead of torch's global one.
+            batch_size: numbers of real and simulated rows, instead of the buffer's own. (n, 0) draws real rows only
+                and works without simulated data.
+            generator: random generator, instead of torch's global one.
 
         Returns:
-            TensorDict of batch size [real + simulated]: the buffer's entries, and ``real``, bool
-            of shape [real + simulated]; the real rows come first.
+            TensorDict of batch size [real + simulated] with the buffer's entries and ``real``, a boolean of shape
+            [real + simulated]; the real rows come first.
 
         Raises:
-            RuntimeError: simulated rows are asked for and there are none.
+            RuntimeError: if simulated rows are requested and there are none.
         """
         n_real, n_sim = self.batch_size if batch_size is None else _require_sizes(batch_size)
         if n_sim and not self._sim_rows:
             raise RuntimeError(
                 "there are no simulated transitions yet; extend() the buffer first, or "
-                f"sample(({n_real + n_sim}, 0)) for real rows alone"
+                f"sample(({n_real + n_sim}, 0)) for real rows only"
             )
         streams = []
         if n_real:
@@ -171,11 +167,11 @@ class HybridReplayBuffer:
         return TensorDict(batch, batch_size=[n_real + n_sim], device=self.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """The simulated stream: tensors, numbers and names. The real data are read again."""
+        """Return the simulated stream. The real data are not included, because they can be read again."""
         return {
             "real": self._fingerprint(),
             "cursor": self.sim.writer.state_dict(),
-            # clones: a view would be saved with all of the capacity behind it
+            # clones, because a view would be saved together with the whole storage
             "rows": [rows.clone() for rows in self._sim_rows],
         }
 
@@ -183,7 +179,7 @@ class HybridReplayBuffer:
         """Restore the simulated stream of a buffer with the same real data, keys and capacity.
 
         Raises:
-            ValueError: the state belongs to other real data, keys or a larger buffer.
+            ValueError: if the state belongs to other real data, other keys or a larger buffer.
         """
         self._require_same_real(state["real"])
         self.sim.empty()
@@ -192,17 +188,17 @@ class HybridReplayBuffer:
             if count > self.sim.storage.max_size:
                 raise ValueError(
                     f"the checkpoint holds {count} simulated transitions, this buffer has room "
-                    f"for {self.sim.storage.max_size}: give it the capacity it had"
+                    f"for {self.sim.storage.max_size}: use the capacity of the saved buffer"
                 )
             self.sim.extend(TensorDict(dict(zip(self.keys, state["rows"], strict=True)), [count]))
-        # rows go back to their places, so that a restored generator draws the same ones
+        # the cursor is restored too, so that a restored generator draws the same rows
         self.sim.writer.load_state_dict(state["cursor"])
         self._find_sim_rows()
 
     def dumps(self, path: str | Path) -> None:
-        """Write the simulated stream to a folder: memory-mapped rows, as many as there are.
+        """Write the simulated stream to a folder of memory-mapped rows.
 
-        A folder of that name is replaced once the new one is complete.
+        An existing folder is replaced once the new one is complete.
 
         Args:
             path: the folder.
@@ -215,13 +211,13 @@ class HybridReplayBuffer:
                 rows.cpu().memmap(folder / "rows", copy_existing=True)
 
     def loads(self, path: str | Path) -> None:
-        """Read what :meth:`dumps` has written, into a buffer with the same real data and keys.
+        """Read a folder written by :meth:`dumps` into a buffer with the same real data and keys.
 
         Args:
             path: the folder.
 
         Raises:
-            ValueError: as :meth:`load_state_dict`; also a cut-off file.
+            ValueError: as for :meth:`load_state_dict`, and for a truncated file.
         """
         folder = Path(path)
         state = json.loads((folder / "stream.json").read_text(encoding="utf-8"))
@@ -236,12 +232,12 @@ class HybridReplayBuffer:
         return torch.randint(len(rows[0]), (count,), device=self.device, generator=generator)
 
     def _find_sim_rows(self) -> None:
-        """Keep the filled part of each tensor at hand: looking it up costs more than gathering."""
+        """Store the filled part of each tensor, because looking it up is slower than gathering rows."""
         stored = self.sim.storage[:] if len(self.sim) else None
         self._sim_rows = [] if stored is None else [stored.get(key) for key in self.keys]
 
     def _fingerprint(self) -> dict[str, Any]:
-        # 64 rows tell two recordings apart without reading all of a mapped file
+        # 64 rows distinguish two recordings without reading a whole mapped file; the number is part of the format
         some = torch.linspace(0, len(self.real) - 1, 64, dtype=torch.double).long()
         digest = hashlib.sha256()
         for rows in self._real_rows:
@@ -257,7 +253,7 @@ class HybridReplayBuffer:
         if saved != own:
             raise ValueError(
                 f"the checkpoint was made with {saved['transitions']} real transitions and the "
-                f"entries {saved['keys']}; this buffer holds {own['transitions']} and "
+                f"entries {saved['keys']}; this buffer has {own['transitions']} and "
                 f"{own['keys']}, or other values: load the same real data first"
             )
 
@@ -268,7 +264,7 @@ def _select(td: TensorDictBase, keys: list[NestedKey], stream: str) -> TensorDic
         if key not in present:
             raise ValueError(
                 f"the {stream} data lack {key!r}, they have {sorted(present, key=str)}; record "
-                "it (a log needs reward= for its reward), or choose keys="
+                "it (for a log, give reward=), or choose other keys="
             )
     return td.select(*keys)
 
@@ -276,5 +272,5 @@ def _select(td: TensorDictBase, keys: list[NestedKey], stream: str) -> TensorDic
 def _require_sizes(sizes: tuple[int, int]) -> tuple[int, int]:
     n_real, n_sim = sizes
     if n_real < 0 or n_sim < 0 or n_real + n_sim < 1:
-        raise ValueError(f"batch_size is {sizes}, expected (real, simulated) rows, at least one in all")
+        raise ValueError(f"batch_size is {sizes}, expected (real, simulated) rows with at least one in total")
     return int(n_real), int(n_sim)

@@ -34,7 +34,7 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 class Episode(NamedTuple):
-    """The action, observation and force effects of one episode, with the state they keep since its start.
+    """The action, observation and force effects of one episode, with their state since its start.
 
     Args:
         actions: functions from an action (..., nu) to the altered one, in order.
@@ -129,11 +129,11 @@ class Pipeline:
 
         Args:
             dt: the control step, in s.
-            rng: the generator of the random effects; may be left out where there are none.
+            rng: the generator of the random effects; not needed without any.
             model: the compiled model. Without it the episode holds no forces.
 
         Raises:
-            ValueError: if an effect finds nothing to act on. Also, when the episode is used, if an effect draws
+            ValueError: if the model has no element that a force could act on. Also, when the episode is used, if an effect draws
                 random numbers though its class is not marked ``random``.
         """
 

@@ -1,4 +1,4 @@
-"""One episode of a dynamics gap in a TorchRL env: its effects at work on tensordicts."""
+"""One episode of a dynamics gap in a TorchRL env: applies its effects to tensordicts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class GapEpisode(NamedTuple):
     """The effects of one gap in one episode, and the tensordict entries that they alter.
 
     Args:
-        effects: the effects at work. Effects on the model need no work during an episode.
+        effects: the action, observation and force effects. Model effects are already in the compiled model.
         action_keys: the entries of the action.
         observation_keys: the floating-point entries of the observation.
     """

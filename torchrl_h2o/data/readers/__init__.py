@@ -1,1 +1,1 @@
-"""Readers of measured data. Each returns one flat TED TensorDict of float32."""
+"""Readers of measured data; each returns a flat TED TensorDict of float32."""

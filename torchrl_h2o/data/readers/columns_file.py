@@ -23,7 +23,7 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
     Both classes are arguments, so that :class:`LogColumns` can call this function without an import circle.
 
     Args:
-        source: a YAML file, or the name of one in the package.
+        source: a YAML file, or the name of a layout in the package.
         layout: the class of the layout, :class:`LogColumns`.
         column: the class of a column, :class:`Column`, with the field ``name``.
 
@@ -43,10 +43,10 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
         line = error.problem_mark.line + 1
         raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(f"no YAML: {error}", "correct it", source=source) from error
+        raise DataError(f"invalid YAML: {error}", "correct the file", source=source) from error
     known = _known_entries(layout, entries, source)
     if not isinstance(known.get("columns"), list) or not known["columns"]:
-        raise DataError("'columns' is no list", "list the file's columns", source=source)
+        raise DataError("'columns' is not a list", "list the file's columns", source=source)
     columns = tuple(
         _build_column(column, {"name": f"column {number}", **_known_entries(column, entry, source)}, source)
         for number, entry in enumerate(known["columns"], start=1)
@@ -55,7 +55,7 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
 
 
 class _Loader(yaml.SafeLoader):
-    """yaml's safe loader, but two equal keys are an error and not one forgotten value."""
+    """yaml's safe loader, which additionally rejects duplicate keys instead of keeping the last value."""
 
     def construct_mapping(self, node, deep=False):
         seen = set()
@@ -63,7 +63,7 @@ class _Loader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode):
                 continue
             if key.value in seen:
-                problem = f"the entry {key.value!r} stands there twice"
+                problem = f"duplicate entry {key.value!r}"
                 raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
@@ -87,10 +87,10 @@ def _find(source: str | Path) -> Path:
 def _known_entries(kind: type, entries: Any, source: str | Path) -> dict[str, Any]:
     known = [field.name for field in fields(kind)]
     if not isinstance(entries, dict):
-        raise DataError(f"{entries!r} is no mapping", f"give {', '.join(known)}", source=source)
+        raise DataError(f"{entries!r} is not a mapping", f"give {', '.join(known)}", source=source)
     for name in entries:
         if name not in known:
-            raise DataError(f"unknown entry {name!r}", f"known are {', '.join(known)}", source=source)
+            raise DataError(f"unknown entry {name!r}", f"choose from {', '.join(known)}", source=source)
     return entries
 
 
@@ -115,13 +115,13 @@ def _build(kind: type, entries: dict[str, Any], source: str | Path, column: str 
 
 
 def _number(name: str, value: Any) -> float:
-    # YAML 1.1 takes 5e-3 for a text, and on for true, which Python takes for 1
+    # YAML 1.1 reads 5e-3 as a string, and on as true, which Python would convert to 1
     if isinstance(value, int | float | str) and not isinstance(value, bool):
         try:
             return float(value)
         except ValueError:
             pass
-    raise ValueError(f"{name}: {value!r} is no number; units stand in an entry of their own, and dt is in s")
+    raise ValueError(f"{name}: {value!r} is not a number; give the unit in its own entry, and dt in s")
 
 
 def _pair(name: str, value: Any) -> tuple[float, float] | None:
@@ -136,5 +136,5 @@ def _names(name: str, value: Any) -> tuple[str, ...]:
     if value is None:
         return ()
     if not isinstance(value, list) or not all(isinstance(entry, str) for entry in value):
-        raise ValueError(f"{name}: {value!r} must be a list of column names; put on, off and numbers in quotes")
+        raise ValueError(f"{name}: {value!r} must be a list of column names; quote on, off and numbers")
     return tuple(value)

@@ -18,25 +18,24 @@ _REQUIRED = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "tim
 def read_d4rl(path: str | Path) -> TensorDict:
     """Read a D4RL file.
 
-    With ``next_observations`` every row is a transition; a row that does not lead to the row after
-    it, though neither flag is set, is marked truncated, and the number of those is logged.
+    In a file with ``next_observations`` every row is a transition. A row whose next observation differs from the
+    following row, although neither flag is set, is marked truncated; the number of these rows is logged.
 
-    Without it the next observation is the row after; the last row of an episode then has none and
-    is dropped (the row before it becomes the truncated end), because the row after belongs to
-    another episode. The number of dropped rows is logged. A terminal row dropped so takes its
-    reward with it: prefer files with ``next_observations`` (D4RL's MuJoCo files from v1 on have
-    it) for tasks that terminate.
+    In a file without ``next_observations`` the next observation is the following row. The last row of an episode then
+    has none and is dropped, and the row before it becomes the truncated end; the number of dropped rows is logged. A
+    dropped terminal row loses its reward, so prefer files with ``next_observations`` (D4RL's MuJoCo files from v1 on)
+    for tasks that terminate.
 
     Args:
-        path: an HDF5 file with observations, actions, rewards, terminals and timeouts; the last
-            three of shape (N,) or (N, 1).
+        path: an HDF5 file with observations, actions, rewards, terminals and timeouts, the last three of shape (N,)
+            or (N, 1).
 
     Returns:
         TensorDict of batch size [T] in TED.
 
     Raises:
-        DataError: a file that is missing, empty, cut off or a pickle; a missing array, arrays of
-            different lengths, NaN or infinity, a flag other than 0 and 1. Rows are counted from 1.
+        DataError: for a file that is missing, empty, truncated or a pickle; a missing array, arrays of different
+            lengths, NaN or infinity, or a flag other than 0 and 1. Rows are counted from 1.
 
     Example:
         >>> import h5py, numpy as np, tempfile
@@ -50,7 +49,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
         >>> read_d4rl(path).batch_size
         torch.Size([4])
 
-    Source: Fu et al., "D4RL: Datasets for Deep Data-Driven Reinforcement Learning", 2020.
+    Source: Fu et al., "D4RL: Datasets for Deep Data-Driven Reinforcement Learning" (2020), arXiv 2004.07219.
     """
     path = require_file(path)
     arrays = _read_arrays(path)
@@ -59,7 +58,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
         if len(values) != steps or not steps:
             raise DataError(
                 f"it has {len(values)} rows, observations has {steps}",
-                "the file is empty or cut off: copy or download it again",
+                "the file is empty or truncated: copy or download it again",
                 source=path,
                 column=name,
             )
@@ -73,7 +72,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
         if following.shape != arrays["observations"].shape:
             raise DataError(
                 f"the shape is {list(following.shape)}, observations has {list(arrays['observations'].shape)}",
-                "they must be of one kind",
+                "they must have the same shape",
                 source=path,
                 column="next_observations",
             )
@@ -91,7 +90,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
 
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    import h5py  # here: the replay buffer of this package does without
+    import h5py  # imported here, because the replay buffer does not need it
 
     try:
         with h5py.File(path, "r") as file:
@@ -99,7 +98,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
             if missing:
                 raise DataError(
                     f"the file has no {', '.join(missing)}; it has {', '.join(file)}",
-                    f"a D4RL file holds {', '.join(_REQUIRED)}",
+                    f"a D4RL file contains {', '.join(_REQUIRED)}",
                     source=path,
                     column=missing[0],
                 )
@@ -107,8 +106,8 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
             arrays = {name: np.asarray(file[name]) for name in names}
     except (OSError, RuntimeError, TypeError) as error:
         raise DataError(
-            f"this cannot be read as HDF5: {error}",
-            "the file is cut off or of another kind: copy or download it again",
+            f"the file cannot be read as HDF5: {error}",
+            "the file is truncated or of another format: copy or download it again",
             source=path,
         ) from error
     for name, values in arrays.items():
@@ -138,7 +137,7 @@ def _flags(values: np.ndarray, name: str, path: Path) -> np.ndarray:
 
 
 def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:
-    """The timeouts, and where the next row begins elsewhere: another episode, or rows were left out."""
+    """Return the timeouts, extended by rows whose next observation differs from the following row."""
     led, found = (
         arrays[name][rows].astype(np.float32)
         for name, rows in (("next_observations", slice(-1)), ("observations", slice(1, None)))
@@ -146,14 +145,14 @@ def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray
     jumps = np.append((led != found).any(1), False) & ~arrays["terminals"] & ~arrays["timeouts"]
     if jumps.any():
         torchrl_logger.warning(
-            f"{path}: {jumps.sum()} of {len(jumps)} rows are marked truncated, as the row after "
-            "them does not begin where they led to"
+            f"{path}: {jumps.sum()} of {len(jumps)} rows are marked truncated, because their next observation "
+            "differs from the following row"
         )
     return arrays["timeouts"] | jumps
 
 
 def _link_rows(arrays: dict[str, np.ndarray], path: Path) -> tuple:
-    """The rows whose next observation is known, that observation, and both flags."""
+    """Return the rows with a known next observation, that observation, and both flags."""
     ends = arrays["terminals"] | arrays["timeouts"]
     ends[-1] = True
     rows = np.flatnonzero(~ends)
@@ -165,5 +164,5 @@ def _link_rows(arrays: dict[str, np.ndarray], path: Path) -> tuple:
             column="observations",
         )
     torchrl_logger.info(f"{path}: {ends.sum()} of {len(ends)} rows dropped, last of their episode")
-    # the row before a dropped end becomes its episode's last one
+    # the row before a dropped end becomes the last one of its episode
     return rows, arrays["observations"][rows + 1], np.zeros(len(rows), bool), ends[rows + 1]

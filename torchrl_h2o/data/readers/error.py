@@ -1,7 +1,7 @@
-"""The one exception of this folder, and the check that most readers share.
+"""The exception of all readers, and the check for finite values.
 
-A reader either returns the whole data set or raises :class:`DataError`, which says where the bad
-value stands (file, column, row) and what to do about it.
+A reader either returns the whole data set or raises :class:`DataError`, which names the file, column and row of the
+invalid value and a remedy.
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ import numpy as np
 
 
 class DataError(ValueError):
-    """Data that cannot be used, with the place and the remedy.
+    """Invalid data, with its location and a remedy.
 
     Args:
-        problem: what is wrong, with the bad value.
-        remedy: what the reader of the message can do.
-        source: the file, folder or dataset name; also kept as an attribute.
-        column: the column's name, or the path inside a file; also kept as an attribute.
-        row: the row, counted from 1 (for text: the line number that an editor shows); also kept as
-            an attribute.
+        problem: the problem, with the invalid value.
+        remedy: how to correct it.
+        source: the file, folder or dataset name; also an attribute.
+        column: the column's name, or the path inside a file; also an attribute.
+        row: the row, counted from 1 (in text files, the line number); also an attribute.
 
     Example:
         >>> from torchrl_h2o.data import DataError
@@ -57,16 +56,16 @@ def require_finite(
     source: str | Path,
     row_of: Callable[[int], int] = lambda index: index + 1,
 ) -> None:
-    """Raise at the first value (row by row) that float32 holds as NaN or infinity.
+    """Raise DataError at the first value, row by row, that is NaN or infinite in float32.
 
     Args:
-        values: shape (rows, columns).
-        columns: one name for each column.
-        source: the file that the values come from.
-        row_of: turns an index into the row to report.
+        values: values of shape (rows, columns).
+        columns: one name per column.
+        source: the file of the values.
+        row_of: converts an index to the row number for the message.
 
     Raises:
-        DataError: naming file, column and row.
+        DataError: with file, column and row.
 
     Example:
         >>> import numpy as np
@@ -76,14 +75,14 @@ def require_finite(
         ...
         torchrl_h2o.data.readers.error.DataError: a.csv, column 'v', row 1: the value is nan; ...
     """
-    with np.errstate(over="ignore"):  # 1e300 is finite in the file and infinite in float32
+    with np.errstate(over="ignore"):  # 1e300 is finite in float64 and infinite in float32
         bad = ~np.isfinite(values.astype(np.float32))
     if not bad.any():
         return
     index, position = np.argwhere(bad)[0]
     raise DataError(
         f"the value is {values[index, position]}",
-        "every value must be finite in float32: remove the row and what depends on it, or mark the column as ignored",
+        "every value must be finite in float32: remove the row and the rows that depend on it, or ignore the column",
         source=source,
         column=columns[position],
         row=row_of(int(index)),

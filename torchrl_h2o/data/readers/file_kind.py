@@ -1,6 +1,6 @@
-"""Look at a file before it is read: refuse what could run code, what is missing and what is empty.
+"""Check a file before it is read: reject missing, empty and compressed files, and pickles.
 
-A pickle is recognised by its name or its first bytes and never opened with an unpickler.
+A pickle can execute code. It is recognised by its name or first bytes and never unpickled.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from pathlib import Path
 from torchrl_h2o.data.readers.error import DataError
 
 _PICKLE_SUFFIXES = {".pkl", ".pickle", ".pt", ".pth", ".npy", ".npz", ".joblib", ".ckpt"}
-# protocol 2 and later start with PROTO; torch.save and .npz are zip files, .npy may hold objects
+# pickle protocols from 2 on start with PROTO; torch.save and .npz are zip files; .npy may contain objects
 _PICKLE_STARTS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05", b"PK\x03\x04", b"\x93NUMPY")
 _GZIP_START = b"\x1f\x8b"
 
 
 def is_pickle(path: str | Path) -> bool:
-    """Whether a file is, or may hold, a pickle. It is judged by name and first bytes alone.
+    """Return whether a file is a pickle or may contain one, by its name and first bytes.
 
     Args:
         path: a file.
@@ -36,28 +36,28 @@ def is_pickle(path: str | Path) -> bool:
 
 
 def require_file(path: str | Path) -> Path:
-    """Return the path of a file that exists, holds something and is no pickle.
+    """Return the path of a file after checking that it exists, is not empty and is no pickle.
 
     Args:
         path: a file.
 
     Raises:
-        DataError: a missing file, a folder, an empty or compressed file, a pickle.
+        DataError: for a missing file, a folder, an empty or compressed file, or a pickle.
     """
     path = Path(path).expanduser()
     if not path.exists():
         raise DataError("there is no such file", "check the path", source=path)
     if path.is_dir():
-        raise DataError("this is a folder, a file was expected", "give the file in it", source=path)
+        raise DataError("this is a folder, but a file was expected", "give the file in it", source=path)
     if is_pickle(path):
         raise DataError(
-            "this is a pickle, or a format that may hold one, and reading it could run any code",
-            "convert it to CSV, HDF5 or a memory-mapped TensorDict where you trust it",
+            "this is a pickle, or a format that may contain one, and reading it could execute arbitrary code",
+            "if you trust the file, convert it to CSV, HDF5 or a memory-mapped TensorDict",
             source=path,
         )
     if path.stat().st_size == 0:
         raise DataError("the file is empty", "copy or record it again", source=path)
     with path.open("rb") as file:
         if file.read(len(_GZIP_START)) == _GZIP_START:
-            raise DataError("this is compressed by gzip", "unpack it with gunzip first", source=path)
+            raise DataError("the file is compressed with gzip", "unpack it with gunzip first", source=path)
     return path

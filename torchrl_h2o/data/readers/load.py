@@ -1,4 +1,4 @@
-"""Load real data from whatever holds it: one call that picks the reader."""
+"""Load measured data from any supported source; selects the reader."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ def load(
     """Load transitions from a Minari dataset, a D4RL file, a robot log or a TED memory map.
 
     Args:
-        source: a Minari name (``"halfcheetah/medium-v0"``) or folder, an HDF5 file, a text or CSV
-            log, or a folder written by :func:`write_ted`.
-        env: check dimensions, kinds and action bounds against this environment.
+        source: a Minari name (``"halfcheetah/medium-v0"``) or folder, an HDF5 file, a text or CSV log, or a folder
+            written by :func:`write_ted`.
+        env: an environment; the data's dimensions, kinds of numbers and action bounds are checked against it.
         columns: for a log, the layout of its columns; see :func:`read_robot_log`.
         reward: for a log, its reward function; see :func:`read_robot_log`.
-        task: a Gymnasium id such as ``"HalfCheetah-v5"``: refuse a Minari dataset of another task.
-            Versions may differ. Where the source does not name its task, a warning is logged.
+        task: a Gymnasium id such as ``"HalfCheetah-v5"``. A Minari dataset of another task is rejected; the version
+            may differ. If the source does not name its task, a warning is logged.
 
     Returns:
         TensorDict of batch size [T] in TED.
 
     Raises:
-        DataError: naming file, column and row; nothing is half-loaded. Also columns for what is
-            no log.
+        DataError: with file, column and row, for invalid data; also if columns are given for a source that is not a
+            log.
 
     Example:
         >>> import pathlib, tempfile
@@ -75,8 +75,8 @@ def load(
 def _require_no_columns(columns: LogColumns | str | Path | None, source: str | Path) -> None:
     if columns is not None:
         raise DataError(
-            "columns were given, and this is no log: it names its own entries",
-            "leave columns out, or give the log",
+            "columns were given, but the source is not a log: its entries have names",
+            "omit columns, or give the log",
             source=source,
         )
 
@@ -109,13 +109,13 @@ def _read_file(
         return read_d4rl(path)
     if columns is None:
         raise DataError(
-            "a log does not say what its columns mean",
-            "give columns=, a YAML as in torchrl_h2o/data/logs",
+            "a log does not describe its columns",
+            "give columns=, a YAML file as in torchrl_h2o/data/readers/logs",
             source=path,
         )
     return read_robot_log(path, columns, reward=reward)
 
 
 def _looks_like_a_path(source: str | Path) -> bool:
-    """A Minari name has neither a suffix nor a root, and ends in its version."""
+    """Whether a source is a path rather than a Minari name, which has no suffix and no root and ends in a version."""
     return isinstance(source, Path) or not re.fullmatch(r"[-\w]+(/[-\w]+)*-v\d+", source)

@@ -1,4 +1,4 @@
-"""What the columns of a robot log mean: names, roles, units and timing."""
+"""The layout of a robot log: names, roles and units of its columns, and timing."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Column:
     """One column of a log.
 
     Args:
-        name: its name; with a header, the one that stands there.
-        role: one of observation, action, reward, done, time, ignore. ``done`` is 1 in the rows in
-            which the task has ended. ``reward`` in a row is what that row's action earned.
-        unit: the unit of the file, turned into SI; see :data:`~torchrl_h2o.data.units.UNITS`.
-        scale: a factor beside the unit (a gear ratio, a sign).
-        bounds: lowest and highest value in SI, for actions.
+        name: the column's name; in a file with a header, the name in the header.
+        role: one of observation, action, reward, done, time, ignore. ``done`` is 1 in rows in which the task has
+            ended. The ``reward`` of a row is the reward of that row's action.
+        unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
+        scale: a further factor, such as a gear ratio or a sign.
+        bounds: lowest and highest value in SI, for actions only.
 
     Example:
         >>> from torchrl_h2o.data import Column
@@ -39,15 +39,15 @@ class Column:
 
     def __post_init__(self):
         if not isinstance(self.name, str):
-            raise ValueError(f"name {self.name!r} is no text: put it in quotes (YAML reads on, off, yes, no as flags)")
+            raise ValueError(f"name {self.name!r} is not a string: quote it (YAML reads on, off, yes, no as booleans)")
         if self.role not in ROLES:
-            raise ValueError(f"unknown role {self.role!r}; known are {', '.join(ROLES)}")
+            raise ValueError(f"unknown role {self.role!r}; choose from {', '.join(ROLES)}")
         try:
             si_unit, _ = to_si(self.unit)
         except KeyError as error:
             raise ValueError(error.args[0]) from None
         if self.role == "time" and si_unit != "s":
-            raise ValueError(f"the unit {self.unit!r} is none of time; take s, ms or us")
+            raise ValueError(f"the unit {self.unit!r} is not a unit of time; use s, ms or us")
         if not math.isfinite(self.scale) or self.scale == 0:
             raise ValueError(f"scale {self.scale} must be finite and not zero")
         if self.bounds is not None:
@@ -58,35 +58,34 @@ class Column:
 
     @property
     def factor(self) -> float:
-        """What the file's value is multiplied by to have it in SI."""
+        """The factor from the file's value to SI."""
         return to_si(self.unit)[1] * self.scale
 
 
 @dataclass(frozen=True)
 class LogColumns:
-    """The layout of a log file. Whatever leaves rows out has to be asked for by name.
+    """The layout of a log file. Options that drop rows are off by default.
 
     Args:
-        columns: the columns; without a header in the file's order.
-        dt: seconds between two rows; ``None`` takes the median of the time column.
-        separator: ``"whitespace"`` or one character; with a character, cells may stand in "".
+        columns: the columns; for a file without a header, in the file's order.
+        dt: time between two rows in s; ``None`` uses the median of the time column.
+        separator: ``"whitespace"`` or one character; with a character, cells may be quoted with "".
         header: whether the first row holds the names.
-        comment: a character; lines that begin with it are skipped, before the header too.
-        decimal: what stands before the fraction, ``"."`` or ``","``.
-        other_columns: columns of the header that are not described are an ``"error"``, or
-            ``"ignore"`` them.
+        comment: a character; lines that begin with it are skipped, including lines before the header.
+        decimal: the decimal separator, ``"."`` or ``","``.
+        other_columns: treatment of columns in the header that are not described: ``"error"`` or ``"ignore"``.
         observation: names in the order of the observation vector; the file's order by default.
-        action: the same for the action vector.
-        outside_bounds: an action outside its bounds is an ``"error"``, or ``"clip"`` it.
-        time_tolerance: how far a time step may be from dt, as a share of dt.
-        on_time_jump: a time step outside of that is an ``"error"``, or ``"split"`` the run there.
-            Time that runs backwards is always an error.
-        after_done: rows with done = 0 behind a row with done = 1 are an ``"error"``; or ``"drop"``
-            the rest of the file, or begin a ``"new_episode"`` with them.
-        drop_trailing_zero_rows: leave out rows at the end of the file that are zero throughout.
+        action: names in the order of the action vector; the file's order by default.
+        outside_bounds: treatment of actions outside their bounds: ``"error"`` or ``"clip"``.
+        time_tolerance: largest deviation of a time step from dt, as a share of dt.
+        on_time_jump: treatment of larger deviations: ``"error"``, or ``"split"`` the run there. Decreasing time is
+            always an error.
+        after_done: treatment of rows with done = 0 after a row with done = 1: ``"error"``, ``"drop"`` the rest of the
+            file, or start a ``"new_episode"``.
+        drop_trailing_zero_rows: whether to drop rows at the end of the file that are all zero.
 
     Raises:
-        ValueError: a contradiction, with what is allowed.
+        ValueError: for contradicting or invalid entries; the message lists what is allowed.
 
     Example:
         >>> from torchrl_h2o.data import Column, LogColumns
@@ -113,7 +112,7 @@ class LogColumns:
     def __post_init__(self):
         for name, count in Counter(column.name for column in self.columns).items():
             if count > 1:
-                raise ValueError(f"the column name {name!r} stands there {count} times")
+                raise ValueError(f"the column name {name!r} occurs {count} times")
         for role in ("observation", "action"):
             names = self._names(role)
             if not names:
@@ -124,21 +123,25 @@ class LogColumns:
             object.__setattr__(self, role, tuple(order))
         for role in ("reward", "done", "time"):
             if len(self._names(role)) > 1:
-                raise ValueError(f"several columns have the role {role!r}; one can")
+                raise ValueError(f"several columns have the role {role!r}; at most one is allowed")
         if self.dt is None and not self._names("time"):
-            raise ValueError("dt is missing, and so is a time column to take it from")
+            raise ValueError("dt is missing, and there is no time column to derive it from")
         if self.dt is not None and not 0 < self.dt < math.inf:
             raise ValueError(f"dt {self.dt} must be a positive number of seconds")
         if not isinstance(self.separator, str) or (self.separator != "whitespace" and len(self.separator) != 1):
             raise ValueError(f"separator {self.separator!r} must be 'whitespace' or one character")
         if self.separator in ('"', "\n", "\r"):
-            raise ValueError(f"separator {self.separator!r} cannot stand between cells; take another")
+            raise ValueError(f"separator {self.separator!r} cannot separate cells; choose another")
         if self.comment is not None and not (isinstance(self.comment, str) and len(self.comment.strip()) == 1):
-            raise ValueError(f"comment {self.comment!r} must be one character (in quotes: YAML's own comment is #)")
+            raise ValueError(
+                f"comment {self.comment!r} must be one character (quoted, because # starts a comment in YAML)"
+            )
         if self.decimal == self.separator:
-            raise ValueError(f"decimal and separator are both {self.decimal!r}; one of them is another")
+            raise ValueError(f"decimal and separator are both {self.decimal!r}; they must differ")
         if self.other_columns == "ignore" and not self.header:
-            raise ValueError("other_columns: ignore needs a header; without one, describe all with role: ignore")
+            raise ValueError(
+                "other_columns: ignore requires a header; without one, describe all columns, with role: ignore"
+            )
         if not 0 < self.time_tolerance < math.inf:
             raise ValueError(f"time_tolerance {self.time_tolerance} must be positive")
         for name, allowed in (
@@ -154,7 +157,7 @@ class LogColumns:
                 raise ValueError(f"{name} {getattr(self, name)!r} must be one of {allowed}")
 
     def named(self, role: str) -> Column | None:
-        """The column with a role of which there is at most one."""
+        """Return the column of a role that occurs at most once, or None."""
         return next((column for column in self.columns if column.role == role), None)
 
     def _names(self, role: str) -> tuple[str, ...]:
@@ -162,14 +165,14 @@ class LogColumns:
 
     @classmethod
     def load(cls, source: str | Path) -> LogColumns:
-        """Read the layout from a YAML file, or one that comes with the package by its name.
+        """Read a layout from a YAML file, or a layout of the package by its name.
 
         Args:
             source: a path, or ``"wheel_legged_standing_still"``, ``"wheel_legged_moving_forward"``
                 or ``"simple_pendulum"``.
 
         Raises:
-            DataError: no such file, no YAML, an unknown, doubled or wrong entry, a contradiction.
+            DataError: a missing file, invalid YAML, an unknown, duplicate or invalid entry, or contradicting entries.
 
         Example:
             >>> from torchrl_h2o.data import LogColumns

@@ -1,4 +1,4 @@
-"""Turn the text of a log into numbers in SI, or say in which line and column it is not one."""
+"""Convert the text of a log to numbers in SI, with errors that name the line and column."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class LogTable:
 
     Args:
         source: the file.
-        names: the columns that are read, in the file's order.
-        values: shape (rows, columns), float64, in SI.
-        rows: shape (rows,), the line number of each row, counted from 1.
-        zero_rows: how many rows of zeros were left out at the end.
+        names: names of the columns that are not ignored, in the file's order.
+        values: values in SI, float64, (rows, columns).
+        rows: line number of each row, counted from 1, (rows,).
+        zero_rows: number of rows of zeros that were dropped at the end.
     """
 
     source: str
@@ -32,23 +32,23 @@ class LogTable:
     zero_rows: int
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """The named columns in that order, shape (rows, len(names))."""
+        """Return the named columns in the given order, (rows, len(names))."""
         return self.values[:, [self.names.index(name) for name in names]]
 
 
 def read_table(path: str, layout: LogColumns) -> LogTable:
-    """Read a log's numbers and check every one of them.
+    """Read and check the numbers of a log.
 
     Args:
         path: the log.
-        layout: what its columns are.
+        layout: the meaning of its columns.
 
     Returns:
-        the table, converted to SI; columns that are ignored are not looked at.
+        The table, converted to SI. Ignored columns are not parsed.
 
     Raises:
-        DataError: no file, no text, an empty or cut-off file, missing or extra columns, what is
-            no number, NaN or infinity.
+        DataError: for a missing, binary, empty or truncated file, missing or extra columns, a cell that is not a
+            number, NaN or infinity.
 
     Example:
         >>> import pathlib, tempfile
@@ -66,8 +66,8 @@ def read_table(path: str, layout: LogColumns) -> LogTable:
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
-        raise DataError(f"this is no text: {error}", "give a text or CSV file", source=path) from error
-    # blank lines and comments are skipped and still counted, as in an editor
+        raise DataError(f"the file is not text: {error}", "give a text or CSV file", source=path) from error
+    # blank lines and comments are skipped but counted, so that row numbers are line numbers
     rows = [
         (number, _cells(line, layout.separator, path, number))
         for number, line in enumerate(lines, start=1)
@@ -79,7 +79,7 @@ def read_table(path: str, layout: LogColumns) -> LogTable:
     if len(rows) < 2:
         raise DataError(
             f"there are {len(rows)} rows of data",
-            "two make a transition: the file is empty or cut off",
+            "a transition needs two: the file is empty or truncated",
             source=path,
         )
     _require_width(rows, names, path)
@@ -94,7 +94,7 @@ def read_table(path: str, layout: LogColumns) -> LogTable:
         zero_rows = len(values) - (filled[-1] + 1 if len(filled) else 0)
         values, numbers = values[: len(values) - zero_rows], numbers[: len(values) - zero_rows]
     if len(values) < 2:
-        raise DataError("only rows of zeros are left", "record it again", source=path)
+        raise DataError("only rows of zeros remain", "record the log again", source=path)
     values = values * np.array([by_name[name].factor for name in names])
     require_finite(values, names, source=path, row_of=lambda index: int(numbers[index]))
     return LogTable(str(path), tuple(names), values, numbers, int(zero_rows))
@@ -104,13 +104,13 @@ def _cells(line: str, separator: str, path, number: int) -> list[str]:
     if separator == "whitespace":
         return line.split()
     try:
-        # skipinitialspace: a quote behind a space is a quote still
+        # skipinitialspace, so that a quote after a space is recognised
         skip = separator != " "
         (cells,) = csv.reader([line.rstrip("\r")], delimiter=separator, skipinitialspace=skip, strict=True)
     except csv.Error as error:
         raise DataError(
-            f"the line cannot be cut into cells: {error}",
-            "correct its quotes; a cell ends on its own line",
+            f"the line cannot be split into cells: {error}",
+            "correct its quotes; a cell cannot span lines",
             source=path,
             row=number,
         ) from error
@@ -127,7 +127,7 @@ def _require_names(header: tuple[int, list[str]], expected: list[str], path, ign
         if names.count(name) > 1:
             problem = "two columns have this name"
         elif name not in expected:
-            problem = "the column is not described (role: ignore leaves it out, other_columns: ignore all such)"
+            problem = "the column is not described (use role: ignore, or other_columns: ignore for all such columns)"
         else:
             continue
         raise DataError(problem, remedy, source=path, column=name, row=number)
@@ -146,13 +146,13 @@ def _require_width(rows: list[tuple[int, list[str]]], names: list[str], path) ->
         if len(cells) > len(names):
             raise DataError(
                 f"{found}; extra: {', '.join(cells[len(names) :])}",
-                "describe them (the role ignore leaves them out), or check the separator",
+                "describe them (with the role ignore if not needed), or check the separator",
                 column=f"column {len(names) + 1}",
                 **place,
             )
         place["column"] = names[len(cells)]
         if number == rows[-1][0] and len(rows) > 1:
-            raise DataError(f"{found}, and it is the last", "the file is cut off", **place)
+            raise DataError(f"{found}, and it is the last row", "the file is truncated", **place)
         raise DataError(f"{found}; missing", "correct the row, or check the separator", **place)
 
 
@@ -166,7 +166,7 @@ def _numbers(
                 values[index, position] = _number(cell, decimal)
             except ValueError:
                 raise DataError(
-                    f"{cell!r} is no number",
+                    f"{cell!r} is not a number",
                     f"correct it, or check separator, header and decimal ({decimal!r})",
                     source=path,
                     column=names[position],
@@ -176,7 +176,7 @@ def _numbers(
 
 
 def _number(cell: str, decimal: str) -> float:
-    # float takes 1_5 for 15; and with a decimal comma, a point stands between thousands
+    # float() accepts 1_5 as 15; and with a decimal comma, a point would separate thousands
     if "_" in cell or (decimal == "," and "." in cell):
         raise ValueError
     return float(cell.replace(",", ".") if decimal == "," else cell)

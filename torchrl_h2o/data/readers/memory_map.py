@@ -1,7 +1,7 @@
-"""Write a TED TensorDict as a memory map, and open one only after its files have been looked at.
+"""Write and read TED TensorDicts as memory maps, with checks of the files before they are opened.
 
-torch maps a file that is too short by growing it with zeros: the source would change, and nobody
-would be told. And tensordict keeps what is not a tensor in a pickle.
+The checks are needed because torch silently extends a file that is too short with zeros, and because tensordict
+stores entries that are not tensors as pickles.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ _FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
 
 
 def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
-    """Write a flat TED TensorDict as a memory map: one file an entry, no pickle, all or nothing.
+    """Write a flat TED TensorDict as a memory map, atomically: one file per entry and no pickles.
 
     Args:
-        td: batch size [T]; tensors only.
+        td: transitions of batch size [T], tensors only.
         folder: a folder that does not exist yet.
 
     Returns:
-        the folder.
+        The folder.
 
     Raises:
-        DataError: the folder exists, or the TensorDict is not what :func:`read_ted` would take.
+        DataError: if the folder exists, or if :func:`read_ted` would reject the TensorDict.
 
     Example:
         >>> import tempfile, torch
@@ -59,21 +59,20 @@ def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
 
 
 def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
-    """Read a flat TED TensorDict that :func:`write_ted` or ``TensorDict.memmap`` has written.
+    """Read a flat TED TensorDict written by :func:`write_ted` or ``TensorDict.memmap``.
 
     Args:
-        folder: the folder that holds ``meta.json``.
-        in_memory: copy the data, and turn observation, action and reward to float32 (our own
-            simulators record float64). Without it the tensors stay mapped to the files, for data
-            larger than the memory, and must be float32 there; writing to them changes the files.
+        folder: the folder with ``meta.json``.
+        in_memory: whether to copy the data and convert observation, action and reward to float32 (simulators may
+            record float64). Otherwise the tensors stay mapped to the files, for data larger than memory, and must be
+            float32 in the files; writing to them changes the files.
 
     Returns:
-        TensorDict of batch size [T], with every entry that was written. A last episode without an
-        end is marked truncated.
+        TensorDict of batch size [T] with all entries in the files. An unfinished last episode is marked truncated.
 
     Raises:
-        DataError: a missing or cut-off file, a pickle, a missing entry, NaN or infinity, another
-            dtype than float32 that is to stay mapped.
+        DataError: for a missing or truncated file, a pickle, a missing entry, NaN or infinity, or mapped data of a
+            dtype other than float32.
     """
     td = load_memory_map(folder)
     require_ted(td, source=folder)
@@ -86,13 +85,13 @@ def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
 
 
 def load_memory_map(folder: str | Path) -> TensorDict:
-    """Map what ``TensorDict.memmap`` has written; writing to the result changes the files.
+    """Map the files written by ``TensorDict.memmap``; writing to the result changes the files.
 
     Args:
-        folder: the folder that holds ``meta.json``.
+        folder: the folder with ``meta.json``.
 
     Raises:
-        DataError: no such folder, a pickle in it, a missing or cut-off file.
+        DataError: for a missing folder, a pickle in it, or a missing or truncated file.
 
     Example:
         >>> import tempfile, torch
@@ -105,12 +104,12 @@ def load_memory_map(folder: str | Path) -> TensorDict:
     """
     folder = Path(folder).expanduser()
     if not (folder / "meta.json").is_file():
-        raise DataError("there is no meta.json here", "give a folder written by write_ted", source=folder)
+        raise DataError("there is no meta.json in the folder", "give a folder written by write_ted", source=folder)
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.suffix != ".memmap" and is_pickle(path):
             raise DataError(
-                "this is a pickle, and reading it could run any code",
-                "write the data again with write_ted, which keeps tensors only",
+                "this is a pickle, and reading it could execute arbitrary code",
+                "write the data again with write_ted, which stores only tensors",
                 source=path,
             )
     _require_whole_files(folder)
@@ -140,8 +139,8 @@ def _require_whole_files(folder: Path) -> None:
         found = path.stat().st_size if path.is_file() else 0
         if found != size:
             raise DataError(
-                f"the file has {found} bytes, meta.json promises {size}",
-                "it is cut off or not its own: copy or write the folder again",
+                f"the file has {found} bytes, but meta.json states {size}",
+                "the file is truncated or belongs to other data: copy or write the folder again",
                 source=path,
             )
     for key in inner:
@@ -151,13 +150,13 @@ def _require_whole_files(folder: Path) -> None:
 def _as_float32(td: TensorDict, in_memory: bool, folder: str | Path) -> TensorDict:
     for key in _FLOATS:
         values = td.get(key, None)
-        # actions may be integers: those of a discrete task
+        # actions of a discrete task may be integers
         discrete = key == "action" and not values.is_floating_point()
         if values is None or values.dtype == torch.float32 or discrete:
             continue
         if not in_memory:
             raise DataError(
-                f"the dtype is {values.dtype}, and mapped data are taken as they are: torch.float32",
+                f"the dtype is {values.dtype}, but mapped data must be torch.float32, because they are not converted",
                 "read with in_memory=True, or write the data again as float32",
                 source=folder,
                 column=entry_name(key),

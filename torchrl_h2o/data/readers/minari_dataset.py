@@ -1,7 +1,7 @@
-"""Read Minari datasets into TED, and write our own recordings of real data as Minari datasets.
+"""Read Minari datasets into TED, and write recordings as Minari datasets.
 
-Everything is read through ``minari`` itself: torchrl 0.14.1's ``MinariExperienceReplay(...,
-load_from_local_minari=True)`` returns zeros for these files without an error.
+Files are read through ``minari`` itself, because ``MinariExperienceReplay(..., load_from_local_minari=True)`` of
+torchrl 0.14.1 returns zeros for these files without an error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.readers.ted import episodes, require_continuous, require_ted, to_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 
-if TYPE_CHECKING:  # minari and gymnasium are imported where they are used: the buffer needs neither
+if TYPE_CHECKING:  # minari and gymnasium are imported where they are used, because the buffer needs neither
     from gymnasium.envs.registration import EnvSpec
     from minari import MinariDataset
     from torchrl.envs import EnvBase
@@ -28,21 +28,21 @@ _FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
 def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
     """Read a Minari dataset by its folder or by its name.
 
-    A name such as ``"halfcheetah/medium-v0"`` is looked up in ``MINARI_DATASETS_PATH``, then
-    downloaded. A folder is only read.
+    A name such as ``"halfcheetah/medium-v0"`` is looked up in ``MINARI_DATASETS_PATH`` and downloaded if missing. A
+    folder is only read.
 
     Args:
-        source: a dataset's folder (it holds ``data/``), or its name.
-        task: a Gymnasium id: refuse data of another task (of another version of it they may be).
-            Data that do not name theirs are taken with a warning in the log.
+        source: a dataset's folder, which contains ``data/``, or its name.
+        task: a Gymnasium id. Data of another task are rejected; the version may differ. For data that do not name
+            their task, a warning is logged.
 
     Returns:
         TensorDict of batch size [T] in TED.
 
     Raises:
-        DataError: an unknown name, cut-off files, an episode whose parts do not fit together, NaN
-            or infinity (the column is the path inside the HDF5 file, the row is counted from 1 in
-            its episode), spaces other than flat boxes.
+        DataError: for an unknown name, truncated files, an episode with arrays of inconsistent shapes, NaN or infinity
+            (the column is the path inside the HDF5 file, the row is counted from 1 within its episode), or spaces
+            other than flat boxes.
 
     Example:
         >>> import tempfile
@@ -59,8 +59,8 @@ def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
     lengths = [len(rewards) for rewards in parts["rewards"]]
     if sum(lengths) != dataset.total_steps or not lengths:
         raise DataError(
-            f"the metadata promise {dataset.total_steps} steps, the file holds {sum(lengths)}",
-            "the dataset is empty or cut off: copy or download it again",
+            f"the metadata state {dataset.total_steps} steps, the file contains {sum(lengths)}",
+            "the dataset is empty or truncated: copy or download it again",
             source=source,
         )
     for field in ("observations", "actions", "rewards"):
@@ -71,7 +71,7 @@ def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
             require_finite(values, names, source=source)
     truncated = np.concatenate(parts["truncations"]).astype(bool)
     terminated = np.concatenate(parts["terminations"]).astype(bool)
-    # Minari lets an episode stop without either flag: the recording was cut there
+    # Minari allows episodes that end without either flag; they are marked truncated
     last = np.cumsum(lengths) - 1
     truncated[last] |= ~terminated[last]
     return to_ted(
@@ -95,26 +95,26 @@ def write_minari(
     algorithm_name: str | None = None,
     description: str | None = None,
 ) -> Path:
-    """Write a recording as a Minari dataset, all or nothing.
+    """Write a recording as a Minari dataset, atomically.
 
     Args:
-        td: flat TED transitions of batch size [T] with a reward, cut at ("next", "done").
+        td: flat TED transitions of batch size [T] with rewards, with episodes ending at ("next", "done").
         dataset_id: ``"(namespace/)name-v0"``.
         root: the folder of datasets; by default Minari's own (``MINARI_DATASETS_PATH``).
-        env: gives the bounds of the action space; the data are checked against it. Without it
+        env: an environment that provides the bounds of the action space; the data are checked against it. Without it
             the spaces are unbounded.
-        env_spec: Gymnasium's spec of the task, so that ``recover_environment`` works.
+        env_spec: Gymnasium's spec of the task, which ``recover_environment`` needs.
         author, algorithm_name, description: Minari's metadata.
 
     Returns:
-        the dataset's folder.
+        The dataset's folder.
 
     Raises:
-        DataError: the dataset exists, the name is not Minari's, or an observation inside an
-            episode is not the one that the step before it led to.
+        DataError: if the dataset exists, the name is not valid, or an observation within an episode is not the next
+            observation of the step before.
 
     Example:
-        see :func:`read_minari`.
+        See :func:`read_minari`.
     """
     from minari import __version__
     from minari.data_collector import EpisodeBuffer
@@ -124,10 +124,10 @@ def write_minari(
 
     try:
         parse_dataset_id(dataset_id)
-    except (ValueError, TypeError) as error:  # without a version minari takes int(None)
+    except (ValueError, TypeError) as error:  # minari calls int(None) for a name without a version
         raise DataError(
-            "this is not a name that Minari takes",
-            "take name-v0 or namespace/name-v0, of letters, digits, _ and -, two at least each",
+            "this is not a valid Minari name",
+            "use name-v0 or namespace/name-v0, each of at least two letters, digits, _ or -",
             source=dataset_id,
         ) from error
     folder = (get_dataset_path() if root is None else Path(root)) / dataset_id
@@ -173,17 +173,17 @@ def _open(source: str | Path) -> MinariDataset:
         if data.is_dir():
             return minari.MinariDataset(data)
         return minari.load_dataset(str(source), download=True)
-    except Exception as error:  # every hosting service has its own network errors
+    except Exception as error:  # each hosting service raises its own network errors
         raise DataError(
             f"no Minari dataset can be opened: {error}",
-            "give the folder that holds data/metadata.json, or a name that is in "
+            "give the folder that contains data/metadata.json, or a name that is in "
             "MINARI_DATASETS_PATH or can be downloaded",
             source=source,
         ) from error
 
 
 def _require_task(dataset: MinariDataset, task: str | None, source: str | Path) -> None:
-    # Dimensions do not tell: HalfCheetah and Walker2d both have 17 and 6.
+    # dimensions do not identify a task: HalfCheetah and Walker2d both have 17 and 6
     spec = dataset.spec.env_spec
     if spec is None:
         warn_of_unknown_task(task, source)
@@ -199,7 +199,7 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
         if not isinstance(space, Box) or len(space.shape) != 1:
             raise DataError(
                 f"the space is {space}",
-                "only flat vectors of real numbers are read: flatten and write the dataset again",
+                "only flat vectors of real numbers are supported: flatten them and write the dataset again",
                 source=source,
                 column=name,
             )
@@ -215,7 +215,7 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
                 if values.shape != shape:
                     raise DataError(
                         f"the shape is {list(values.shape)}, expected {list(shape)}",
-                        "the episode is cut off or not its space's: write it again",
+                        "the episode is truncated or does not match its space: write it again",
                         source=source,
                         column=f"episode_{number}/{field}",
                     )
@@ -223,7 +223,7 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
     except (OSError, KeyError, RuntimeError, AssertionError) as error:
         raise DataError(
             f"episode {len(parts['truncations'])} cannot be read: {error}",
-            "the file is cut off: copy or download it again",
+            "the file is truncated: copy or download it again",
             source=source,
         ) from error
     return parts
@@ -232,8 +232,8 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
 def _require_recordable(td: TensorDictBase, source: str) -> None:
     require_ted(td, source=source)
     if ("next", "reward") not in td.keys(True):
-        raise DataError("the entry is missing", "Minari needs it", source=source, column="next.reward")
-    # an episode is stored as one array of observations: a jump inside it would be lost
+        raise DataError("the entry is missing", "Minari requires it", source=source, column="next.reward")
+    # an episode is stored as one array of observations, which cannot represent a jump
     require_continuous(td, source=source)
 
 

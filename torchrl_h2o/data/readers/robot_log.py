@@ -1,6 +1,6 @@
-"""Read a robot's log, text or CSV, into TED: parse, convert to SI, link rows into transitions.
+"""Read a robot's log, text or CSV, into TED: parse, convert to SI, and link rows into transitions.
 
-Row t and row t + 1 make a transition, so the last row of a run is only a next observation.
+Rows t and t + 1 form a transition, so the last row of a run serves only as a next observation.
 """
 
 from __future__ import annotations
@@ -30,23 +30,24 @@ def read_robot_log(
     reward: Reward | None = None,
     settings: ReaderSettings = READER_SETTINGS,
 ) -> TensorDict:
-    """Read a log with the meaning of its columns.
+    """Read a log whose columns are described by a layout.
 
-    How many rows were left out and how many actions were clipped is logged. The first row with
-    done = 1 is the terminal next observation; the rows with done = 1 behind it are left out.
+    The numbers of dropped rows and clipped actions are logged. The first row with done = 1 is the terminal next
+    observation; later rows with done = 1 are dropped.
 
     Args:
         path: the log.
-        columns: its layout, or the YAML that holds it, or the name of one in the package.
-        reward: ``reward(observation (T, n), action (T, m), next_observation (T, n)) -> (T,)`` on
-            float64 arrays in SI. Without it, and without a reward column, the result has no
-            ("next", "reward"): identifying a system needs none.
+        columns: its layout, or a YAML file with it, or the name of a layout of the package.
+        reward: ``reward(observation (T, n), action (T, m), next_observation (T, n)) -> (T,)`` on float64 arrays in
+            SI. Without it and without a reward column, the result has no ("next", "reward"), which system
+            identification does not need.
+        settings: the tolerance of the clock.
 
     Returns:
-        TensorDict of batch size [T] in TED, with a float64 ``time`` in seconds, shape [T, 1].
+        TensorDict of batch size [T] in TED, with a float64 ``time`` in s of shape [T, 1].
 
     Raises:
-        DataError: naming file, column and row (the line number that an editor shows).
+        DataError: with file, column and line number.
 
     Example:
         >>> import pathlib, tempfile
@@ -85,7 +86,14 @@ def read_robot_log(
 
 @dataclass(frozen=True)
 class _Links:
-    """Which rows are followed by the next row of the same run."""
+    """The first rows of all transitions and their flags.
+
+    Args:
+        start: index of the first row of each transition, (T,).
+        terminated: whether the second row has done = 1, (T,).
+        truncated: whether the run ends after the transition without done, (T,).
+        dropped: number of rows that belong to no transition.
+    """
 
     start: np.ndarray
     terminated: np.ndarray
@@ -136,7 +144,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndar
     if len(restarts) and layout.after_done == "error":
         raise DataError(
             "done falls back to 0 after the run has ended",
-            "say what these rows are: after_done: drop, or after_done: new_episode",
+            "declare what these rows are: after_done: drop, or after_done: new_episode",
             source=table.source,
             column=layout.named("done").name,
             row=table.rows[restarts[0] + 1],
@@ -144,7 +152,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndar
 
 
 def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings) -> np.ndarray:
-    """Where the time between two linked rows is not dt; an error unless a split is asked for."""
+    """Return where the time between two linked rows is not dt; raises DataError unless on_time_jump is split."""
     column = layout.named("time")
     if column is None:
         return np.zeros(len(linked), bool)
@@ -156,8 +164,8 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
         index = backwards[0]
         raise DataError(
             f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
-            "time must grow: cut the file into its runs, or set drop_trailing_zero_rows if the "
-            "logger fills its end with zeros",
+            "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
+            "end of the file with zeros",
             row=table.rows[index + 1],
             **place,
         )
@@ -175,17 +183,17 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
 
 
 def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, str], settings: ReaderSettings) -> float:
-    """The layout's dt, held against the time between linked rows; without one, the median time."""
+    """Return the layout's dt after comparing it with the steps between linked rows, or else their median."""
     if layout.dt is None or not len(steps):
         return float(np.median(steps)) if len(steps) else 0.0
     median = float(np.median(steps))
-    # a clock that counts in ms gives 3, 3, 4 at 300 Hz: there the mean is right, without the gaps
+    # a clock with a resolution of 1 ms gives 3, 3, 4 at 300 Hz, where the mean without gaps is accurate
     mean = float(np.mean(steps[steps <= settings.longest_regular_step * median]))
-    # time_tolerance is for single late rows: it would let dt be wrong throughout
+    # time_tolerance is for single late rows and would accept a dt that is wrong throughout
     if min(abs(median - layout.dt), abs(mean - layout.dt)) > settings.clock_tolerance * layout.dt:
         raise DataError(
             f"the median time step is {median:.9g} s, dt is {layout.dt:.9g} s",
-            "correct dt or the unit of time, or leave dt out to take the median",
+            "correct dt or the unit of time, or omit dt to use the median",
             **place,
         )
     return layout.dt
@@ -202,7 +210,7 @@ def _bounded(action: np.ndarray, start: np.ndarray, table: LogTable, layout: Log
     by_name = {column.name: column for column in layout.columns}
     bounds = [by_name[name].bounds or (-np.inf, np.inf) for name in layout.action]
     low, high = np.array(bounds).T
-    # a row without a transition has no action to judge
+    # only actions of transitions are checked
     outside = (action[start] < low) | (action[start] > high)
     if outside.any() and layout.outside_bounds == "error":
         index, position = np.argwhere(outside)[0]
@@ -228,7 +236,7 @@ def _rewards(
         if reward is not None:
             raise DataError(
                 "the log has a reward column and a reward function was given",
-                "give one: set the column's role to ignore, or leave out the function",
+                "use one of them: set the column's role to ignore, or omit the function",
                 source=table.source,
                 column=column.name,
             )
@@ -238,8 +246,8 @@ def _rewards(
     values = np.asarray(reward(*transition), dtype=np.float64)
     if values.size != len(start):
         raise DataError(
-            f"the reward function gave the shape {list(values.shape)}",
-            f"it must give [{len(start)}], one number a transition",
+            f"the reward function returned the shape {list(values.shape)}",
+            f"it must return [{len(start)}], one number per transition",
             source=table.source,
         )
     values = values.reshape(-1, 1)

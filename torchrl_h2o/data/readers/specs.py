@@ -1,4 +1,4 @@
-"""Compare recorded transitions with an environment before anything is trained on them."""
+"""Check recorded transitions against the specs of an environment."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def check_specs(
     source: str | Path = "transitions",
     settings: ReaderSettings = READER_SETTINGS,
 ) -> None:
-    """Check that transitions could have come from an environment.
+    """Check that transitions match the specs of an environment.
 
     Args:
-        td: flat TED transitions, batch size [T].
+        td: flat TED transitions of batch size [T].
         env: a TorchRL environment with the entries ``observation`` and ``action``.
         source: name of the data in errors.
         settings: the tolerance of the action bounds.
 
     Raises:
-        DataError: another number of dimensions, another kind of number, an action outside the
+        DataError: for a different number of dimensions, a different kind of number, or an action outside the
             environment's bounds; with the column and the row, counted from 1.
 
     Example:
@@ -74,7 +74,7 @@ def check_specs(
             )
         if values.is_floating_point() != spec.dtype.is_floating_point:
             raise DataError(
-                f"the data are {values.dtype}, the environment takes {spec.dtype}",
+                f"the data are {values.dtype}, the environment uses {spec.dtype}",
                 "choose the environment that was recorded",
                 source=source,
                 column=key,
@@ -83,14 +83,16 @@ def check_specs(
 
 
 def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
-    """Log a warning that data which name no task could not be checked to be of the one asked for.
+    """Log a warning that the task of the data is unknown and was not compared with the requested one.
 
     Args:
-        task: what was asked for; without one there is nothing to warn of.
-        source: what to call the data.
+        task: the requested task; without one no warning is logged.
+        source: name of the data.
     """
     if task is not None:
-        torchrl_logger.warning(f"{source} does not say which task it was recorded in: not checked to be {task}")
+        torchrl_logger.warning(
+            f"{source} does not name the task it was recorded in; whether it is {task} was not checked"
+        )
 
 
 def _require_bounds(action: torch.Tensor, spec: TensorSpec, source: str | Path, rounding: float) -> None:

@@ -1,6 +1,6 @@
-"""The one form that every reader returns, TorchRL's TED as a flat TensorDict, and its checks.
+"""TorchRL's episode data format (TED) as a flat TensorDict, which every reader returns, and its checks.
 
-Row t is a transition; ``next`` of an episode's last row is that episode's own final observation.
+Row t is a transition; ``next`` of the last row of an episode is the final observation of that episode.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ def to_ted(
     truncated: np.ndarray,
     reward: np.ndarray | None = None,
 ) -> TensorDict:
-    """Put arrays of T transitions into one flat TED TensorDict.
+    """Build a flat TED TensorDict from arrays of T transitions.
 
-    An episode that the end of the data cuts is marked truncated.
+    An unfinished last episode is marked truncated.
 
     Args:
-        observation: shape (T, n), the state before the action.
-        action: shape (T, m).
-        next_observation: shape (T, n), the state after it.
-        terminated: shape (T,), bool: the task ended here, nothing follows.
-        truncated: shape (T,), bool: the recording ended here, more would have followed.
-        reward: shape (T,); without it the result has no ("next", "reward").
+        observation: observations before the actions, (T, n).
+        action: actions, (T, m).
+        next_observation: observations after the actions, (T, n).
+        terminated: whether the task ended at this transition, (T,), bool.
+        truncated: whether the episode was cut off at this transition, (T,), bool.
+        reward: rewards, (T,); without them the result has no ("next", "reward").
 
     Returns:
-        TensorDict of batch size [T]: float32 ``observation``, ``action`` and their ``next``; bool
-        flags and float32 reward of shape [T, 1].
+        TensorDict of batch size [T] with float32 ``observation``, ``action`` and ("next", "observation"), and bool
+        flags and float32 rewards of shape [T, 1].
 
     Example:
         >>> import numpy as np
@@ -61,7 +61,7 @@ def to_ted(
     """
 
     def floats(values: np.ndarray) -> torch.Tensor:
-        # a copy: the caller's array must not change with the result
+        # a copy, so that the result does not share memory with the caller's array
         return torch.from_numpy(np.array(values, dtype=np.float32))
 
     ends = {"terminated": np.array(terminated, bool), "truncated": np.array(truncated, bool)}
@@ -76,7 +76,7 @@ def to_ted(
         {
             "observation": floats(observation),
             "action": floats(action),
-            # TED: no state from which a step is taken is itself an end
+            # in TED, a state from which a step is taken is never done
             **{name: torch.zeros_like(flag) for name, flag in flags.items()},
             "next": TensorDict(following, batch_size=[steps]),
         },
@@ -85,13 +85,13 @@ def to_ted(
 
 
 def episodes(td: TensorDictBase) -> Iterator[TensorDictBase]:
-    """Cut a flat TED TensorDict behind every ("next", "done"); the views share its memory.
+    """Split a flat TED TensorDict after every ("next", "done") into views that share its memory.
 
     Args:
-        td: batch size [T].
+        td: transitions of batch size [T].
 
     Yields:
-        one TensorDict an episode; a last one without an end is yielded too.
+        One TensorDict per episode, including an unfinished last one.
     """
     ends = (td["next", "done"].flatten().nonzero().flatten() + 1).tolist()
     if not ends or ends[-1] != len(td):
@@ -103,14 +103,14 @@ def episodes(td: TensorDictBase) -> Iterator[TensorDictBase]:
 
 
 def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> None:
-    """Check keys, shapes, flags and finite values of a flat TED TensorDict.
+    """Check the keys, shapes, flags and values of a flat TED TensorDict.
 
     Args:
-        td: what to check, batch size [T].
-        source: what to call it in errors.
+        td: transitions of batch size [T].
+        source: name of the data in errors.
 
     Raises:
-        DataError: naming the key as column, and the row.
+        DataError: with the key as column, and the row.
     """
     keys = set(td.keys(True, True))
     for key in _REQUIRED_KEYS:
@@ -119,7 +119,7 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
     if td.ndim != 1 or not len(td):
         raise DataError(
             f"the batch size is {list(td.batch_size)}, expected [T] with T of at least 1",
-            "reshape(-1) complete episodes that end in done, or record something",
+            "use reshape(-1) on complete episodes that end in done, or record more data",
             source=source,
         )
     _require_shapes(td, keys, source)
@@ -132,14 +132,14 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
 
 
 def require_continuous(td: TensorDictBase, *, source: str | Path = "transitions") -> None:
-    """Check that inside an episode every observation is the one that the row before led to.
+    """Check that within an episode every observation equals the next observation of the row before.
 
     Args:
-        td: flat TED transitions of batch size [T], cut at ("next", "done").
-        source: what to call them in errors.
+        td: flat TED transitions of batch size [T], with episodes ending at ("next", "done").
+        source: name of the data in errors.
 
     Raises:
-        DataError: at the first row that begins elsewhere, counted from 1.
+        DataError: at the first row that violates this, counted from 1.
 
     Example:
         >>> from torchrl.envs import GymEnv
@@ -158,7 +158,7 @@ def require_continuous(td: TensorDictBase, *, source: str | Path = "transitions"
     if len(jumps):
         raise DataError(
             "the observation is not the next observation of the row before",
-            "mark the row before as done and truncated if another episode begins here",
+            "mark the row before as done and truncated if a new episode begins here",
             source=source,
             column="observation",
             row=int(jumps[0]) + 2,
@@ -178,14 +178,14 @@ def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
         if td.get(key).ndim != 2:
             raise DataError(
                 f"the shape is {list(td.get(key).shape)}, expected [{len(td)}, n]",
-                "flatten what belongs to one step into one vector, of length 1 at least",
+                "flatten the values of one step into one vector of at least one entry",
                 source=source,
                 column=key,
             )
     if td["observation"].shape != td["next", "observation"].shape:
         raise DataError(
             f"shape {list(td['next', 'observation'].shape)}, observation has {list(td['observation'].shape)}",
-            "both must be of one kind",
+            "both must have the same shape",
             source=source,
             column="next.observation",
         )
@@ -193,7 +193,7 @@ def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
         if not td.get(key).is_floating_point():
             raise DataError(
                 f"the dtype is {td.get(key).dtype}",
-                "observations must be real numbers: turn them with .float(), or encode them one-hot",
+                "observations must be real numbers: convert them with .float(), or encode them one-hot",
                 source=source,
                 column=entry_name(key),
             )
@@ -207,7 +207,7 @@ def _require_flags(td: TensorDictBase, source: str | Path) -> None:
             if values.dtype != torch.bool:
                 raise DataError(
                     f"the dtype is {values.dtype}, expected torch.bool",
-                    "turn the flags with .bool()",
+                    "convert the flags with .bool()",
                     source=source,
                     column=entry_name((*prefix, name)),
                 )
@@ -218,8 +218,8 @@ def _require_flags(td: TensorDictBase, source: str | Path) -> None:
             loose = (flags[name] & ~done).flatten().nonzero().flatten()
             if len(loose):
                 raise DataError(
-                    f"{name} holds and done does not",
-                    "done must hold wherever terminated or truncated does: set done = terminated | truncated",
+                    f"{name} is true but done is false",
+                    "done must be true wherever terminated or truncated is: set done = terminated | truncated",
                     source=source,
                     column=entry_name((*prefix, "done")),
                     row=int(loose[0]) + 1,
@@ -227,5 +227,5 @@ def _require_flags(td: TensorDictBase, source: str | Path) -> None:
 
 
 def entry_name(key: str | tuple) -> str:
-    """Write a nested key as errors name it: ``("next", "done")`` as ``next.done``."""
+    """Format a nested key for error messages: ``("next", "done")`` as ``next.done``."""
     return key if isinstance(key, str) else ".".join(key)

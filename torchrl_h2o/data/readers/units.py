@@ -1,11 +1,11 @@
-"""Units that a log may be written in, and what turns them into SI."""
+"""Units of log columns and their conversion to SI."""
 
 from __future__ import annotations
 
 import math
 from types import MappingProxyType
 
-# unit -> (SI unit, factor); "·" and "*" are left out of names, "^" and superscripts are plain digits
+# unit -> (SI unit, factor); names are written without "·", "*" and "^" and with plain digits for superscripts
 UNITS = MappingProxyType(
     {
         "1": ("1", 1.0),
@@ -54,7 +54,7 @@ UNITS = MappingProxyType(
 
 
 def to_si(unit: str) -> tuple[str, float]:
-    """Return the SI unit of a quantity and the factor that leads to it.
+    """Return the SI unit of a unit and the conversion factor.
 
     Args:
         unit: a name such as ``"deg/s"``, ``"mN·m"`` or ``"m/s²"``.
@@ -63,7 +63,7 @@ def to_si(unit: str) -> tuple[str, float]:
         The SI unit and the factor: value in SI = factor · value.
 
     Raises:
-        KeyError: an unknown unit; the message lists the known ones.
+        KeyError: for an unknown unit; the message lists the known ones.
 
     Example:
         >>> from torchrl_h2o.data.readers.units import to_si
@@ -73,5 +73,5 @@ def to_si(unit: str) -> tuple[str, float]:
     name = str(unit).translate(str.maketrans({"·": "", "*": "", "^": "", " ": "", "²": "2"}))
     name = name.replace("µ", "u").replace("°", "deg")
     if name not in UNITS:
-        raise KeyError(f"unknown unit {unit!r}; known are {', '.join(UNITS)}")
+        raise KeyError(f"unknown unit {unit!r}; choose from {', '.join(UNITS)}")
     return UNITS[name]

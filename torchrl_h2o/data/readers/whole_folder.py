@@ -1,4 +1,4 @@
-"""Write a folder all or nothing: under another name first, renamed when it is complete."""
+"""Write a folder atomically: under a temporary name, renamed once it is complete."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torchrl_h2o.data.readers.error import DataError
 
 @contextmanager
 def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]:
-    """Give a temporary folder beside ``folder`` that takes its name when the block ends well.
+    """Yield a temporary folder next to ``folder`` that is renamed to it when the block succeeds.
 
-    A block that raises, or a process that is killed, leaves nothing under ``folder``.
+    If the block raises or the process is killed, ``folder`` is not created.
 
     Args:
         folder: the final name.
-        replace: let an older folder of that name make way, at the last moment.
+        replace: whether to replace an existing folder of that name, at the end of the block.
 
     Raises:
-        DataError: it exists and is not to be replaced.
+        DataError: if the folder exists and ``replace`` is false.
 
     Example:
         >>> import pathlib, tempfile
@@ -34,13 +34,13 @@ def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]
     """
     folder = Path(folder).expanduser()
     if folder.exists() and not replace:
-        raise DataError("it exists and is never overwritten", "remove it or take another name", source=folder)
+        raise DataError("the folder exists and is never overwritten", "remove it or choose another name", source=folder)
     partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # what a killed process has left
+    shutil.rmtree(partial, ignore_errors=True)  # left over from a killed process
     partial.mkdir(parents=True)
     try:
         yield partial
-        if folder.exists():  # a folder can only be renamed onto an empty one
+        if folder.exists():  # a folder cannot be renamed onto a folder with files
             replaced = folder.with_name(f".{folder.name}.replaced")
             shutil.rmtree(replaced, ignore_errors=True)
             folder.rename(replaced)

@@ -1,4 +1,4 @@
-"""A simulator that effects can be put into, stepped from many measured states at once."""
+"""Simulators that take effects and are stepped from many measured states at once."""
 
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.simulation.state_map import StateMap

@@ -1,4 +1,4 @@
-"""How an observation and the model's state belong together: what turns measured rows into states to start from."""
+"""Maps between observations and the model's state, used to start simulations from measured rows."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class StateMap:
     """A linear map between observations and states (qpos, qvel).
 
     Args:
-        names: of the observations, (n).
-        units: of the observations, (n).
-        observe: (n, nq + nv), the observation is ``observe @ state``, clipped to ``clip``.
-        restore: (nq + nv, n), the state is ``offset + restore @ observation``.
-        offset: (nq + nv), what is not observed stands there.
-        clip: (n, 2), the smallest and the largest value that is reported.
-        hidden: the indices of the state that no observation tells and that matter: they follow from what the simulator
-            did before.
+        names: names of the observations, (n,).
+        units: units of the observations, (n,).
+        observe: matrix (n, nq + nv); the observation is ``observe @ state``, clipped to ``clip``.
+        restore: matrix (nq + nv, n); the state is ``offset + restore @ observation``.
+        offset: values of the unobserved coordinates, (nq + nv,); zero for observed ones.
+        clip: smallest and largest reported value of each observation, (n, 2).
+        hidden: indices of the unobserved coordinates that affect later observations. They are estimated by simulating
+            the steps before.
 
     Examples:
         >>> import numpy as np
@@ -49,30 +49,37 @@ class StateMap:
     def of_coordinates(
         cls, names: Sequence[str], units: Sequence[str], indices: Sequence[int], num_states: int
     ) -> StateMap:
-        """Every observation is one coordinate of the state, at an index of (qpos, qvel)."""
+        """Builds the map of observations that each equal one coordinate of the state.
+
+        Args:
+            names: names of the observations, (n,).
+            units: units of the observations, (n,).
+            indices: index of each observation in (qpos, qvel), (n,).
+            num_states: nq + nv.
+        """
         observe = np.zeros((len(names), num_states))
         observe[np.arange(len(names)), indices] = 1.0
         clip = np.tile([-np.inf, np.inf], (len(names), 1))
         return cls(tuple(names), tuple(units), observe, observe.T.copy(), np.zeros(num_states), clip)
 
     def states(self, observations: np.ndarray) -> np.ndarray:
-        """The states, (..., nq + nv), that observations (..., n) tell of."""
+        """Returns the states (..., nq + nv) of observations (..., n)."""
         return self.offset + observations @ self.restore.T
 
     def observations(self, states: np.ndarray) -> np.ndarray:
-        """The observations (..., n) of states (..., nq + nv), without any clipping."""
+        """Returns the observations (..., n) of states (..., nq + nv), without clipping."""
         return states @ self.observe.T
 
     def clipped(self, observations: np.ndarray) -> np.ndarray:
-        """Which rows, (...), of observations (..., n) hold a value at which the sensor was at its end."""
+        """Returns which rows (...) of observations (..., n) contain a clipped value."""
         low, high = self.clip.T
         return ((observations <= low) | (observations >= high)).any(-1)
 
 
 def coordinate_names(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
-    """Names and units of every coordinate of (qpos, qvel), after the joints.
+    """Returns names and units of every coordinate of (qpos, qvel), derived from the joints.
 
-    A joint's angle goes by its own name, its velocity by ``name_velocity``.
+    A joint's position has the joint's name, its velocity the name with ``_velocity`` appended.
     """
     positions, velocities, position_units, velocity_units = [], [], [], []
     for index in range(model.njnt):
@@ -99,14 +106,15 @@ def coordinate_names(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
 def probe_gymnasium(
     task: MujocoEnv, rng: np.random.Generator, settings: SimulationSettings = SIMULATION_SETTINGS
 ) -> StateMap:
-    """The state map of a Gymnasium MuJoCo task, found by showing it states and reading its observations.
+    """Determines the state map of a Gymnasium MuJoCo task from its observations in random states.
 
-    A task may state in ``hidden_state`` how a velocity that it does not observe follows from observations:
-    ``{joint: {observed coordinate: factor}}``.
+    A task may define an attribute ``hidden_state``, which gives unobserved velocities as linear functions of observed
+    coordinates: ``{joint: {observed coordinate: factor}}``.
 
     Args:
-        task: a :class:`gymnasium.envs.mujoco.MujocoEnv`; its state is put back afterwards.
-        rng: draws the states.
+        task: the task; its state is restored afterwards.
+        rng: generator of the random states.
+        settings: spread and number of the states, and tolerances.
 
     Returns:
         The map.
@@ -130,8 +138,8 @@ def probe_gymnasium(
     one_each = (np.abs(observe) > 0).sum(1) == 1
     if error > tolerance or np.abs(solution[-1]).max() > tolerance or not one_each.all():
         raise ValueError(
-            f"{type(task).__name__} does not observe coordinates of its state as they are (qpos and qvel); its "
-            "observation cannot be turned into a state. Give the simulation a StateMap of your own"
+            f"the observation of {type(task).__name__} does not consist of single coordinates of qpos and qvel, so it "
+            "cannot be converted to a state. Give the simulation a StateMap of your own"
         )
     indices = np.abs(observe).argmax(1)
     names, units = coordinate_names(model)
