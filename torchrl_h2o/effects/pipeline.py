@@ -133,8 +133,8 @@ class Pipeline:
             model: the compiled model. Without it the episode holds no forces.
 
         Raises:
-            ValueError: if the model has no element that a force could act on. Also, when the episode is used, if an effect draws
-                random numbers though its class is not marked ``random``.
+            ValueError: if the model has no element that a force could act on; also during the episode, if an effect
+                draws random numbers although its class is not marked ``random``.
         """
 
         def processes(kind: type[Effect], on: Any) -> list:

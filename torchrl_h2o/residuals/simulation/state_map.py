@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -157,6 +157,6 @@ def probe_gymnasium(
     return StateMap(found.names, found.units, found.observe, restore, offset, clip)
 
 
-def _observation(task: MujocoEnv, state: np.ndarray) -> np.ndarray:
+def _observation(task: Any, state: np.ndarray) -> np.ndarray:
     task.set_state(state[: task.model.nq], state[task.model.nq :])
     return task._get_obs()
