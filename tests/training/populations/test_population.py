@@ -189,12 +189,10 @@ def test_compiled_losses_of_a_population_are_the_eager_ones():
 
 def layer_norm_loss(seed):
     parts = Parts(seed, torch.float32)
+    inputs = OBSERVATION_DIM + ACTION_DIM
     sizes = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": 8}}
     qvalues = [
-        ValueOperator(
-            MLP(OBSERVATION_DIM + ACTION_DIM, 1, num_cells=[8, 8], **sizes), in_keys=["observation", "action"]
-        )
-        for _ in range(2)
+        ValueOperator(MLP(inputs, 1, num_cells=[8, 8], **sizes), in_keys=["observation", "action"]) for _ in range(2)
     ]
     bellman_loss = MixedBellmanLoss(parts.actor, qvalues, parts.value)
     return H2OPlusLoss(bellman_loss, ExpectileValueLoss(parts.value), DynamicsRatioLoss(parts.estimator))

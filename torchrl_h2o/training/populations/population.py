@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
 from torch import Tensor, nn
 
 from torchrl_h2o.training.populations.noise_tape import Draw, Playback, Tape, record
@@ -141,9 +141,9 @@ class Population(nn.Module):
         self, tensors: TensorDictBase, noise: tuple[Tensor, ...], *batches: TensorDictBase
     ) -> dict[str, Tensor]:
         self._tape.numbers, self._tape.position = noise, 0
-        with _in_place_of_own(self.members[0], {path: tensors.get(path) for path in self._paths}) as member:
-            with self._playback:
-                terms = dict(member(*batches).items())
+        own = {path: tensors.get(path) for path in self._paths}
+        with _in_place_of_own(self.members[0], own) as member, self._playback:
+            terms = dict(member(*batches).items())
         if self._tape.position != len(noise):
             raise RuntimeError(
                 f"a member's forward made {self._tape.position} of {len(noise)} recorded draws of random numbers: what "
@@ -238,10 +238,11 @@ def _look_into(held: Stackable, stack: TensorDictBase | Tensor, number: int) -> 
     if isinstance(held, Tensor):
         held.data = stack.data[number]
         return
-    held.unlock_()  # a locked tensordict caches values computed from its old tensors
     for key in held.keys(True, True):
         held.get(key).data = stack.get(key).data[number]
-    held.lock_()
+    own = held._param_td
+    for params in (own, *(value for value in own.values(True) if is_tensor_collection(value))):
+        params._erase_cache()  # a locked tensordict caches values computed from its old tensors
 
 
 @contextmanager
