@@ -88,7 +88,7 @@ def test_gamma_is_set_as_in_torchrl(parts, batch, noise):
     loss = parts.bellman(mixing=0.3)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
     assert loss(batch)["loss_qvalue"].item() == pytest.approx(reference_loss(loss, batch, 0.3, noise, gamma=0.5)[0])
-    with pytest.raises(ValueError, match="one-step"):
+    with pytest.raises(NotImplementedError, match="one-step"):
         loss.make_value_estimator(ValueEstimators.TDLambda)
 
 
@@ -173,11 +173,18 @@ def test_td_error_is_written_for_prioritised_replay(parts, batch):
     torch.testing.assert_close(batch["td_error"], error.detach().abs().amax(0))
 
 
-def test_priority_weights_multiply_the_terms(parts, batch):
-    loss = parts.bellman()
-    plain = loss(batch.copy())["loss_qvalue"]
-    batch["priority_weight"] = torch.full(batch.shape, 0.1, dtype=torch.float64)
-    torch.testing.assert_close(loss(batch)["loss_qvalue"], 0.1 * plain)
+def test_priority_weights_are_normalised_within_each_stream(parts, batch):
+    loss, rowwise = parts.bellman(), parts.bellman(reduction="none")
+    rowwise.load_state_dict(loss.state_dict())
+    terms, real = rowwise(batch.copy())["loss_qvalue"], batch["real"]
+    weights = torch.linspace(0.1, 2.0, batch.shape[0], dtype=torch.float64)
+    batch["priority_weight"] = weights
+    expected = sum((terms * weights)[rows].sum() / weights[rows].sum() for rows in (real, ~real))
+    torch.testing.assert_close(loss(batch.copy())["loss_qvalue"], expected)
+    torch.testing.assert_close(rowwise(batch.copy())["loss_qvalue"], terms * weights)
+    loss.use_prioritized_weights = False
+    plain = sum(terms[rows].mean() for rows in (real, ~real))
+    torch.testing.assert_close(loss(batch)["loss_qvalue"], plain)
 
 
 def test_targets_move_only_through_softupdate(parts, batch):
