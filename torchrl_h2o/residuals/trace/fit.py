@@ -6,8 +6,9 @@ import contextlib
 import io
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mujoco import sysid
@@ -72,22 +73,38 @@ def fit(
         for name in free[index]
     ]
 
-    def put(z: np.ndarray) -> list[Effect]:
-        values = [{} for _ in effects]
-        for variable, position in zip(variables, z, strict=True):
-            values[variable.effect][variable.name] = variable.value(position)
-        return [effect.with_parameters(new) if new else effect for effect, new in zip(effects, values, strict=True)]
-
     def residual(z: np.ndarray, _: sysid.ParameterDict) -> tuple:
         try:
-            return [problem.residual(put(z), starts).ravel()], None, None
+            scaled = problem.residual(_with_values(effects, variables, z), starts).ravel()
         except ValueError:  # values that the model rejects, such as negative damping
-            return (
-                [np.full(len(starts) * problem.horizon * problem.scale.shape[-1], problem.settings.worst)],
-                None,
-                None,
-            )
+            scaled = np.full(len(starts) * problem.horizon * problem.scale.shape[-1], problem.settings.worst)
+        return [scaled], None, None
 
+    evaluations = settings.max_evaluations if max_evaluations is None else max_evaluations
+    best, result = _optimised(residual, variables, evaluations, settings)
+    fitted = _with_values(effects, variables, best)
+    widths = [{} for _ in effects]
+    for variable, position, half in zip(variables, best, _half_widths(problem, result), strict=True):
+        widths[variable.effect][variable.name] = half * variable.slope(position)
+    at_best = problem.residual(fitted, starts)
+    return Fit(tuple(fitted), tuple(free), float(losses(at_best).mean()), tuple(widths))
+
+
+def _with_values(effects: Sequence[Effect], variables: Sequence[_Variable], z: np.ndarray) -> list[Effect]:
+    """The effects with the parameter values that belong to scaled variables z."""
+    values = [{} for _ in effects]
+    for variable, position in zip(variables, z, strict=True):
+        values[variable.effect][variable.name] = variable.value(position)
+    return [effect.with_parameters(new) if new else effect for effect, new in zip(effects, values, strict=True)]
+
+
+def _optimised(
+    residual: Callable[[np.ndarray, sysid.ParameterDict], tuple],
+    variables: Sequence[_Variable],
+    max_evaluations: int,
+    settings: FitSettings,
+) -> tuple[np.ndarray, Any]:
+    """Scaled variables at the least robust loss, and scipy's result."""
     unknown = sysid.ParameterDict(
         {str(i): sysid.Parameter(str(i), settings.origin, *variable.bounds) for i, variable in enumerate(variables)}
     )
@@ -97,18 +114,13 @@ def fit(
             residual,
             "scipy",
             verbose=False,
-            max_iters=settings.max_evaluations if max_evaluations is None else max_evaluations,
+            max_iters=max_evaluations,
             loss="soft_l1",
             diff_step=settings.difference_step,
             ftol=settings.loss_tolerance,
             xtol=settings.variable_tolerance,
         )
-    fitted = put(best.as_vector())
-    widths = [{} for _ in effects]
-    for variable, position, half in zip(variables, best.as_vector(), _half_widths(problem, result), strict=True):
-        widths[variable.effect][variable.name] = half * variable.slope(position)
-    at_best = problem.residual(fitted, starts)
-    return Fit(tuple(fitted), tuple(free), float(losses(at_best).mean()), tuple(widths))
+    return best.as_vector(), result
 
 
 @contextlib.contextmanager
