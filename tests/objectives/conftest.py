@@ -71,11 +71,19 @@ class Parts:
 
     def h2o_plus(self, value_loss=ExpectileValueLoss, ratio: bool = True, **kwargs) -> H2OPlusLoss:
         ratio_loss = DynamicsRatioLoss(self.estimator) if ratio else None
-        loss = H2OPlusLoss(self.actor, self.qvalues, value_loss(self.value), ratio_loss, **kwargs)
-        return _move_targets(loss)
+        own, bellman = _split(kwargs)
+        bellman_loss = MixedBellmanLoss(self.actor, self.qvalues, self.value, **bellman)
+        return _move_targets(H2OPlusLoss(bellman_loss, value_loss(self.value), ratio_loss, **own))
 
     def sac(self, **kwargs) -> H2OPlusLoss:
-        return _move_targets(H2OPlusLoss(self.actor, self.qvalues, None, mixing=0.0, **kwargs))
+        own, bellman = _split(kwargs)
+        return _move_targets(H2OPlusLoss(MixedBellmanLoss(self.actor, self.qvalues, mixing=0.0, **bellman), **own))
+
+
+def _split(kwargs: dict) -> tuple[dict, dict]:
+    """Arguments of H2OPlusLoss, and those of its MixedBellmanLoss."""
+    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "target_entropy") if key in kwargs}
+    return own, {key: value for key, value in kwargs.items() if key not in own}
 
 
 def _move_targets(loss):

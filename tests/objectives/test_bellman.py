@@ -88,7 +88,7 @@ def test_gamma_is_set_as_in_torchrl(parts, batch, noise):
     loss = parts.bellman(mixing=0.3)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=0.5)
     assert loss(batch)["loss_qvalue"].item() == pytest.approx(reference_loss(loss, batch, 0.3, noise, gamma=0.5)[0])
-    with pytest.raises(ValueError, match="one-step"):
+    with pytest.raises(NotImplementedError, match="one-step"):
         loss.make_value_estimator(ValueEstimators.TDLambda)
 
 
@@ -154,7 +154,7 @@ def test_the_exploration_term_can_be_swapped(parts, batch):
     loss.load_state_dict(base.state_dict())
     difference = loss.mixed_target(batch) - base.mixed_target(batch)
     alive = ~batch["next", "terminated"].squeeze(-1)
-    action, _ = loss._sample_action(batch["next"])
+    action, _ = loss.sample_action(batch["next"])
     expected = 0.99 * novelty(batch["next", "observation"], action).squeeze(-1) * alive
     torch.testing.assert_close(difference, expected)
 
@@ -169,15 +169,22 @@ def test_only_the_q_network_gets_a_gradient(parts, batch):
 def test_td_error_is_written_for_prioritised_replay(parts, batch):
     loss = parts.bellman()
     loss(batch)
-    error = loss._qvalues(batch, loss.qvalue_network_params) - loss.mixed_target(batch)
+    error = loss.qvalues(batch, loss.qvalue_network_params) - loss.mixed_target(batch)
     torch.testing.assert_close(batch["td_error"], error.detach().abs().amax(0))
 
 
-def test_priority_weights_multiply_the_terms(parts, batch):
-    loss = parts.bellman()
-    plain = loss(batch.copy())["loss_qvalue"]
-    batch["priority_weight"] = torch.full(batch.shape, 0.1, dtype=torch.float64)
-    torch.testing.assert_close(loss(batch)["loss_qvalue"], 0.1 * plain)
+def test_priority_weights_are_normalised_within_each_stream(parts, batch):
+    loss, rowwise = parts.bellman(), parts.bellman(reduction="none")
+    rowwise.load_state_dict(loss.state_dict())
+    terms, real = rowwise(batch.copy())["loss_qvalue"], batch["real"]
+    weights = torch.linspace(0.1, 2.0, batch.shape[0], dtype=torch.float64)
+    batch["priority_weight"] = weights
+    expected = sum((terms * weights)[rows].sum() / weights[rows].sum() for rows in (real, ~real))
+    torch.testing.assert_close(loss(batch.copy())["loss_qvalue"], expected)
+    torch.testing.assert_close(rowwise(batch.copy())["loss_qvalue"], terms * weights)
+    loss.use_prioritized_weights = False
+    plain = sum(terms[rows].mean() for rows in (real, ~real))
+    torch.testing.assert_close(loss(batch)["loss_qvalue"], plain)
 
 
 def test_targets_move_only_through_softupdate(parts, batch):

@@ -54,7 +54,7 @@ def test_the_bellman_terms_are_those_of_equation_1(parts, batch):
     loss = h2o(parts, exploration=NO_BONUS)
     batch = weighted(parts, batch)
     torch.manual_seed(5)
-    next_action, _ = loss.loss._sample_action(batch["next"])
+    next_action, _ = loss.loss.bellman_loss.sample_action(batch["next"])
     targets = [reference.layers(loss.target_qvalue_network_params, member) for member in range(2)]
     errors = {True: [], False: []}
     for row, action, ratio in zip(
@@ -111,7 +111,7 @@ def test_without_the_term_and_the_ratio_h2o_is_sac_on_both_streams(batch):
     parts, others = Parts(), Parts()
     loss = h2o(parts, alpha_c=0.0)
     sac = SACLoss(others.actor, others.qvalues, loss_function="l2", reduction="none", scalar_output_mode="exclude")
-    sac.load_state_dict(loss.loss.state_dict(), strict=False)
+    sac.load_state_dict(loss.loss.bellman_loss.state_dict(), strict=False)
     torch.manual_seed(2)
     got = loss(batch.copy())
     torch.manual_seed(2)
@@ -141,7 +141,7 @@ def test_the_term_moves_q_alone_down_in_the_simulator_and_up_on_the_data(parts, 
 
 
 def q_of_streams(loss, batch):
-    qvalues = loss.loss._qvalues(batch, loss.qvalue_network_params).mean(0)
+    qvalues = loss.loss.bellman_loss.qvalues(batch, loss.qvalue_network_params).mean(0)
     return qvalues[batch["real"]].mean().item(), qvalues[~batch["real"]].mean().item()
 
 

@@ -1,24 +1,27 @@
 """H2O+ as a whole: Eq. (10), beta, who moves whom, and swapping its parts."""
 
+import copy
+
 import pytest
 import torch
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SoftUpdate
 
 from tests.objectives import reference
-from tests.objectives.conftest import ACTION_DIM, Parts
+from tests.objectives.conftest import ACTION_DIM, Parts, make_batch
 from torchrl_h2o.objectives import (
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
+    MixedBellmanLoss,
     SparseValueLoss,
 )
 
 OWNERS = {
-    "loss_actor": "actor_network",
-    "loss_qvalue": "qvalue_network",
-    "loss_value": "value_loss.value_network",
-    "loss_alpha": "log_alpha",
+    "loss_actor": "bellman_loss.actor_network",
+    "loss_qvalue": "bellman_loss.qvalue_network",
+    "loss_value": "bellman_loss.value_network",  # shared with value_loss
+    "loss_alpha": "bellman_loss.log_alpha",
     "loss_ratio_sa": "ratio_loss.estimator_params.sa_network",
     "loss_ratio_sas": "ratio_loss.estimator_params.sas_network",
 }
@@ -44,15 +47,62 @@ def test_every_parameter_is_in_the_optimiser_once_and_gets_a_gradient(parts, bat
     assert sum(p.numel() for p in parameters) == stacked_q + others + 1  # log_alpha
 
 
-def test_no_tensor_stands_twice_in_the_state_dict(parts):
-    pointers = [v.data_ptr() for v in parts.h2o_plus().state_dict().values() if isinstance(v, torch.Tensor)]
-    assert len(set(pointers)) == len(pointers)
+def test_only_the_shared_value_network_stands_twice_in_the_state_dict(parts):
+    state = parts.h2o_plus().state_dict()
+    pointers = {}
+    for name, value in state.items():
+        if isinstance(value, torch.Tensor):
+            pointers.setdefault(value.data_ptr(), []).append(name)
+    assert all("value_network" in name for names in pointers.values() if len(names) > 1 for name in names)
+
+
+@pytest.mark.parametrize("change", [lambda loss: loss.double(), copy.deepcopy])
+def test_v_stays_shared_when_the_loss_is_converted_or_copied(change):
+    loss = change(Parts(dtype=torch.float32).h2o_plus())
+    read, trained = loss.bellman_loss.value_network_params, loss.value_loss.value_network_params
+    assert all(read.get(key) is trained.get(key) for key in read.keys(True, True))
+
+
+def test_losses_of_different_value_networks_are_refused(parts):
+    bellman_loss = MixedBellmanLoss(parts.actor, parts.qvalues, parts.value)
+    with pytest.raises(ValueError, match="built from the same module"):
+        H2OPlusLoss(bellman_loss, ExpectileValueLoss(copy.deepcopy(parts.value)))
+    with pytest.raises(ValueError, match="built from the same module"):
+        H2OPlusLoss(bellman_loss)
+
+
+def test_the_discriminators_may_have_a_batch_of_their_own(parts, batch):
+    loss, pairs = parts.h2o_plus().eval(), make_batch(5, 2, seed=9)
+    own, other = loss.ratio_loss(pairs), loss.ratio_loss(batch)
+    torch.manual_seed(2)
+    together = loss(batch)
+    torch.manual_seed(2)
+    apart = loss(batch, pairs)
+    for name in ("loss_ratio_sa", "loss_ratio_sas", "accuracy", "accuracy_sa"):
+        torch.testing.assert_close(apart[name], own[name])
+        torch.testing.assert_close(together[name], other[name])
+    for name in ("loss_qvalue", "loss_actor", "loss_value", "dynamics_ratio"):
+        torch.testing.assert_close(apart[name], together[name])
+    with pytest.raises(ValueError, match="pass a ratio_loss"):
+        Parts().h2o_plus(ratio=False)(batch, pairs)
+
+
+def test_an_unweighted_loss_trains_the_discriminators_and_ignores_ratios(parts, batch):
+    loss, plain = parts.h2o_plus(weighted=False).eval(), Parts().h2o_plus(ratio=False)
+    plain.load_state_dict({k: v for k, v in loss.state_dict().items() if not k.startswith("ratio_loss")})
+    torch.manual_seed(2)
+    expected = plain(batch.copy())
+    torch.manual_seed(2)
+    got = loss(batch.copy().set("dynamics_ratio", torch.full(batch.shape, 0.3, dtype=torch.float64)))
+    torch.testing.assert_close(got["loss_qvalue"], expected["loss_qvalue"])
+    got["loss_ratio_sas"].backward()
+    assert any(p.grad is not None and p.grad.any() for p in loss.ratio_loss.parameters())
 
 
 def test_actor_and_alpha_losses_are_equation_10(parts, batch):
     loss = parts.h2o_plus(alpha_init=0.3)
     torch.manual_seed(4)
-    action, log_prob = loss._sample_action(batch)
+    action, log_prob = loss.bellman_loss.sample_action(batch)
     actor = reference.layers(loss.actor_network_params)
     qvalues = [reference.layers(loss.qvalue_network_params, member) for member in range(2)]
     terms, entropies = {True: [], False: []}, {True: [], False: []}
@@ -86,7 +136,7 @@ def test_alpha_grows_while_the_entropy_is_below_its_target(parts, batch):
 def test_the_logged_entropy_is_minus_the_mean_log_probability(parts, batch):
     loss = parts.h2o_plus(ratio=False)
     torch.manual_seed(3)
-    loss.mixed_target(batch)
+    loss.bellman_loss.mixed_target(batch)
     _, log_prob = loss.actor_loss(batch, loss._rows(batch))
     torch.manual_seed(3)
     expected = -(log_prob[batch["real"]].mean() + log_prob[~batch["real"]].mean()) / 2
@@ -159,7 +209,7 @@ def test_without_a_value_loss_it_is_mixing_zero_without_v(batch):
 
 def test_without_a_value_loss_mixing_has_nothing_to_weigh(parts):
     with pytest.raises(ValueError, match=r"no value network: pass one, or mixing=0\.0"):
-        H2OPlusLoss(parts.actor, parts.qvalues, None, mixing=0.1)
+        MixedBellmanLoss(parts.actor, parts.qvalues, mixing=0.1)
 
 
 def test_an_update_moves_every_network_and_the_targets_follow(parts, batch):
@@ -170,7 +220,7 @@ def test_an_update_moves_every_network_and_the_targets_follow(parts, batch):
     sum(v for k, v in loss(batch).items() if k.startswith("loss_")).backward()
     optimiser.step()
     targets.step()
-    fixed = {"mixing", "gamma", "target_entropy"}
+    fixed = {"bellman_loss.mixing", "bellman_loss.gamma", "target_entropy"}
     still = {k for k, v in loss.state_dict().items() if k in before and torch.equal(v, before[k])}
     assert still <= fixed
 
@@ -182,16 +232,4 @@ def test_the_automatic_target_entropy_is_minus_the_action_s_size(parts):
 def test_an_automatic_target_entropy_needs_the_action_s_spec(parts):
     actor = ProbabilisticActor(parts.actor[0], in_keys=["loc", "scale"], distribution_class=TanhNormal)
     with pytest.raises(ValueError, match="spec"):
-        H2OPlusLoss(actor, parts.qvalues, ExpectileValueLoss(parts.value))
-
-
-def test_with_the_real_rows_first_the_numbers_stay_and_v_sees_them_alone(parts, batch):
-    loss, told = parts.h2o_plus(), parts.h2o_plus(num_real=4)
-    told.load_state_dict(loss.state_dict())
-    torch.manual_seed(0)
-    expected = loss(batch.copy())
-    seen = []
-    told.value_network.register_forward_hook(lambda module, inputs, output: seen.append(len(inputs[0])))
-    torch.manual_seed(0)
-    torch.testing.assert_close(told(batch.copy()), expected)
-    assert seen == [7, 4]  # V of all next states, and of the real states
+        H2OPlusLoss(MixedBellmanLoss(actor, parts.qvalues, mixing=0.0))

@@ -197,9 +197,12 @@ def test_nested_action_and_observation_keys_are_taken_from_the_networks():
     keys = {"in_keys": [("agent", "obs"), ("agent", "act")], "out_keys": ["state_action_value"]}
     qvalues = [ValueOperator(q.module, **keys) for q in parts.qvalues]
     value_loss = ExpectileValueLoss(ValueOperator(parts.value.module, **agent))
-    loss = H2OPlusLoss(actor, qvalues, value_loss, fixed_alpha=True)
+    bellman_loss = MixedBellmanLoss(actor, qvalues, value_loss.value_network)
+    loss = H2OPlusLoss(bellman_loss, value_loss, fixed_alpha=True)
     assert loss.target_entropy == -ACTION_DIM
-    plain = H2OPlusLoss(Parts().actor, Parts().qvalues, ExpectileValueLoss(Parts().value), fixed_alpha=True)
+    parts = Parts()
+    bellman_loss = MixedBellmanLoss(parts.actor, parts.qvalues, parts.value)
+    plain = H2OPlusLoss(bellman_loss, ExpectileValueLoss(parts.value), fixed_alpha=True)
     renamed = batch.exclude("observation", "action", ("next", "observation"))
     renamed["agent", "obs"], renamed["agent", "act"] = batch["observation"], batch["action"]
     renamed["next", "agent", "obs"] = batch["next", "observation"]
@@ -210,6 +213,7 @@ def test_what_may_be_there_is_dispatched_too():
     loss, batch = make("bellman"), full_batch()
     batch["dynamics_ratio"] = torch.linspace(0.1, 1.0, 7, dtype=torch.float64)
     batch["priority_weight"] = torch.linspace(1.0, 0.2, 7, dtype=torch.float64)
+    batch["steps_to_next_obs"] = torch.arange(1, 8)[:, None]
     tensors = {"_".join(k) if isinstance(k, tuple) else k: batch[k] for k in loss._dispatch_keys}
     torch.manual_seed(11)
     torch.testing.assert_close(loss(**tensors), evaluate(loss, batch)["loss_qvalue"])
@@ -252,7 +256,7 @@ def test_one_q_network_is_expanded_to_an_ensemble():
 def test_mixing_can_be_scheduled_in_place():
     loss = make("h2o_plus")
     loss.mixing = 0.7
-    assert loss.state_dict()["mixing"] == pytest.approx(0.7)
+    assert loss.state_dict()["bellman_loss.mixing"] == pytest.approx(0.7)
 
 
 def test_actions_fill_the_bounds_of_their_spec_and_no_more():

@@ -70,7 +70,7 @@ class HybridReplayBuffer:
         >>> buffer.sample()["real"].tolist()
         [True, True, True, True, False, False, False, False]
 
-    Source: Feng et al., "H2O+" (2023): 𝒟 and B of Eq. (8), 128 rows of each.
+    Source: H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716): 𝒟 and B of Eq. (8), 128 rows of each.
     """
 
     def __init__(

@@ -1,7 +1,9 @@
-"""The losses of H2O+, and what DARC and H2O add to others. Needs torch, tensordict and torchrl alone."""
+"""The losses of H2O+, and the terms of DARC and H2O. Needs only torch, tensordict and torchrl."""
 
-from torchrl_h2o.objectives.bellman import EntropyBonus, MixedBellmanLoss
+from torchrl_h2o.objectives.accelerated import accelerate
+from torchrl_h2o.objectives.bellman import MixedBellmanLoss
 from torchrl_h2o.objectives.conservative import ConservativeLoss, DynamicsDivergence
+from torchrl_h2o.objectives.exploration import EntropyBonus
 from torchrl_h2o.objectives.h2o_plus import H2OPlusLoss
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, total_loss
 from torchrl_h2o.objectives.importance import ImportanceWeightedLoss
@@ -35,6 +37,7 @@ __all__ = [
     "InSampleValueLoss",
     "MixedBellmanLoss",
     "SparseValueLoss",
+    "accelerate",
     "make_actor",
     "make_dynamics_ratio_estimator",
     "make_qvalue",

@@ -1,4 +1,4 @@
-"""H2O's conservative term, Eq. (1): Q is pushed down where the simulator is off, and up on the real data."""
+"""H2O's conservative term, Eq. (1): lower Q where the simulator is wrong, raise it on the real data."""
 
 from __future__ import annotations
 
@@ -11,25 +11,24 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_h2o.objectives.functional import run
 from torchrl_h2o.objectives.hybrid_loss import Rows, like_rows
 from torchrl_h2o.objectives.loss_wrapper import LossWrapper
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 
 class DynamicsDivergence(TensorDictModuleBase):
-    r"""How far the simulator is off at (s, a): :math:`D_{KL}(\hat P\|P)` from noisy next states.
+    r"""Estimate :math:`D_{KL}(\hat P\|P)` at (s, a), the simulator's error, from noisy next states.
 
     .. math::
         u(s,a)=\tfrac 1N\sum_i\log\frac{\hat P(s'_i|s,a)}{P(s'_i|s,a)},\qquad s'_i\sim\mathcal N(s',\sigma^2)
 
-    Normalised over a batch's simulated rows it is ω of Eq. (1), as :class:`ConservativeLoss` takes it.
+    :class:`ConservativeLoss` normalises it over a batch's simulated rows, which gives ω of Eq. (1).
 
     Args:
         estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`.
-        noise (Tensor or float): σ, in the observation's units, ``[observation_dim]`` or one for all: that of the
-            real data's observations, say. The authors' is smaller: their code takes it with the zeros of a buffer's
-            simulated part, still empty, among the observations.
+        noise (Tensor or float): σ, in the observation's units, ``[observation_dim]`` or one number. For example the
+            standard deviation of the real data's observations. The authors' value is smaller: their code includes
+            the zeros of the simulated part of the buffer, which is still empty then.
         num_samples (int, optional): N. Defaults to 10, the authors'.
 
     Keyword Args:
@@ -37,10 +36,11 @@ class DynamicsDivergence(TensorDictModuleBase):
         out_keys (sequence of NestedKey, optional): Defaults to ``["dynamics_divergence"]``, ``[*B]``, a constant.
 
     Raises:
-        ValueError: if there is no sample, or the lower bound is not positive: its logarithm is taken.
+        ValueError: if ``num_samples`` is below 1, or the lower bound is not positive, as its logarithm is taken.
 
     Source:
-        H2O+, below Eq. (1), after H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464); constants of their code.
+        H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464), as restated in H2O+ (Niu et al., 2023,
+        https://arxiv.org/abs/2309.12716) below Eq. (1). Constants of the authors' code.
 
     Examples:
         >>> import torch
@@ -88,38 +88,40 @@ class DynamicsDivergence(TensorDictModuleBase):
 
 
 class ConservativeLoss(LossWrapper):
-    r"""Any loss with a Q network, and H2O's conservative term beside it.
+    r"""Add H2O's conservative term to any loss with a Q network.
 
     .. math::
         \alpha_c\Big(\log\sum_{s,a\sim B}\omega(s,a)e^{Q(s,a)}-E_{𝒟}[Q(s,a)]\Big)
 
-    ω is the batch's ``dynamics_divergence``, which :class:`DynamicsDivergence` writes, normalised over the simulated
-    rows. The term, ``loss_conservative``, is summed over the ensemble and moves Q alone. Around SAC on both streams
-    whose Bellman error the dynamics ratio weighs, as in the example, it is H2O.
+    ω is the batch's ``dynamics_divergence``, written by :class:`DynamicsDivergence`, normalised over the simulated
+    rows. The term, ``loss_conservative``, is summed over the ensemble and trains only Q. H2O is this term added to SAC
+    on both streams with a Bellman error weighted by the dynamics ratio, as in the example.
 
     Args:
         loss (LossModule): with a ``qvalue_network``, as TorchRL's SAC, TD3 and IQL losses have and this package's.
-        alpha_c (float, optional): its weight, not negative. Defaults to 0.01, the authors'.
+        alpha_c (float, optional): weight of the term, not negative. Defaults to 0.01, the authors'.
 
     Raises:
         ValueError: if the loss inside has no ``qvalue_network`` or does not return means, or α_c is negative.
 
-    Reads what the loss inside reads, ``real`` ``[*B]``, and ``dynamics_divergence`` ``[*B]`` if it is there (else all
-    simulated rows weigh the same). Without rows of one stream that stream's part is zero.
+    Reads the inputs of the loss inside, ``real`` ``[*B]`` and, if present, ``dynamics_divergence`` ``[*B]`` (default:
+    equal weights). A stream without rows contributes zero.
 
     Source:
-        H2O+, Eq. (1), after H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464).
+        H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464), as restated in H2O+ (Niu et al., 2023,
+        https://arxiv.org/abs/2309.12716), Eq. (1).
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_h2o.objectives import (DynamicsDivergence, H2OPlusLoss, make_actor,
-        ...     make_dynamics_ratio_estimator, make_qvalue)
+        >>> from torchrl_h2o.objectives import (DynamicsDivergence, H2OPlusLoss, MixedBellmanLoss,
+        ...     make_actor, make_dynamics_ratio_estimator, make_qvalue)
         >>> actor, estimator = make_actor(3, Bounded(-1, 1, (1,))), make_dynamics_ratio_estimator(3, 1)
         >>> divergence = DynamicsDivergence(estimator, noise=1.0)
-        >>> loss = ConservativeLoss(H2OPlusLoss(actor, [make_qvalue(3, 1), make_qvalue(3, 1)], None, mixing=0.0))
+        >>> sac = H2OPlusLoss(MixedBellmanLoss(actor, [make_qvalue(3, 1), make_qvalue(3, 1)], mixing=0.0))
+        >>> loss = ConservativeLoss(sac)
         >>> targets = SoftUpdate(loss, tau=0.005)
         >>> batch = TensorDict(observation=torch.randn(8, 3), action=torch.rand(8, 1), real=torch.arange(8) < 4,
         ...                    next=TensorDict(observation=torch.randn(8, 3), reward=torch.randn(8, 1),
@@ -130,7 +132,7 @@ class ConservativeLoss(LossWrapper):
 
     @dataclass
     class _AcceptedKeys(LossWrapper._AcceptedKeys):
-        """Keys that ``set_keys`` renames, beside those of the loss inside.
+        """Keys that ``set_keys`` renames, in addition to those of the loss inside.
 
         Attributes:
             dynamics_divergence: ω before it is normalised. Defaults to ``"dynamics_divergence"``.
@@ -142,14 +144,14 @@ class ConservativeLoss(LossWrapper):
 
     def __init__(self, loss: LossModule, alpha_c: float = 0.01) -> None:
         if not hasattr(loss, "qvalue_network"):
-            raise ValueError(f"{type(loss).__name__} has no qvalue_network that a conservative term could push down.")
+            raise ValueError(f"{type(loss).__name__} has no qvalue_network that a conservative term could lower.")
         if getattr(loss, "reduction", "mean") != "mean":
             raise ValueError(
-                f"{type(loss).__name__} has reduction={loss.reduction!r}; the conservative term is a number a batch: "
-                "build it with reduction='mean'."
+                f"{type(loss).__name__} has reduction={loss.reduction!r}; the conservative term is one number per "
+                "batch: build it with reduction='mean'."
             )
         if alpha_c < 0:
-            raise ValueError(f"alpha_c is {alpha_c}: below zero it would reward the simulator for being off.")
+            raise ValueError(f"alpha_c is {alpha_c}: a negative weight would raise Q where the simulator is wrong.")
         super().__init__(loss)
         self.alpha_c = alpha_c
 
@@ -158,7 +160,7 @@ class ConservativeLoss(LossWrapper):
 
     def _optional_keys(self) -> Iterable[NestedKey]:
         inside = self.loss._optional_keys() if hasattr(self.loss, "_optional_keys") else ()
-        return *inside, self.tensor_keys.dynamics_divergence
+        return *inside, *super()._optional_keys(), self.tensor_keys.dynamics_divergence
 
     def _written_keys(self) -> Iterable[NestedKey]:
         return *self.loss.out_keys, "loss_conservative"
@@ -169,18 +171,23 @@ class ConservativeLoss(LossWrapper):
         return self._output({**self.loss(tensordict), "loss_conservative": term}, tensordict)
 
     def conservative_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
-        """The first bracket of Eq. (1), times α_c, ``[]``."""
-        inputs = tensordict.select(*self.loss.qvalue_network.in_keys)
-        out = run(self.loss.qvalue_network, inputs, self.loss.qvalue_network_params)
-        qvalues = out.get(self.loss.tensor_keys.state_action_value).squeeze(-1)
-        of_sim = self._soft_maximum(qvalues, tensordict, rows.sim).sum()
+        """Compute the first bracket of Eq. (1), times α_c, ``[]``."""
+        inside = self.loss
+        out = self.calls.outputs(
+            inside.qvalue_network, tensordict, inside.qvalue_network_params, inside.vmap_randomness
+        )
+        qvalues = out.get(inside.tensor_keys.state_action_value).squeeze(-1)
+        of_sim = self._soft_maximum(qvalues, tensordict, rows).sum()
         return self.alpha_c * (of_sim - self._expectation(qvalues, rows, rows.real))  # Eq. (1)
 
-    def _soft_maximum(self, qvalues: Tensor, tensordict: TensorDictBase, sim: Tensor) -> Tensor:
-        """log Σ ω e^Q over the simulated rows, of each member of the ensemble; zero without such rows."""
-        lowest = torch.finfo(qvalues.dtype).min  # not -inf, which taken from itself is NaN: there may be no row
+    def _soft_maximum(self, qvalues: Tensor, tensordict: TensorDictBase, rows: Rows) -> Tensor:
+        """log Σ ω e^Q over the simulated rows, ``[num_qvalue_nets]``; zero without such rows."""
+        sim = rows.sim
+        lowest = torch.finfo(qvalues.dtype).min  # -inf would give NaN (-inf + inf) if no row is simulated
         divergence = tensordict.get(self.tensor_keys.dynamics_divergence, None)
         logits = torch.zeros_like(qvalues[0]) if divergence is None else like_rows(divergence.detach(), sim).log()
+        if rows.priority is not None:
+            logits = logits + rows.priority.log()
         logits = torch.where(sim, logits, lowest).flatten()
         log_omega = logits - logits.logsumexp(0)
         terms = torch.where(sim.flatten(), qvalues.flatten(1) + log_omega, lowest)

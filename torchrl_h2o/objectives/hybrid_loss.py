@@ -1,8 +1,8 @@
-"""What every loss of this package needs, written once: the ``real`` mark, keys, and expectations over streams.
+"""Base class of the losses: the ``real`` mark, renameable keys, and expectations over the two streams.
 
-The formulas of H2O+ are sums of expectations over two streams, the real data 𝒟 and the simulator's
-replay buffer B. Each expectation is the mean over that stream's own rows, so that neither the order of
-the rows nor the share of real rows in a batch changes a loss.
+The formulas of H2O+ are sums of expectations over two streams, the real data 𝒟 and the simulator's replay buffer B.
+Each expectation is the mean over its own stream's rows, so neither the order of the rows nor the share of real rows in
+a batch changes a loss.
 """
 
 from __future__ import annotations
@@ -12,38 +12,44 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_h2o.objectives.network_calls import NetworkCalls
+
 
 class Rows:
-    """Which rows of a batch belong to which stream, and what each weighs in a mean over its own.
+    """The rows of each stream in a batch, and the weight of each row in the mean over its own stream.
 
     Args:
-        real: the rows of measured data, a mask ``[*B]``.
-        sim: the simulated rows.
-        either: the rows of any stream; None for all, if ``loss_mask_key`` excludes none.
+        real: mask of measured rows, ``[*B]``.
+        sim: mask of simulated rows, ``[*B]``.
+        either: mask of the rows of both streams; None if ``loss_mask_key`` excludes no row.
+        priority: importance weights of a prioritised replay buffer, ``[*B]``; None if there are none.
     """
 
-    def __init__(self, real: Tensor, sim: Tensor, either: Tensor | None) -> None:
-        self.real, self.sim, self.either = real, sim, either
-        self._weights: dict[torch.dtype, Tensor] = {}
+    def __init__(self, real: Tensor, sim: Tensor, either: Tensor | None, priority: Tensor | None = None) -> None:
+        self.real, self.sim, self.either, self.priority = real, sim, either, priority
+        self._weights: dict[tuple[torch.dtype, bool], Tensor] = {}
         self._streams: dict[torch.dtype, Tensor] = {}
 
-    def first(self, number: int) -> Rows:
-        """The first rows of a flat batch alone."""
-        return Rows(self.real[:number], self.sim[:number], None if self.either is None else self.either[:number])
-
-    def weights(self, dtype: torch.dtype) -> Tensor:
-        """One over the number of rows in each row's own stream, ``[*B]``."""
-        if dtype not in self._weights:
-            n_real, n_sim = (rows.sum(dtype=dtype).clamp_min(1.0) for rows in (self.real, self.sim))
-            self._weights[dtype] = self.real / n_real + self.sim / n_sim
-        return self._weights[dtype]
+    def weights(self, dtype: torch.dtype, *, prioritised: bool = True) -> Tensor:
+        """Weights that sum to one over each stream, ``[*B]``: equal ones, or in proportion to ``priority``."""
+        key = dtype, prioritised and self.priority is not None
+        if key not in self._weights:
+            streams = [rows.to(dtype) for rows in (self.real, self.sim)]
+            if key[1]:
+                # Selected, not multiplied: 0 * inf is NaN.
+                streams = [torch.where(rows > 0, self.priority.to(dtype), 0.0) for rows in streams]
+            totals = [rows.sum() for rows in streams]
+            self._weights[key] = sum(
+                rows / torch.where(total > 0, total, 1.0) for rows, total in zip(streams, totals, strict=True)
+            )
+        return self._weights[key]
 
     def streams(self, dtype: torch.dtype) -> Tensor:
-        """How many of the two streams have rows, at least one, ``[]``."""
+        """Number of streams that have rows, at least one, ``[]``."""
         if dtype not in self._streams:
             self._streams[dtype] = sum(rows.any().to(dtype) for rows in (self.real, self.sim)).clamp_min(1)
         return self._streams[dtype]
@@ -52,13 +58,14 @@ class Rows:
 class HybridLoss(LossModule):
     """Base of the losses over real (𝒟) and simulated (B) rows.
 
-    A subclass lists what it reads in ``_read_keys`` and what it writes in ``_written_keys``, and reduces its per-row
-    terms with :meth:`_expectation` over the rows of one stream or of both, or :meth:`_union_expectation`. TorchRL's
-    ``loss_mask_key`` is honoured.
+    A subclass lists the entries it reads in ``_read_keys`` and those it writes in ``_written_keys``, and reduces its
+    per-row terms with :meth:`_expectation` or :meth:`_union_expectation`. TorchRL's ``loss_mask_key`` and
+    ``use_prioritized_weights`` work as in TorchRL: with ``reduction="mean"`` the terms are weighted by
+    ``priority_weight`` and divided by the sum of the weights, here within each stream.
 
     Args:
         reduction (str, optional): ``"mean"`` (default) takes each expectation over its own stream;
-            ``"sum"`` adds all terms; ``"none"`` returns one term a row, of the batch's shape, and zero on
+            ``"sum"`` adds all terms; ``"none"`` returns one term per row, of the batch's shape, and zero on
             the rows of a stream that the loss does not read.
     """
 
@@ -68,12 +75,12 @@ class HybridLoss(LossModule):
 
         Attributes:
             real: boolean of the batch's shape, True on rows of measured data. Defaults to ``"real"``.
-            noise: standard normal numbers that the loss then does not draw itself, see :meth:`draw_noise`. Defaults
-                to ``"noise"``.
+            priority_weight: importance weights of a prioritised replay buffer, ``[*B]``, optional. Defaults to
+                ``"priority_weight"``.
         """
 
         real: NestedKey = "real"
-        noise: NestedKey = "noise"
+        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -91,21 +98,25 @@ class HybridLoss(LossModule):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', not {reduction!r}.")
         self.reduction = reduction
+        self.calls = NetworkCalls()
 
     @abstractmethod
     def _read_keys(self) -> Iterable[NestedKey]:
-        """What the loss cannot do without: its ``in_keys``."""
+        """Entries that the loss requires: its ``in_keys``."""
 
     def _optional_keys(self) -> Iterable[NestedKey]:
-        """What the loss reads if it is there: not in ``in_keys``, but dispatched like them, after them."""
-        return ()
+        """Entries that the loss reads if the batch has them; dispatched after the ``in_keys``."""
+        return (self.tensor_keys.priority_weight,)
 
     @abstractmethod
     def _written_keys(self) -> Iterable[NestedKey]:
-        """What the loss returns: its ``out_keys``."""
+        """Entries that the loss returns: its ``out_keys``."""
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """No loss here holds a value estimator: the targets are written out beside their equations."""
+        """Does nothing: these losses compute their targets themselves and hold no value estimator."""
+
+    def _make_vmap(self) -> None:
+        """Does nothing: ``vmap`` is applied at each call, with the ``vmap_randomness`` of that moment."""
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -130,7 +141,7 @@ class HybridLoss(LossModule):
         self._out_keys = keys
 
     def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        """An entry that the loss cannot do without."""
+        """Return a required entry, or raise a KeyError that names it."""
         value = tensordict.get(key, None)
         if value is None:
             raise KeyError(
@@ -140,7 +151,7 @@ class HybridLoss(LossModule):
         return value
 
     def _rows(self, tensordict: TensorDictBase) -> Rows:
-        """Which rows of the batch belong to which stream; found once a forward and handed on."""
+        """Sort the batch's rows into streams; called once per forward."""
         real = tensordict.get(self.tensor_keys.real, None)
         if real is None:
             raise KeyError(
@@ -157,70 +168,70 @@ class HybridLoss(LossModule):
                 valid = self._expand_loss_mask(valid, real)
                 real, sim = real & valid, sim & valid
                 either = real | sim
-        return Rows(real, sim, either)
+        priority = self._maybe_get_priority_weight(tensordict)
+        return Rows(real, sim, either, None if priority is None else like_rows(priority, real))
 
-    def draw_noise(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDict:
-        """The standard normal numbers that a forward on this batch draws, in its order.
-
-        A forward on a batch that has them under ``noise`` draws nothing, and returns what the generator would have
-        made it return. So random numbers can come from elsewhere: from the stream of each member of a population.
-
-        Args:
-            tensordict: the batch, ``[*B]``.
-            generator: torch's global one if it is None.
-        """
-        return TensorDict({}, batch_size=tensordict.batch_size)
-
-    def _given_noise(self, tensordict: TensorDictBase, name: str) -> Tensor | TensorDictBase | None:
-        noise = tensordict.get(self.tensor_keys.noise, None)
-        return None if noise is None else noise.get(name, None)
+    def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
+        # TorchRL's own looks the key up in ``keys()``, which a nested key is not in.
+        if self.use_prioritized_weights in (True, "auto"):
+            return tensordict.get(self.tensor_keys.priority_weight, None)
+        return None
 
     def _expectation(
-        self, terms: Tensor, rows: Rows, among: Tensor | None = None, *, reduction: str | None = None
+        self,
+        terms: Tensor,
+        rows: Rows,
+        among: Tensor | None = None,
+        *,
+        reduction: str | None = None,
+        prioritised: bool = True,
     ) -> Tensor:
-        """The sum over streams of the mean of the terms over each: :math:`E_𝒟[.] + E_B[.]`, or one of the two.
+        """Add the means over each stream, :math:`E_𝒟[.] + E_B[.]`, or take one of the two.
 
         Args:
-            terms: one a row, ``[*B]``.
-            rows: of the batch. A stream without any contributes zero.
-            among: ``rows.real`` or ``rows.sim``, for one expectation alone.
-            reduction: instead of the loss's own.
+            terms: one per row, ``[*B]``.
+            rows: of the batch. A stream without rows contributes zero.
+            among: ``rows.real`` or ``rows.sim``, for one expectation only.
+            reduction: replaces the loss's own.
+            prioritised: whether ``priority_weight`` weighs the terms.
         """
         among = rows.either if among is None else among
         # Selected, not multiplied: 0 * inf is NaN.
         selected = terms if among is None else terms.masked_fill(~among, 0.0)
         reduction = reduction or self.reduction
-        if reduction == "none":
-            return selected
-        return (selected * rows.weights(terms.dtype) if reduction == "mean" else selected).sum()
+        if reduction == "mean":
+            return (selected * rows.weights(terms.dtype, prioritised=prioritised)).sum()
+        if prioritised and rows.priority is not None:
+            selected = selected * rows.priority
+        return selected if reduction == "none" else selected.sum()
 
-    def _union_expectation(self, terms: Tensor, rows: Rows, reduction: str | None = None) -> Tensor:
-        """:math:`E_{𝒟∪B}[.]`: both streams weigh the same, however many rows each has; one alone is that stream."""
-        total = self._expectation(terms, rows, reduction=reduction)
+    def _union_expectation(
+        self, terms: Tensor, rows: Rows, reduction: str | None = None, *, prioritised: bool = True
+    ) -> Tensor:
+        """Take :math:`E_{𝒟∪B}[.]`: the average of the two streams' means, or the mean of the only stream."""
+        total = self._expectation(terms, rows, reduction=reduction, prioritised=prioritised)
         return total / rows.streams(terms.dtype) if (reduction or self.reduction) == "mean" else total
 
     def _metric(self, terms: Tensor, rows: Rows) -> Tensor:
-        """A figure to log: a mean whatever the losses' reduction, or one value a row beside one loss a row."""
-        return self._union_expectation(terms.detach(), rows, "none" if self.reduction == "none" else "mean")
+        """Reduce a figure to be logged: the unweighted mean, or one value per row with ``reduction="none"``."""
+        reduction = "none" if self.reduction == "none" else "mean"
+        return self._union_expectation(terms.detach(), rows, reduction, prioritised=False)
 
     def _output(self, losses: dict[str, Tensor], tensordict: TensorDictBase) -> TensorDict:
-        """The losses as TorchRL returns them: scalars, or one term a row with ``reduction="none"``."""
+        """Pack the losses as TorchRL does: scalars, or one term per row with ``reduction="none"``."""
         batch_size = tensordict.batch_size if self.reduction == "none" else []
         out = TensorDict(losses, batch_size=batch_size)
-        self._clear_weakrefs(tensordict, out, *(name for name, _ in self.named_children()))
+        if torch.compiler.is_compiling():
+            held = [module for module in self.modules() if isinstance(module, TensorDictParams)]
+            self._clear_weakrefs(tensordict, out, *held)
         return out
 
 
-def normal_like(tensor: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """What ``torch.randn_like`` draws, from a generator."""
-    return torch.empty_like(tensor).normal_(generator=generator)
-
-
 def like_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """``tensor`` without the trailing singleton that ``rows`` lacks: ``[*B, 1]`` becomes ``[*B]``."""
+    """Drop the trailing singleton that ``rows`` lacks: ``[*B, 1]`` becomes ``[*B]``."""
     return tensor.squeeze(-1) if tensor.ndim > rows.ndim else tensor
 
 
 def total_loss(terms: dict[str, Tensor]) -> Tensor:
-    """The sum of the terms named ``loss_*``: of one run, ``[]``, or of each member of a population, ``[N]``."""
+    """Add the terms named ``loss_*``: of one run, ``[]``, or of each member of a population, ``[N]``."""
     return sum(term for name, term in terms.items() if name.startswith("loss_"))

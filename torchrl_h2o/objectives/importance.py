@@ -1,4 +1,4 @@
-"""Any TorchRL loss, each row weighted by the dynamics ratio: the discriminators' weighting for other algorithms."""
+"""Weigh each row of any TorchRL loss by the dynamics ratio."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchrl_h2o.objectives.loss_wrapper import LossWrapper
 
 
 class ImportanceWeightedLoss(LossWrapper):
-    """A TorchRL loss with every row's terms multiplied by a weight found in the batch.
+    """Multiply every row's terms of a TorchRL loss by a weight from the batch.
 
     If the batch has ``real``, rows marked True keep weight 1, as in Eq. (8): measured rows need no correction. Only
     ``loss_*`` terms are weighted, and the weights are constants. ``SoftUpdate`` works on it as on the loss inside.
@@ -25,17 +25,17 @@ class ImportanceWeightedLoss(LossWrapper):
         key (NestedKey, optional): the weights, ``[*B]`` or ``[*B, 1]``. Defaults to ``"dynamics_ratio"``.
 
     Keyword Args:
-        terms (sequence of str, optional): those that are weighted, such as ``["loss_qvalue"]`` for the Bellman error
-            alone. Defaults to every ``loss_*`` term.
+        terms (sequence of str, optional): the weighted terms, such as ``["loss_qvalue"]`` for only the Bellman
+            error. Defaults to every ``loss_*`` term.
         reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"`` of the weighted terms over all rows.
             Defaults to ``"mean"``.
 
     Raises:
-        ValueError: if the loss inside reduces its terms already, or has none of a name in ``terms``.
+        ValueError: if the loss inside reduces its terms, or does not write a name in ``terms``.
         KeyError: if the batch has no weights.
 
     Source:
-        H2O+, Eq. (8), the weight P / P̂.
+        H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (8), the weight P / P̂.
 
     Examples:
         >>> import torch
@@ -78,7 +78,7 @@ class ImportanceWeightedLoss(LossWrapper):
         return *self.loss.in_keys, self.key
 
     def _optional_keys(self) -> Iterable[NestedKey]:
-        return (self.tensor_keys.real,)
+        return (self.tensor_keys.real, self.tensor_keys.priority_weight)
 
     def _written_keys(self) -> Iterable[NestedKey]:
         return tuple(key for key in self.loss.out_keys if str(key).startswith("loss_"))
@@ -104,7 +104,7 @@ class ImportanceWeightedLoss(LossWrapper):
 
 
 def _scale(terms: Tensor, weights: Tensor) -> Tensor:
-    """``terms * weights`` with the weights' shape brought to the terms' batch shape."""
+    """Multiply terms by weights, whose trailing singletons are dropped or added to fit."""
     while weights.ndim > terms.ndim:
         weights = weights.squeeze(-1)
     return terms * weights.reshape(weights.shape + (1,) * (terms.ndim - weights.ndim))

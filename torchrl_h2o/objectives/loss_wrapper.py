@@ -1,9 +1,10 @@
-"""Base of the losses that go around another one: its keys, its discount and its target networks show through."""
+"""Base class of losses that contain another loss, and expose its keys, its discount and its target networks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from tensordict import NestedKey
 from torch import nn
 from torchrl.objectives import LossModule
 
@@ -11,46 +12,98 @@ from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
 class LossWrapper(HybridLoss):
-    """A loss around a loss. ``SoftUpdate`` and ``make_value_estimator`` work on it as on the one inside.
+    """A loss around another loss. ``SoftUpdate``, ``make_value_estimator`` and ``set_keys`` reach the loss inside.
 
     Args:
-        loss (LossModule): the loss inside, held once.
+        loss (LossModule): the loss inside.
 
     Keyword Args:
-        reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
     """
+
+    # The attribute that holds the loss inside.
+    _inside_name = "loss"
 
     def __init__(self, loss: LossModule, *, reduction: str = "mean") -> None:
         super().__init__(reduction=reduction)
-        self.loss = loss
+        setattr(self, self._inside_name, loss)
+
+    @property
+    def _inside(self) -> LossModule | None:
+        return self.__dict__.get("_modules", {}).get(self._inside_name)
+
+    @property
+    def _parts(self) -> list[LossModule]:
+        """Losses that share this one's settings."""
+        return [self._inside]
 
     def set_keys(self, **kwargs) -> None:
-        """Renames the keys that this class reads itself, and every other one in the loss inside."""
+        """Rename the keys that this class reads, and all others in the loss inside."""
+        inside = self._inside
         own = {key: value for key, value in kwargs.items() if hasattr(self.tensor_keys, key)}
-        inside = {k: v for k, v in kwargs.items() if k not in own or hasattr(self.loss.tensor_keys, k)}
+        others = {k: v for k, v in kwargs.items() if k not in own or hasattr(inside.tensor_keys, k)}
         if own:
             super().set_keys(**own)
-        if inside:
-            self.loss.set_keys(**inside)
+        if others:
+            inside.set_keys(**others)
 
-    def make_value_estimator(self, *args, **kwargs) -> None:
-        """That of the loss inside."""
-        self.loss.make_value_estimator(*args, **kwargs)
+    def make_value_estimator(self, *args, **kwargs) -> LossWrapper:
+        """Set the value estimator of the loss inside."""
+        self._inside.make_value_estimator(*args, **kwargs)
+        return self
 
-    # What follows lets SoftUpdate find the targets of the loss inside.
+    @property
+    def vmap_randomness(self) -> str:
+        return self._inside.vmap_randomness
+
+    def set_vmap_randomness(self, value: str) -> None:
+        for part in self._parts:
+            part.set_vmap_randomness(value)
+
+    @property
+    def loss_mask_key(self) -> NestedKey | str | None:
+        return self._loss_mask_key
+
+    @loss_mask_key.setter
+    def loss_mask_key(self, key: NestedKey | str | None) -> None:
+        HybridLoss.loss_mask_key.fset(self, key)
+        for part in self._parts:
+            part.loss_mask_key = key
+
+    @property
+    def use_prioritized_weights(self) -> str | bool:
+        return self._inside.use_prioritized_weights
+
+    @use_prioritized_weights.setter
+    def use_prioritized_weights(self, value: str | bool) -> None:
+        for part in self._parts:
+            part.use_prioritized_weights = value
+
+    def reset_parameters_recursive(self) -> None:
+        for part in self._parts:
+            part.reset_parameters_recursive()
+
+    def _load_from_state_dict(self, *args, **kwargs) -> None:
+        # TorchRL's losses make the buffer of an automatic target entropy at its first use. A state_dict has it, so it
+        # must exist before the loss inside is loaded.
+        if "_target_entropy" in self._inside.__dict__:
+            _ = self._inside.target_entropy
+        super()._load_from_state_dict(*args, **kwargs)
+
+    # SoftUpdate finds the targets of the loss inside through the following three.
     @property
     def _has_update_associated(self) -> dict[str, bool]:
-        return self.loss._has_update_associated if "loss" in self._modules else {}
+        return {} if self._inside is None else self._inside._has_update_associated
 
     @_has_update_associated.setter
     def _has_update_associated(self, value: dict[str, bool]) -> None:
-        """The loss inside keeps its own."""
+        """Does nothing: the loss inside has its own."""
 
     def named_children(self) -> Iterator[tuple[str, nn.Module]]:
         yield from super().named_children()
-        yield from ((n, m) for n, m in self.loss.named_children() if n.startswith("target_"))
+        yield from ((name, module) for name, module in self._inside.named_children() if name.startswith("target_"))
 
     def __getattr__(self, name: str):
-        if name.endswith("_params"):
-            return getattr(self.loss, name)
+        if name.endswith("_params") and self._inside is not None:
+            return getattr(self._inside, name)
         return super().__getattr__(name)

@@ -1,4 +1,4 @@
-"""The paper's networks as TensorDict modules: two hidden layers of 256, ReLU, a small last layer."""
+"""The paper's networks as TensorDict modules: two hidden layers of 256 with ReLU, small initial outputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
-from torchrl_h2o.objectives.functional import LastAxis
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 HIDDEN = (256, 256)
@@ -23,24 +22,53 @@ def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
     return network
 
 
-class GaussianParameters(LastAxis):
+class GaussianParameters(nn.Module):
     """Splits a network's output ``[*B, 2 n]`` into the mean and the standard deviation of a Gaussian, ``[*B, n]`` each.
 
     The log standard deviation is clamped to [-20, 2], as in the authors' code: it can neither vanish nor overflow.
+
+    Args:
+        trainable (bool, optional): whether the log standard deviation is scaled by a trained multiplier and shifted
+            by a trained offset, from 1 and -1, as in the authors' code. Defaults to ``False``.
     """
+
+    def __init__(self, trainable: bool = False) -> None:
+        super().__init__()
+        self.trainable = trainable
+        if trainable:
+            self.multiplier = nn.Parameter(torch.tensor(1.0))
+            self.offset = nn.Parameter(torch.tensor(-1.0))
+
+    def reset_parameters(self) -> None:
+        if self.trainable:
+            nn.init.constant_(self.multiplier, 1.0)
+            nn.init.constant_(self.offset, -1.0)
 
     def forward(self, output: Tensor) -> tuple[Tensor, Tensor]:
         loc, log_std = output.chunk(2, -1)
+        if self.trainable:
+            log_std = self.multiplier * log_std + self.offset
         return loc, log_std.clamp(-20.0, 2.0).exp()
 
 
-def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequence[int] = HIDDEN) -> ProbabilisticActor:
-    """Tanh-Gaussian policy within the action's bounds.
+def make_actor(
+    observation_dim: int,
+    action_spec: TensorSpec,
+    num_cells: Sequence[int] = HIDDEN,
+    *,
+    trainable_log_std: bool = False,
+) -> ProbabilisticActor:
+    """Build a tanh-Gaussian policy within the action's bounds.
 
     Args:
         observation_dim (int): size of ``observation`` ``[*B, observation_dim]``.
         action_spec (TensorSpec): of one environment, ``[action_dim]``, bounded.
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Keyword Args:
+        trainable_log_std (bool, optional): add the multiplier and the offset of the log standard deviation that the
+            authors' code trains. By default the offset is the initial bias of the last layer, which is trained with
+            the network: the same initial policy with two parameters less. Defaults to ``False``.
 
     Returns:
         A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its
@@ -50,7 +78,7 @@ def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequenc
         ValueError: if the action is not bounded.
 
     Source:
-        The authors' published code.
+        The published code of H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716).
 
     Examples:
         >>> import torch
@@ -64,11 +92,12 @@ def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequenc
         raise ValueError(f"a tanh-Gaussian policy needs a bounded action, not {type(action_spec).__name__}.")
     action_dim = action_spec.shape[-1]
     network = _mlp(observation_dim, 2 * action_dim, num_cells)
-    with torch.no_grad():
-        network[-1].bias[action_dim:].fill_(-1.0)
+    if not trainable_log_std:
+        with torch.no_grad():
+            network[-1].bias[action_dim:].fill_(-1.0)
     return ProbabilisticActor(
         TensorDictModule(
-            nn.Sequential(network, GaussianParameters()),
+            nn.Sequential(network, GaussianParameters(trainable_log_std)),
             in_keys=["observation"],
             out_keys=["loc", "scale"],
         ),
@@ -82,7 +111,7 @@ def make_actor(observation_dim: int, action_spec: TensorSpec, num_cells: Sequenc
 
 
 def make_qvalue(observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN) -> ValueOperator:
-    """Q(s, a), writing ``state_action_value`` ``[*B, 1]``.
+    """Build Q(s, a), which writes ``state_action_value`` ``[*B, 1]``.
 
     Args:
         observation_dim (int): size of ``observation``.
@@ -98,7 +127,7 @@ def make_qvalue(observation_dim: int, action_dim: int, num_cells: Sequence[int] 
 
 
 def make_value(observation_dim: int, num_cells: Sequence[int] = HIDDEN) -> ValueOperator:
-    """V(s), writing ``state_value`` ``[*B, 1]``.
+    """Build V(s), which writes ``state_value`` ``[*B, 1]``.
 
     Args:
         observation_dim (int): size of ``observation``.
@@ -115,13 +144,13 @@ def make_value(observation_dim: int, num_cells: Sequence[int] = HIDDEN) -> Value
 def make_dynamics_ratio_estimator(
     observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN, **kwargs
 ) -> DynamicsRatioEstimator:
-    """The two discriminators of Eq. (9).
+    """Build the two discriminators of Eq. (9).
 
     Args:
         observation_dim (int): size of ``observation``.
         action_dim (int): size of ``action``.
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
-        **kwargs: of :class:`DynamicsRatioEstimator`.
+        **kwargs: arguments of :class:`DynamicsRatioEstimator`.
 
     Examples:
         >>> make_dynamics_ratio_estimator(17, 6, logit_bound=None).in_keys

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_h2o.objectives.functional import run
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, normal_like
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
+from torchrl_h2o.objectives.network_calls import NetworkCalls
 
 
 class DynamicsRatioEstimator(TensorDictModuleBase):
@@ -20,8 +20,8 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
     .. math::
         \frac{P}{\hat P}=\frac{p(real|s,a,s')}{1-p(real|s,a,s')}\Big/\frac{p(real|s,a)}{1-p(real|s,a)}
 
-    A transform for any replay buffer or loss: it reads a transition and writes two entries. Both are constants,
-    no gradient flows through them; :class:`DynamicsRatioLoss` trains the networks.
+    Reads a transition and writes two entries, so it also serves as a replay buffer's transform. Both entries are
+    constants without gradients; :class:`DynamicsRatioLoss` trains the networks.
 
     Args:
         sa_network (TensorDictModule): reads observation and action, writes logits ``[*B, 2]``, (real, simulated).
@@ -30,18 +30,22 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
     Keyword Args:
         logit_bound (float or None, optional): every logit is ``bound * tanh(logit)``, so the log-ratio stays
             within ``2 * bound`` of zero. ``None`` switches it off. Defaults to 2.0.
-        residual (bool, optional): whether the first network's logits are added to the second's, which then learns
-            what s' adds. Defaults to ``True``.
+        residual (bool, optional): whether the first network's logits are added to the second's, so that the second
+            learns only the contribution of s'. Defaults to ``True``.
+        detach_residual (bool, optional): whether the added logits are constants, so that each network is trained by
+            its own loss. ``False`` is the authors' code, where the second loss also trains the first network.
+            Defaults to ``True``: Eq. (9) needs the first network's p(real|s,a), which the second loss disturbs.
         clamp (tuple of float or None, optional): bounds of ``dynamics_ratio`` (``log_dynamics_ratio`` has none).
             ``None`` switches it off. Defaults to ``(1e-5, 1.0)``.
         out_keys (sequence of NestedKey, optional): Defaults to ``["log_dynamics_ratio", "dynamics_ratio"]``, each of
             the batch's shape ``[*B]``.
 
     Raises:
-        ValueError: if the bound is not positive or the clamp not an interval of non-negative numbers.
+        ValueError: if the bound is not positive, or the clamp is not an interval of non-negative numbers.
 
     Source:
-        H2O+, Eq. (9); the defaults are those of the authors' published code.
+        H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (9). Defaults other than ``detach_residual`` are
+        those of the authors' published code.
 
     Examples:
         >>> import torch
@@ -65,6 +69,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         *,
         logit_bound: float | None = 2.0,
         residual: bool = True,
+        detach_residual: bool = True,
         clamp: tuple[float, float] | None = (1e-5, 1.0),
         out_keys: Sequence[NestedKey] = ("log_dynamics_ratio", "dynamics_ratio"),
     ) -> None:
@@ -77,30 +82,39 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         self.sas_network = sas_network
         self.logit_bound = logit_bound
         self.residual = residual
+        self.detach_residual = detach_residual
         self.clamp = clamp
         self.in_keys = list(dict.fromkeys((*sa_network.in_keys, *sas_network.in_keys)))
         self.out_keys = list(out_keys)
 
-    def log_odds(self, tensordict: TensorDictBase, params: TensorDictBase | None = None) -> tuple[Tensor, Tensor]:
+    def log_odds(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None = None, calls: NetworkCalls | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Log-odds of real over simulated.
 
         Args:
             tensordict (TensorDictBase): transitions, ``[*B]``.
-            params (TensorDictBase, optional): instead of this module's own parameters.
+            params (TensorDictBase, optional): replaces this module's own parameters.
+            calls (NetworkCalls, optional): how the networks are run on ``params``. Defaults to TorchRL's way.
 
         Returns:
-            The log-odds given (s, a) and given (s, a, s'), ``[*B]`` each. With ``residual`` the second holds the
-            first as a constant, so that each is trained by its own loss alone.
+            The log-odds given (s, a) and given (s, a, s'), ``[*B]`` each. With ``residual`` the second includes the
+            first.
         """
-        sa, sas = (self._network_log_odds(name, tensordict, params) for name in ("sa_network", "sas_network"))
-        return sa, sas + sa.detach() if self.residual else sas
+        calls = NetworkCalls() if calls is None else calls
+        sa, sas = (self._network_log_odds(name, tensordict, params, calls) for name in ("sa_network", "sas_network"))
+        if not self.residual:
+            return sa, sas
+        return sa, sas + (sa.detach() if self.detach_residual else sa)
 
-    def _network_log_odds(self, name: str, tensordict: TensorDictBase, params: TensorDictBase | None) -> Tensor:
+    def _network_log_odds(
+        self, name: str, tensordict: TensorDictBase, params: TensorDictBase | None, calls: NetworkCalls
+    ) -> Tensor:
         network = getattr(self, name)
         if params is None:
             out = network(tensordict.select(*network.in_keys))
         else:
-            out = run(network, tensordict, params.get(name))
+            out = calls.outputs(network, tensordict, params.get(name))
         logits = out.get(network.out_keys[0])
         if logits.shape[-1] != 2:
             raise ValueError(f"a discriminator must write two logits (real, simulated), not {logits.shape[-1]}.")
@@ -116,36 +130,43 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         return tensordict.set(log_key, log_ratio).set(key, ratio)
 
     @torch.no_grad()
-    def ratio(self, tensordict: TensorDictBase, params: TensorDictBase | None = None) -> tuple[Tensor, Tensor]:
-        """Eq. (9): the log ratio, and the clamped ratio, constants, ``[*B]`` each; arguments as of :meth:`log_odds`."""
-        sa, sas = self.log_odds(tensordict, params)
+    def ratio(
+        self, tensordict: TensorDictBase, params: TensorDictBase | None = None, calls: NetworkCalls | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Compute Eq. (9), with the arguments of :meth:`log_odds`.
+
+        Returns:
+            The log ratio and the clamped ratio, constants, ``[*B]`` each.
+        """
+        sa, sas = self.log_odds(tensordict, params, calls)
         log_ratio = sas - sa  # Eq. (9)
         ratio = log_ratio.exp()
         return log_ratio, ratio if self.clamp is None else ratio.clamp(*self.clamp)
 
 
 class DynamicsRatioLoss(HybridLoss):
-    """Cross-entropy of the two discriminators, each stream weighing one half.
+    """Cross-entropy of the two discriminators, with equal weight on both streams.
 
-    In training mode Gaussian noise is added to every input; after ``loss.eval()`` there is none, which makes
-    ``accuracy`` on a held-out batch a measure of how visible the dynamics gap is (0.5: not at all).
+    In training mode Gaussian noise is added to every input, after ``loss.eval()`` none. So ``accuracy`` in evaluation
+    mode on a held-out batch measures how visible the dynamics gap is (0.5: not at all).
 
-    Unlike the authors' code, the second loss does not reach the first network through the added logits: each
-    network is trained by its own loss.
+    By default each network is trained by its own loss, unlike in the authors' code; see ``detach_residual`` of
+    :class:`DynamicsRatioEstimator`.
 
     Args:
         estimator (DynamicsRatioEstimator): holds the two networks.
 
     Keyword Args:
-        input_noise (float or None, optional): standard deviation, in each input's own unit. 0 or ``None`` switches
-            it off. Defaults to 0.1.
-        reduction (str, optional): see :class:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss`.
+        input_noise (float or None, optional): standard deviation of the noise, in each input's own unit. 0 or
+            ``None`` switches it off. Defaults to 0.1.
+        reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
 
-    Reads what the estimator reads and ``real`` ``[*B]``. Writes ``loss_ratio_sa``, ``loss_ratio_sas``, and
-    ``accuracy_sa`` and ``accuracy`` (of the classifier of (s, a, s')), the mean of the two streams' hit rates.
+    Reads the estimator's inputs, ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Writes
+    ``loss_ratio_sa``, ``loss_ratio_sas``, and the two classifiers' accuracies, ``accuracy_sa`` of (s, a) and
+    ``accuracy`` of (s, a, s'), each the mean of the two streams' hit rates.
 
     Source:
-        H2O+, Eq. (9), after DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916).
+        H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (9), after DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916).
 
     Examples:
         >>> import torch
@@ -181,25 +202,16 @@ class DynamicsRatioLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return "loss_ratio_sa", "loss_ratio_sas", "accuracy_sa", "accuracy"
 
-    def draw_noise(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDict:
-        noise = super().draw_noise(tensordict, generator)
-        if self.training and self.input_noise:
-            inputs = tensordict.select(*self.estimator.in_keys)
-            noise.set("inputs", inputs.apply(lambda x: normal_like(x, generator)))
-        return noise
-
     def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
-        """Eq. (9) of this loss's current parameters, a constant, ``[*B]``."""
-        return self.estimator.ratio(tensordict, self.estimator_params)[1]
+        """Compute Eq. (9) with this loss's current parameters, as a constant, ``[*B]``."""
+        return self.estimator.ratio(tensordict, self.estimator_params, self.calls)[1]
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs, rows = tensordict.select(*self.estimator.in_keys), self._rows(tensordict)
         if self.training and self.input_noise:
-            noise = self._given_noise(tensordict, "inputs")
-            noise = inputs.apply(torch.randn_like) if noise is None else noise
-            inputs = inputs.apply(lambda x, z: x + self.input_noise * z, noise)
-        sa, sas = self.estimator.log_odds(inputs, self.estimator_params)
+            inputs = inputs.apply(self._noisy)
+        sa, sas = self.estimator.log_odds(inputs, self.estimator_params, self.calls)
         return self._output(
             {
                 "loss_ratio_sa": self._cross_entropy(sa, rows),
@@ -209,6 +221,10 @@ class DynamicsRatioLoss(HybridLoss):
             },
             tensordict,
         )
+
+    def _noisy(self, x: Tensor) -> Tensor:
+        # The numbers of torch.randn_like, drawn by a function that compiled populations can supply numbers to.
+        return x + self.input_noise * torch.empty_like(x).normal_()
 
     def _cross_entropy(self, log_odds: Tensor, rows: Rows) -> Tensor:
         terms = F.softplus(torch.where(rows.real, -log_odds, log_odds))  # -log p(own stream)

@@ -1,7 +1,7 @@
 """A perceptron with ReLU, or an ensemble of them, as one node of the autograd graph.
 
-Layer by layer, small networks spend as much time on the graph's bookkeeping and on fresh memory as on products. Written
-out, an activation is clipped where it lies, and a gradient is masked by it.
+Called layer by layer, a small network spends as much time on the graph and on memory allocation as on products. One
+node applies ReLU in place, and masks gradients by the activations.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from torch.nn import functional as F
 
 
 def relu_perceptron(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
-    """What the last layer gives, with ReLU behind all others.
+    """Apply linear layers with ReLU between them.
 
     Args:
-        x: inputs, ``[B, in]``, which all members of an ensemble read.
+        x: inputs, ``[B, in]``, shared by all members of an ensemble.
         weights: of each layer, ``[out, in]``, or of an ensemble, ``[N, out, in]``.
         biases: of each layer, ``[out]`` or ``[N, out]``.
 
     Raises:
-        RuntimeError: in a backward with ``create_graph=True``: there is no gradient of its gradient.
+        RuntimeError: in a backward with ``create_graph=True``, as second derivatives are not implemented.
 
     Returns:
         ``[B, out]`` or ``[N, B, out]``.
@@ -40,12 +40,12 @@ def relu_perceptron(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tenso
 
 
 def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> list[Tensor]:
-    """The activations behind each layer."""
+    """The output of each layer, after its activation."""
     activations = []
     for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if weight.ndim == 2:
             x = F.linear(x, weight, bias)
-        elif index == 0:  # one product for all members, as they read the same
+        elif index == 0:  # all members read the same inputs, so one product serves them all
             x = F.linear(x, weight.flatten(0, 1), bias.flatten()).unflatten(-1, weight.shape[:2]).movedim(-2, 0)
         else:
             x = torch.baddbmm(bias.unsqueeze(-2), x, weight.mT)
@@ -60,7 +60,7 @@ class _ReluPerceptron(torch.autograd.Function):
 
     @staticmethod
     def forward(x: Tensor, *params: Tensor) -> tuple[Tensor, ...]:
-        """The output, and the hidden activations, which backward needs."""
+        """Return the output, and the hidden activations for the backward pass."""
         depth = len(params) // 2
         *hidden, output = _forward(x, params[:depth], params[depth:])
         return output, *hidden
@@ -76,8 +76,8 @@ class _ReluPerceptron(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError(
-                "a perceptron that is one node of the graph has no gradient of its gradient; use "
-                "layers of another type than nn.ReLU, or a hook on one, to have it layer by layer"
+                "an accelerated perceptron has no gradient of its gradient; do without accelerate(loss), or use "
+                "another activation than nn.ReLU"
             )
         depth = ctx.depth
         of_input, of_weights, of_biases = None, [None] * depth, [None] * depth
@@ -99,10 +99,10 @@ class _ReluPerceptron(torch.autograd.Function):
 
 
 def relu(x: Tensor) -> Tensor:
-    """ReLU for compiled losses.
+    """Apply ReLU in compiled losses.
 
-    For PyTorch's own the compiler keeps a mask of booleans, which CPUs write a number at a time. This one's gradient
-    is masked by the sign of its output.
+    For ``torch.relu`` the compiler stores a boolean mask, which CPUs write one number at a time. The gradient of this
+    function is masked by the sign of the output instead.
     """
     return _Relu.apply(x)
 

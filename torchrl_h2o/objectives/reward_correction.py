@@ -1,4 +1,4 @@
-"""DARC's reward correction: a simulated step is paid less the less likely it is in reality."""
+"""DARC's reward correction: lower the reward of simulated steps that are unlikely in reality."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 
 class DynamicsRewardCorrection(TensorDictModuleBase):
-    r"""Adds the log dynamics ratio to the reward of simulated transitions: :math:`r+\log\frac{P}{\hat P}(s'|s,a)`.
+    r"""Add the log dynamics ratio to the reward of simulated transitions: :math:`r+\log\frac{P}{\hat P}(s'|s,a)`.
 
-    Any loss that learns from the corrected reward in the simulator learns what pays off in reality too. With
-    TorchRL's ``SACLoss`` it is DARC. Call it on a batch, or hand it to a replay buffer as its transform, which
-    corrects what is sampled with the discriminators of that moment: ``ReplayBuffer(..., transform=correction)``.
+    With TorchRL's ``SACLoss`` this is DARC. Call it on a batch, or pass it to a replay buffer as its transform, which
+    corrects each sample with the current discriminators: ``ReplayBuffer(..., transform=correction)``.
 
     Args:
-        estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`. Its log-ratio is not clamped;
-            its ``logit_bound`` bounds it.
-        scale (float, optional): of the log-ratio, which is in nats. A script that hands ``c * reward`` to its loss
-            corrects the task's own reward with ``scale=c``. Defaults to 1.0.
+        estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`. Its log ratio is bounded by
+            ``logit_bound``, not by ``clamp``.
+        scale (float, optional): reward per nat of the log ratio. If the loss sees ``c * reward``, use ``scale=c``.
+            Defaults to 1.0.
 
     Keyword Args:
         reward (NestedKey, optional): read and replaced, ``[*B, 1]`` or ``[*B]``. Defaults to ``("next", "reward")``.
-        real (NestedKey, optional): marks measured rows, which keep their reward; if it is not there, every row is
+        real (NestedKey, optional): marks measured rows, which keep their reward. Without it every row counts as
             simulated. Defaults to ``"real"``.
 
     Raises:
-        KeyError: if a transition lacks what the estimator reads, or its reward.
+        KeyError: if a transition lacks the estimator's inputs or the reward.
 
     Source:
-        DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916), the correction Δr; H2O+, Eq. (9), the ratio.
+        DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916), the correction Δr; H2O+ (Niu et al.,
+        2023, https://arxiv.org/abs/2309.12716), Eq. (9), the ratio.
 
     Examples:
         >>> import torch

@@ -1,6 +1,6 @@
-"""In-sample state-value losses, Eq. (4): V(s) is regressed on Q(s, a) at the data's own actions.
+"""In-sample state-value losses, Eq. (4): regress V(s) on Q(s, a) at the data's own actions.
 
-The three backbones differ in one function of the advantage y = Q(s, a) - V(s), their ``penalty``.
+The three backbones differ in their ``penalty``, a function of the advantage y = Q(s, a) - V(s).
 """
 
 from __future__ import annotations
@@ -14,27 +14,26 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 
-from torchrl_h2o.objectives.functional import run
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 
 
 class InSampleValueLoss(HybridLoss):
     r"""In-sample value loss :math:`\min_V E_{(s,a)\sim 𝒟}\,L^f_V(Q(s,a)-V(s))`, abstract in :meth:`penalty`.
 
-    A backbone of one's own is a subclass with that one method.
+    To add a backbone, subclass this and define :meth:`penalty`.
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
 
     Keyword Args:
         reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"``. Defaults to ``"mean"``, the mean over the
-            real rows. Simulated rows never count.
+            real rows. Simulated rows have no effect.
 
-    Reads ``observation`` (what the network reads), ``state_action_value`` ``[*B]`` or ``[*B, 1]`` (target Q at the
-    data's own action, taken as a constant) and ``real`` ``[*B]``; writes ``loss_value``.
+    Reads the network's inputs, ``state_action_value`` ``[*B]`` or ``[*B, 1]`` (target Q at the data's own action, used
+    as a constant), ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Writes ``loss_value``.
 
     Source:
-        H2O+, Eq. (4), after SQL and EQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
+        H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (4), after SQL and EQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
 
     Examples:
         >>> import torch
@@ -91,8 +90,8 @@ class InSampleValueLoss(HybridLoss):
         return self._output({"loss_value": self.value_loss(tensordict, self._rows(tensordict))}, tensordict)
 
     def value_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
-        """Eq. (4), reduced."""
-        out = run(self.value_network, tensordict, self.value_network_params)
+        """Compute Eq. (4), reduced."""
+        out = self.calls.outputs(self.value_network, tensordict, self.value_network_params)
         value = self._entry(out, self.tensor_keys.value).squeeze(-1)
         qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
         return self._expectation(self.penalty(qvalue - value), rows, rows.real)  # Eq. (4)
@@ -103,8 +102,9 @@ class ExpectileValueLoss(InSampleValueLoss):
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
-        expectile (float, optional): :math:`\tau` in (0, 1); 0.5 regresses the mean, towards 1 the maximum over the
-            data's actions. Defaults to 0.7.
+        expectile (float, optional): :math:`\tau` in (0, 1). 0.5 gives the mean of Q over the data's actions, values
+            near 1 approach its maximum. Defaults to 0.7, IQL's; the authors' code has 0.5, and 0.9 in its script for
+            the wheel-legged robot.
 
     Keyword Args:
         reduction (str, optional): see :class:`InSampleValueLoss`.
@@ -113,7 +113,8 @@ class ExpectileValueLoss(InSampleValueLoss):
         ValueError: if ``expectile`` is not inside (0, 1).
 
     Source:
-        H2O+, Eq. (4) and its table; IQL (Kostrikov et al., 2021, https://arxiv.org/abs/2110.06169), Eq. (5).
+        H2O+ (Niu et al., 2023), Eq. (4) and its table; IQL (Kostrikov et al., 2021,
+        https://arxiv.org/abs/2110.06169), Eq. (5).
 
     Examples:
         >>> import torch
@@ -138,7 +139,8 @@ class SparseValueLoss(InSampleValueLoss):
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
-        alpha (float, optional): in units of the return; small is greedy, large is close to the mean.
+        alpha (float, optional): in units of the return. Small values approach the maximum over the data's
+            actions, large ones the mean.
             Defaults to 1.0.
 
     Keyword Args:
@@ -148,7 +150,7 @@ class SparseValueLoss(InSampleValueLoss):
         ValueError: if ``alpha`` is not positive.
 
     Source:
-        H2O+, Eq. (4) and its table, f = x - 1; SQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
+        H2O+ (Niu et al., 2023), Eq. (4) and its table, f = x - 1; SQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
 
     Examples:
         >>> import torch
@@ -170,12 +172,13 @@ class SparseValueLoss(InSampleValueLoss):
 class ExponentialValueLoss(InSampleValueLoss):
     r"""EQL's and XQL's loss :math:`\exp(y/\alpha)-y/\alpha`, finite for any advantage.
 
-    Above ``clip`` the exponential goes on as its tangent: value and gradient stay finite and keep their sign, so
-    that an outlier still pulls V up. Below, both are exact.
+    Above ``clip`` the exponential is replaced by its tangent: value and gradient stay finite and keep their sign, so
+    an outlier still raises V. Below ``clip`` both are exact.
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
-        alpha (float, optional): in units of the return; small is greedy, large is close to the mean.
+        alpha (float, optional): in units of the return. Small values approach the maximum over the data's
+            actions, large ones the mean.
             Defaults to 1.0.
         clip (float, optional): the largest :math:`y/\alpha` with an exact exponential. Defaults to 7.0, as in XQL.
 
@@ -186,8 +189,8 @@ class ExponentialValueLoss(InSampleValueLoss):
         ValueError: if ``alpha`` is not positive, or ``clip`` is outside (0, 20].
 
     Source:
-        H2O+, Eq. (4) and its table, f = log x; EQL (https://arxiv.org/abs/2303.15810); XQL (Garg et al., 2023,
-        https://arxiv.org/abs/2301.02328).
+        H2O+ (Niu et al., 2023), Eq. (4) and its table, f = log x; EQL (Xu et al., 2023,
+        https://arxiv.org/abs/2303.15810); XQL (Garg et al., 2023, https://arxiv.org/abs/2301.02328).
 
     Examples:
         >>> import torch
@@ -199,7 +202,7 @@ class ExponentialValueLoss(InSampleValueLoss):
         tensor([True, True])
     """
 
-    # Past this the loss is a constant. Tangent slope times bound, summed over a batch, stays far inside float32.
+    # The loss is constant beyond this: the tangent there, summed over a batch, must stay inside float32's range.
     _BOUND = 1e25
 
     def __init__(

@@ -3,19 +3,19 @@
 import pytest
 import torch
 from torch import nn
-from torch.distributions import Gumbel
-from torchrl.objectives import SoftUpdate
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import SACLoss, SoftUpdate
 
-from tests.objectives.conftest import Parts, make_batch
+from tests.objectives.conftest import ACTION_DIM, OBSERVATION_DIM, Parts, make_batch
 from torchrl_h2o.objectives import (
     DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
+    MixedBellmanLoss,
     SparseValueLoss,
     total_loss,
 )
-from torchrl_h2o.objectives.functional import sample_from_noise
 from torchrl_h2o.training.populations import Population
 
 LR, TAU = 3e-3, 0.05
@@ -51,11 +51,9 @@ def batches(member, update):
     return [make_batch(4, 4, seed, torch.float32), make_batch(6, 6, seed + 1, torch.float32)]
 
 
-def with_noise(run, member_batches, generator):
-    batch, pairs = member_batches
-    pairs["noise"] = run.ratio_loss.draw_noise(pairs, generator)
-    batch["noise"] = run.loss.draw_noise(batch, generator)
-    return batch, pairs
+def stacked_batches(runs, update):
+    together = zip(*(batches(i, update) for i in range(len(runs))), strict=True)
+    return [torch.stack(list(same)) for same in together]
 
 
 def train_alone(run, member, updates):
@@ -69,10 +67,9 @@ def train_together(runs, updates, spoil=lambda update, stacked: None):
     optimiser = torch.optim.Adam(population.parameters(), lr=LR, fused=True)
     generators = [torch.Generator().manual_seed(member) for member in range(len(runs))]
     for update in range(updates):
-        drawn = [with_noise(run, batches(i, update), generators[i]) for i, run in enumerate(runs)]
-        stacked = [torch.stack(list(same)) for same in zip(*drawn, strict=True)]
+        stacked = stacked_batches(runs, update)
         spoil(update, stacked)
-        terms = population(*stacked)
+        terms = population(*stacked, noise=population.draw(*stacked, generators=generators))
         optimiser.zero_grad()
         total_loss(terms).sum().backward()
         stopped |= set((~total_loss(terms).isfinite()).nonzero().flatten().tolist())
@@ -107,9 +104,9 @@ def test_members_learn_what_single_runs_learn(value_loss):
 def test_a_member_keeps_a_lambda_of_its_own():
     runs = [Run(seed) for seed in range(2)]
     population = Population(runs)
-    assert population.stacked["loss", "mixing"].tolist() == pytest.approx([0.1, 0.4])
-    runs[1].loss.mixing.fill_(0.7)
-    assert population.stacked["loss", "mixing"].tolist() == pytest.approx([0.1, 0.7])
+    assert population.stacked["loss", "bellman_loss", "mixing"].tolist() == pytest.approx([0.1, 0.4])
+    runs[1].loss.mixing = 0.7
+    assert population.stacked["loss", "bellman_loss", "mixing"].tolist() == pytest.approx([0.1, 0.7])
 
 
 def test_a_member_s_policy_acts_with_what_the_population_has_learnt():
@@ -127,11 +124,13 @@ def test_a_member_s_own_loss_sees_what_the_population_has_learnt():
     runs = [Run(seed) for seed in range(2)]
     for member, run in enumerate(runs):
         run(*batches(member, 0))
-    train_together(runs, 5)
-    drawn = [with_noise(run, batches(member, 5), None) for member, run in enumerate(runs)]
-    together = Population(runs)(*(torch.stack(list(same)) for same in zip(*drawn, strict=True)))
+    _, _, population = train_together(runs, 5)
+    stacked = stacked_batches(runs, 5)
+    generators = [torch.Generator().manual_seed(member) for member in range(2)]
+    together = population(*stacked, noise=population.draw(*stacked, generators=generators))
     for member, run in enumerate(runs):
-        for name, term in run(*drawn[member]).items():
+        torch.manual_seed(member)
+        for name, term in run(*batches(member, 5)).items():
             torch.testing.assert_close(together[name][member], term)
 
 
@@ -159,8 +158,7 @@ def test_a_member_whose_parameters_are_no_numbers_is_found():
     with torch.no_grad():
         next(population.parameters())[1].view(-1)[0] = float("nan")
     assert population.finite().tolist() == [True, False, True]
-    drawn = [with_noise(run, batches(i, 0), None) for i, run in enumerate(population.members)]
-    terms = population(*(torch.stack(list(same)) for same in zip(*drawn, strict=True)))
+    terms = population(*stacked_batches(population.members, 0))
     assert total_loss(terms).isfinite().tolist() == [True, False, True]
 
 
@@ -172,41 +170,129 @@ def test_members_of_unequal_shapes_are_refused():
         Population([])
 
 
-@pytest.mark.parametrize("ratio", [True, False])
-def test_given_noise_is_what_the_generator_would_have_drawn(ratio):
-    loss: H2OPlusLoss = Parts(0).h2o_plus(ratio=ratio)
-    torch.manual_seed(7)
-    drawn = loss(make_batch())
-    batch = make_batch()
-    batch["noise"] = loss.draw_noise(batch, torch.Generator().manual_seed(7))
-    torch.manual_seed(8)
-    given = loss(batch)
-    assert (given == drawn).all()
-
-
-def test_noise_is_given_for_gaussian_policies_alone():
-    with pytest.raises(TypeError, match="Gumbel"):
-        sample_from_noise(Gumbel(torch.zeros(2, 1), torch.ones(2, 1)), torch.zeros(2, 1))
-
-
-def test_evaluation_mode_draws_no_noise_for_the_discriminators():
-    loss = Parts(0).h2o_plus()
-    loss.eval()
-    assert set(loss.draw_noise(make_batch()).keys()) == {"next_action", "action"}
-
-
 def test_compiled_losses_of_a_population_are_the_eager_ones():
     runs = [Run(seed) for seed in range(2)]
     population = Population(runs)
-    drawn = [with_noise(run, batches(i, 0), None) for i, run in enumerate(runs)]
-    stacked = [torch.stack(list(same)) for same in zip(*drawn, strict=True)]
+    stacked = stacked_batches(runs, 0)
+    noise = population.draw(*stacked)
     compiled = torch.compile(population, backend="eager", fullgraph=True)
-    eager = population(*stacked)
+    eager = population(*stacked, noise=noise)
     total_loss(eager).sum().backward()
     expected = [parameter.grad.clone() for parameter in population.parameters()]
     population.zero_grad()
-    terms = compiled(*stacked)
+    terms = compiled(*stacked, noise=noise)
     total_loss(terms).sum().backward()
     for name, term in eager.items():
         torch.testing.assert_close(terms[name], term)
     torch.testing.assert_close([parameter.grad for parameter in population.parameters()], expected)
+
+
+def layer_norm_loss(seed):
+    parts = Parts(seed, torch.float32)
+    inputs = OBSERVATION_DIM + ACTION_DIM
+    sizes = {"norm_class": nn.LayerNorm, "norm_kwargs": {"normalized_shape": 8}}
+    qvalues = [
+        ValueOperator(MLP(inputs, 1, num_cells=[8, 8], **sizes), in_keys=["observation", "action"]) for _ in range(2)
+    ]
+    bellman_loss = MixedBellmanLoss(parts.actor, qvalues, parts.value)
+    return H2OPlusLoss(bellman_loss, ExpectileValueLoss(parts.value), DynamicsRatioLoss(parts.estimator))
+
+
+def sac_loss(seed):
+    parts = Parts(seed, torch.float32)
+    return SACLoss(parts.actor, parts.qvalues)
+
+
+@pytest.mark.parametrize("make", [layer_norm_loss, sac_loss])
+def test_members_may_be_any_loss_of_any_network(make):
+    alone, together = ([make(seed) for seed in range(3)] for _ in range(2))
+    population = Population(together)
+    batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(3)])
+    generators = [torch.Generator().manual_seed(member) for member in range(3)]
+    terms = population(batch.copy(), noise=population.draw(batch, generators=generators))
+    total_loss(terms).sum().backward()
+    for member, loss in enumerate(alone):
+        torch.manual_seed(member)
+        expected = loss(batch[member].copy())
+        for name, term in expected.items():
+            torch.testing.assert_close(terms[name][member], term, rtol=1e-5, atol=1e-5)
+        total_loss(expected).backward()
+        stacks = {name.removeprefix("stacked."): p.grad for name, p in population.named_parameters()}
+        for name, parameter in loss.named_parameters():
+            torch.testing.assert_close(stacks[name][member], parameter.grad, rtol=1e-4, atol=1e-5)
+
+
+def test_a_network_that_two_losses_share_is_stacked_once():
+    runs = [Parts(seed, torch.float32).h2o_plus() for seed in range(2)]
+    population = Population(runs)
+    assert len(list(population.parameters())) == len(list(runs[0].parameters()))
+    read, trained = (population.stacked.get((name, "value_network_params")) for name in ("bellman_loss", "value_loss"))
+    assert all(read.get(key) is trained.get(key) for key in read.keys(True, True))
+
+
+def test_without_noise_a_population_draws_from_the_global_generator():
+    population = Population([Run(seed) for seed in range(2)])
+    stacked = stacked_batches(population.members, 0)
+    torch.manual_seed(3)
+    first = population(*stacked)
+    other = population(*stacked)
+    torch.manual_seed(3)
+    again = population(*stacked)
+    assert torch.equal(first["loss_qvalue"], again["loss_qvalue"])
+    assert not torch.equal(first["loss_qvalue"], other["loss_qvalue"])
+
+
+def test_recording_the_draws_leaves_the_random_state_alone():
+    population = Population([Run(seed) for seed in range(2)])
+    stacked = stacked_batches(population.members, 0)
+    before = torch.get_rng_state()
+    generators = [torch.Generator().manual_seed(member) for member in range(2)]
+    assert len(population.draw(*stacked, generators=generators)) == 5  # three noisy inputs, two actions
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_evaluation_mode_draws_no_noise_for_the_discriminators():
+    population = Population([Run(seed) for seed in range(2)])
+    for run in population.members:
+        run.eval()
+    assert len(population.draw(*stacked_batches(population.members, 0))) == 2
+
+
+class Randomly(nn.Module):
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def forward(self, batch):
+        return {"loss": self.function(batch["observation"]).sum()}
+
+
+def filled_twice(x):
+    target = torch.empty_like(x)
+    target.normal_()
+    return target * x
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [(nn.functional.dropout, "dropout"), (lambda x: x[torch.randperm(len(x))], "randperm"), (filled_twice, "in place")],
+)
+def test_draws_that_cannot_be_supplied_are_refused(function, message):
+    population = Population([Randomly(function), Randomly(function)])
+    batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(2)])
+    with pytest.raises(NotImplementedError, match=message):
+        population(batch)
+
+
+def test_bounds_and_moments_of_a_draw_are_kept():
+    def draws(x):
+        uniform = torch.empty_like(x).uniform_(-2.0, 3.0)
+        return uniform + torch.normal(x, 0.5) + torch.rand_like(x) + torch.empty_like(x).normal_(1.0, 2.0)
+
+    population = Population([Randomly(draws), Randomly(draws)])
+    batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(2)])
+    generators = [torch.Generator().manual_seed(member) for member in range(2)]
+    got = population(batch, noise=population.draw(batch, generators=generators))["loss"]
+    for member in range(2):
+        torch.manual_seed(member)
+        torch.testing.assert_close(got[member], draws(batch[member]["observation"]).sum())

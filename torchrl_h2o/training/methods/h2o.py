@@ -1,4 +1,4 @@
-"""H2O, the predecessor: SAC on both streams, the simulator's weighed by the ratio, and Q held down where it is off."""
+"""H2O: SAC on both streams with the dynamics ratio as weight, and lower Q where the simulator is wrong."""
 
 import torch
 from omegaconf import DictConfig
@@ -14,6 +14,8 @@ from torchrl_h2o.objectives import (
     DynamicsDivergence,
     DynamicsRatioLoss,
     H2OPlusLoss,
+    MixedBellmanLoss,
+    accelerate,
     make_dynamics_ratio_estimator,
 )
 from torchrl_h2o.training.learner import Learner, adam, make_networks
@@ -21,7 +23,7 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """Eq. (1): a conservative term around SAC on both streams."""
+    """Build H2O, Eq. (1): a conservative term added to SAC on both streams."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
@@ -29,11 +31,13 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     spread = replay.real[:]["observation"].std(0)
     divergence = DynamicsDivergence(estimator, noise=spread, num_samples=cfg.h2o.num_samples)
 
-    # The authors' backup holds no entropy.
+    # The authors' target has no entropy term.
     no_bonus = TensorDictModule(torch.zeros_like, in_keys=["_log_prob"], out_keys=["exploration_bonus"])
-    both = H2OPlusLoss(actor, qvalues, None, mixing=0.0, exploration=no_bonus, target_entropy=cfg.target_entropy)
-    loss = ConservativeLoss(both, alpha_c=cfg.h2o.alpha_c)
+    bellman_loss = MixedBellmanLoss(actor, qvalues, mixing=0.0, exploration=no_bonus)
+    loss = ConservativeLoss(H2OPlusLoss(bellman_loss, target_entropy=cfg.target_entropy), alpha_c=cfg.h2o.alpha_c)
     loss.make_value_estimator(gamma=cfg.gamma)
+    for part in (loss, ratio_loss):
+        accelerate(part)
 
     def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
         ratio_losses = ratio_loss(pairs)

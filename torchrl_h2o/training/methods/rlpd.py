@@ -1,20 +1,21 @@
-"""RLPD-style: SAC on real and simulated rows half and half, neither weighed. H2O+ without V and without the ratio."""
+"""RLPD: SAC on real and simulated rows in equal parts. H2O+ without V and without the dynamics ratio."""
 
 from omegaconf import DictConfig
 from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import H2OPlusLoss
+from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """SAC's target on both streams, Eq. (6)."""
+    """Build SAC with its target on both streams, Eq. (6)."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
-    loss = H2OPlusLoss(actor, qvalues, None, mixing=0.0, target_entropy=cfg.target_entropy)
+    loss = H2OPlusLoss(MixedBellmanLoss(actor, qvalues, mixing=0.0), target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
+    accelerate(loss)
     targets = SoftUpdate(loss, tau=cfg.tau)
     return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [cfg.batch_size], loss)
 

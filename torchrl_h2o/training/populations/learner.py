@@ -1,4 +1,4 @@
-"""One update of many runs at once: batches, losses, a step of one optimiser for all, a step of all targets."""
+"""One update of many runs at once: batches, losses, one optimiser step, one step of all targets."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ from torchrl_h2o.training.populations.replay import PopulationReplay
 
 
 class PopulationLearner:
-    """The learners of N runs as one; a member whose losses are no finite numbers any more stops.
+    """The learners of N runs as one; a member whose losses stop being finite is stopped.
 
     On a CPU each member draws from a random stream of its own, in the order in which a single run draws. On a GPU that
-    would be a thousand small kernels an update, so there all draw from torch's global generator, in a few calls.
+    would take a thousand small kernels per update, so there all draw from torch's global generator, in a few calls.
 
     Args:
-        learners: one a member. Their own optimisers and target updaters stay unused.
+        learners: one per member. Their own optimisers and target updaters stay unused.
         replay: the members' data.
         lr: of Adam.
         tau: of the target networks.
@@ -40,12 +40,12 @@ class PopulationLearner:
         self._batches: list[TensorDictBase] = []
 
     def start_stream(self, number: int) -> None:
-        """Lets a member draw on from where torch's global generator is."""
+        """Set a member's stream to the state of torch's global generator."""
         if self.generators is not None:
             self.generators[number].set_state(torch.get_rng_state())
 
     def update(self) -> dict[str, Tensor]:
-        """One update; returns each term of each member, ``[N]``."""
+        """Make one update and return each term of each member, ``[N]``."""
         terms = self.differentiate()
         healthy = total_loss(terms).isfinite()
         if not healthy.all():
@@ -57,24 +57,25 @@ class PopulationLearner:
         return terms
 
     def differentiate(self) -> dict[str, Tensor]:
-        """The first half of an update: what the losses are, and their gradients."""
-        self._draw()
-        terms = self.losses_of(*self._batches)
+        """Make the first half of an update: losses and gradients."""
+        self._batches = self.sample()
+        noise = self.population.draw(*self._batches, generators=self.generators)
+        terms = self.losses_of(*self._batches, noise=noise)
         self.optimiser.zero_grad()
         total_loss(terms).sum().backward()  # no member's loss depends on another's parameters
         return terms
 
     def step(self) -> None:
-        """The second half."""
+        """Make the second half of an update: the optimiser's step and the targets'."""
         self.optimiser.step()
         self.population.move_targets(self.tau)
 
     def check_parameters(self) -> None:
-        """Stops members whose parameters are no finite numbers any more, which their next losses would show."""
+        """Stop members whose parameters are not finite, before their next losses show it."""
         self._note_failures(self.population.finite(), {})
 
     def batches_of(self, number: int) -> list[TensorDictBase]:
-        """A member's batches of the last update."""
+        """Return a member's batches of the last update."""
         return [batch[number] for batch in self._batches]
 
     def _note_failures(self, healthy: Tensor, terms: dict[str, Tensor]) -> None:
@@ -84,19 +85,5 @@ class PopulationLearner:
             self.failures.setdefault(number, {"updates": self.updates, "why": why})
 
     def sample(self) -> list[TensorDictBase]:
-        """The batches of one update of all members, ``[N, B]`` each."""
+        """Draw the batches of one update of all members, ``[N, B]`` each."""
         return [self.replay.sample(size, self.generators) for size in self.learners[0].batch_sizes]
-
-    def _draw(self) -> None:
-        """The members' batches, ``[N, B]``, with the noise of a forward on them."""
-        self._batches = self.sample()
-        if self.generators is None:
-            noise = self.learners[0].terms_of.draw_noise(*self._batches)
-        else:
-            of_each = [
-                learner.terms_of.draw_noise(*self.batches_of(number), generator=self.generators[number])
-                for number, learner in enumerate(self.learners)
-            ]
-            noise = [torch.stack(same) for same in zip(*of_each, strict=True)]
-        for batch, of_batch in zip(self._batches, noise, strict=True):
-            batch["noise"] = of_batch

@@ -1,4 +1,4 @@
-"""Many runs as one: their losses' parameters stacked, all losses taken in one call, one optimiser for all.
+"""Many runs as one: their parameters stacked, all losses computed in one call, one optimiser for all.
 
 Small networks leave a device idle between kernels. N of them, stacked, are a few large products instead.
 """
@@ -9,8 +9,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
 from torch import Tensor, nn
+
+from torchrl_h2o.training.populations.noise_tape import Draw, Playback, Tape, record
 
 Stackable = TensorDictParams | Tensor
 
@@ -18,41 +20,46 @@ Stackable = TensorDictParams | Tensor
 class Population(nn.Module):
     """The losses of N runs, evaluated together by ``torch.vmap`` over their stacked parameters and buffers.
 
-    What is stacked is every tensor of a member: networks, targets, β, λ, γ. So these may differ between members. All
-    else (widths, backbone, whether there is a ratio) is taken from the first, and must be the same in all.
+    Every tensor of a member is stacked: networks, targets, β, λ, γ. These may differ between members. Everything else
+    (widths, backbone, whether there is a ratio) is taken from the first member and must be the same in all.
 
-    The members stay in use: their own parameters become views of the stack, so that a member's policy always acts with
-    what the population has learnt, and a checkpoint of the members is one of the population. Put them on their device
-    before. Gradients are the stack's alone, so the optimiser is built of the population's parameters.
+    The members stay usable: their own parameters become views of the stack, so a member's policy always acts with
+    the population's current parameters, and a checkpoint of the members is one of the population. Move members to
+    their device before. Only the stack has gradients, so build the optimiser from the population's parameters.
+
+    Random numbers are drawn outside of ``vmap``, see :meth:`draw`, so that each member can have a stream of its own.
+    Supported are losses and networks that draw normal or uniform numbers. Not supported, and refused with an error:
+
+    - other random functions, such as dropout or random permutations;
+    - draws or branches that depend on data or parameters;
+    - members that differ in structure.
+
+    Buffers that a forward changes, such as the running means of batch normalisation, are not written back.
 
     Args:
-        members (sequence of nn.Module): one a run, a loss such as :class:`~torchrl_h2o.objectives.H2OPlusLoss` or a
-            module that holds several; ``forward(*batches)`` returns the terms by name.
+        members (sequence of nn.Module): one per run, a loss such as :class:`~torchrl_h2o.objectives.H2OPlusLoss` or
+            TorchRL's ``SACLoss``, or a module that holds several; ``forward(*batches)`` returns the terms by name.
 
     Raises:
         ValueError: for no members, or members of unequal shapes.
-
-    A loss that draws random numbers must be given them, as each member draws from a stream of its own: see
-    :meth:`~torchrl_h2o.objectives.hybrid_loss.HybridLoss.draw_noise`.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
-        >>> from torchrl_h2o.objectives import H2OPlusLoss, make_actor, make_qvalue, total_loss
+        >>> from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, make_actor, make_qvalue, total_loss
         >>> from torchrl_h2o.training.populations import Population
         >>> def make_loss(seed):
         ...     torch.manual_seed(seed)
         ...     actor = make_actor(observation_dim=3, action_spec=Bounded(-1, 1, (1,)))
-        ...     return H2OPlusLoss(actor, [make_qvalue(3, 1), make_qvalue(3, 1)], None, mixing=0.0)
+        ...     return H2OPlusLoss(MixedBellmanLoss(actor, [make_qvalue(3, 1), make_qvalue(3, 1)], mixing=0.0))
         >>> population = Population([make_loss(seed) for seed in range(5)])
         >>> optimiser = torch.optim.Adam(population.parameters(), lr=3e-4, fused=True)
         >>> batch = TensorDict(observation=torch.randn(5, 8, 3), action=torch.rand(5, 8, 1),
         ...                    real=(torch.arange(8) < 4).expand(5, 8),
         ...                    next=TensorDict(observation=torch.randn(5, 8, 3), reward=torch.randn(5, 8, 1),
         ...                                    terminated=torch.zeros(5, 8, 1, dtype=torch.bool)), batch_size=[5, 8])
-        >>> batch["noise"] = population.members[0].draw_noise(batch)  # or each member's own
-        >>> terms = population(batch)
+        >>> terms = population(batch)  # or population(batch, noise=population.draw(batch, generators=...))
         >>> terms["loss_qvalue"].shape
         torch.Size([5])
         >>> total_loss(terms).sum().backward()
@@ -65,42 +72,92 @@ class Population(nn.Module):
         if not members:
             raise ValueError("a population needs at least one member.")
         self.members = tuple(members)  # a tuple, so that their parameters do not count twice
-        self._paths = list(_tensors(members[0]))
+        for member in members:
+            member.state_dict()  # TorchRL's losses make some buffers at the first access
         own = [_tensors(member) for member in members]
+        self._paths = list(own[0])
         for number, tensors in enumerate(own):
             _check_alike(number, tensors, own[0])
-        stacked = TensorDict({}, batch_size=[len(members)])
+        stacked, stacks = TensorDict({}, batch_size=[len(members)]), {}
         for path in self._paths:
-            stacked.set(path, _stack([tensors[path] for tensors in own]))
+            stacked.set(path, _stack([tensors[path] for tensors in own], stacks))
         self.stacked = TensorDictParams(stacked, no_convert=True)
         for number, tensors in enumerate(own):
             for path, held in tensors.items():
                 _look_into(held, self.stacked.get(path), number)
+        self._draws: dict[tuple, list[Draw]] = {}
+        self._tape = Tape()
+        self._playback = Playback(self._tape)
 
     def __len__(self) -> int:
         return len(self.members)
 
-    def forward(self, *batches: TensorDictBase) -> dict[str, Tensor]:
-        """Every member's terms on its own batches.
+    def draw(self, *batches: TensorDictBase, generators: Sequence[torch.Generator] | None = None) -> tuple[Tensor, ...]:
+        """Draw the random numbers of one forward.
 
         Args:
-            *batches: what a member's forward takes, stacked, ``[N, *B]``.
+            *batches: as of :meth:`forward`.
+            generators: one per member, which then gets the numbers that a single run draws with it. Without them all
+                members draw from torch's global generator, in one call per draw.
 
         Returns:
-            What a member's forward returns, ``[N]`` or, of losses with ``reduction="none"``, ``[N, *B]``.
-        """
-        return torch.vmap(self._terms_of_one)(self.stacked, *batches)
+            The numbers of each draw, ``[N, *shape]``.
 
-    def _terms_of_one(self, tensors: TensorDictBase, *batches: TensorDictBase) -> dict[str, Tensor]:
-        with _in_place_of_own(self.members[0], {path: tensors.get(path) for path in self._paths}) as member:
-            return dict(member(*batches).items())
+        Raises:
+            NotImplementedError: for random functions that cannot be supplied from outside, such as dropout.
+        """
+        draws = self._recorded(batches)
+        if generators is None:
+            return tuple(draw.make(members=[len(self)]) for draw in draws)
+        of_each = [[draw.make(generator) for draw in draws] for generator in generators]
+        return tuple(torch.stack(same) for same in zip(*of_each, strict=True))
+
+    def _recorded(self, batches: Sequence[TensorDictBase]) -> list[Draw]:
+        """The draws of the first member's forward, recorded once per shape of the batches and training mode."""
+        modes = tuple(module.training for module in self.members[0].modules())
+        key = (tuple(batch.batch_size for batch in batches), modes)
+        if key not in self._draws:
+            first = [batch[0].copy() for batch in batches]
+            devices = {batch.device for batch in batches if batch.device is not None}
+            with _without_caches(self.members[0]):
+                self._draws[key] = record(lambda: self.members[0](*first), list(devices))
+        return self._draws[key]
+
+    def forward(self, *batches: TensorDictBase, noise: Sequence[Tensor] | None = None) -> dict[str, Tensor]:
+        """Compute every member's terms on its own batches.
+
+        Args:
+            *batches: inputs of a member's forward, stacked, ``[N, *B]``.
+            noise: random numbers, from :meth:`draw`. Without it they are drawn from torch's global generator; a
+                compiled population needs it.
+
+        Returns:
+            The terms of a member's forward, ``[N]`` or, of losses with ``reduction="none"``, ``[N, *B]``.
+        """
+        noise = self.draw(*batches) if noise is None else noise
+        return torch.vmap(self._terms_of_one)(self.stacked, tuple(noise), *batches)
+
+    def _terms_of_one(
+        self, tensors: TensorDictBase, noise: tuple[Tensor, ...], *batches: TensorDictBase
+    ) -> dict[str, Tensor]:
+        self._tape.numbers, self._tape.position = noise, 0
+        own = {path: tensors.get(path) for path in self._paths}
+        with _in_place_of_own(self.members[0], own) as member, self._playback:
+            terms = dict(member(*batches).items())
+        if self._tape.position != len(noise):
+            raise RuntimeError(
+                f"a member's forward made {self._tape.position} of {len(noise)} recorded draws of random numbers: what "
+                "it draws must not depend on data."
+            )
+        self._tape.numbers = ()
+        return terms
 
     @torch.no_grad()
     def move_targets(self, tau: float) -> None:
-        """Each member's target networks, as ``SoftUpdate(loss, tau=tau).step()`` moves them.
+        """Move each member's target networks as ``SoftUpdate(loss, tau=tau).step()`` does.
 
         Args:
-            tau: how much of the online networks goes into the targets.
+            tau: weight of the online networks.
         """
         for path in self._paths:
             *owner, name = path
@@ -115,11 +172,11 @@ class Population(nn.Module):
 
     @torch.no_grad()
     def stop(self, number: int, optimiser: torch.optim.Adam) -> None:
-        """Lets the coming step of the optimiser leave a member exactly as it is. To be called before each such step.
+        """Make the optimiser's next step leave a member unchanged. Call it before every step.
 
         Args:
-            number: the member's.
-            optimiser: that of the population, without weight decay.
+            number: index of the member.
+            optimiser: the population's, without weight decay.
         """
         for parameter in self.parameters():
             if parameter.grad is not None:
@@ -130,9 +187,9 @@ class Population(nn.Module):
 
 
 def _tensors(member: nn.Module) -> dict[tuple[str, ...], Stackable]:
-    """Every tensor that a member holds, by the path to it; those of a network stay together."""
+    """Every tensor that a member holds, by each path to it; those of a network stay together."""
     tensors: dict[tuple[str, ...], Stackable] = {}
-    for name, module in member.named_modules():
+    for name, module in member.named_modules(remove_duplicate=False):  # a shared network has several paths
         path = tuple(name.split(".")) if name else ()
         if isinstance(module, TensorDictParams):
             tensors[path] = module
@@ -154,12 +211,19 @@ def _check_alike(number: int, tensors: dict, first: dict) -> None:
             )
 
 
-def _stack(held: list[Stackable]) -> TensorDictBase | Tensor:
-    """One stack of the members' tensors, each a leaf of its own: what is a parameter stays one."""
+def _stack(held: list[Stackable], stacks: dict[int, Tensor]) -> TensorDictBase | Tensor:
+    """Stack the members' tensors; parameters stay parameters, and a tensor that is shared gets one stack.
+
+    Args:
+        held: the same tensors or networks of each member.
+        stacks: the stacks so far, by the identity of the first member's tensor.
+    """
 
     def one(*tensors: Tensor) -> Tensor:
-        stack = torch.stack([tensor.detach() for tensor in tensors])
-        return nn.Parameter(stack) if isinstance(tensors[0], nn.Parameter) else nn.Buffer(stack)
+        if id(tensors[0]) not in stacks:
+            stack = torch.stack([tensor.detach() for tensor in tensors])
+            stacks[id(tensors[0])] = nn.Parameter(stack) if isinstance(tensors[0], nn.Parameter) else nn.Buffer(stack)
+        return stacks[id(tensors[0])]
 
     if isinstance(held[0], Tensor):
         return one(*held)
@@ -170,24 +234,39 @@ def _stack(held: list[Stackable]) -> TensorDictBase | Tensor:
 
 
 def _look_into(held: Stackable, stack: TensorDictBase | Tensor, number: int) -> None:
-    """Makes a member's own tensors views of the stack."""
+    """Make a member's own tensors views of the stack."""
     if isinstance(held, Tensor):
         held.data = stack.data[number]
         return
-    held.unlock_()  # while it is locked, a tensordict keeps at hand what it made of its old tensors
     for key in held.keys(True, True):
         held.get(key).data = stack.get(key).data[number]
-    held.lock_()
+    own = held._param_td
+    for params in (own, *(value for value in own.values(True) if is_tensor_collection(value))):
+        params._erase_cache()  # a locked tensordict caches values computed from its old tensors
 
 
 @contextmanager
 def _in_place_of_own(member: nn.Module, tensors: dict[tuple[str, ...], TensorDictBase | Tensor]) -> Iterator[nn.Module]:
-    """The member with other tensors than its own: an attribute of the instance hides the one that is registered."""
+    """Give a member other tensors: an attribute of the instance hides the registered one of the same name."""
     owners = {path: member.get_submodule(".".join(path[:-1])) for path in tensors}
     for path, value in tensors.items():
         owners[path].__dict__[path[-1]] = value
     try:
-        yield member
+        with _without_caches(member):
+            yield member
     finally:
         for path, owner in owners.items():
-            del owner.__dict__[path[-1]]
+            owner.__dict__.pop(path[-1], None)  # a shared network's owner may be listed twice
+
+
+@contextmanager
+def _without_caches(member: nn.Module) -> Iterator[None]:
+    """Empty what TorchRL's losses cache of their parameters, before and after the parameters are exchanged."""
+    cached = [module for module in member.modules() if "_cache" in module.__dict__]
+    for module in cached:
+        module.__dict__["_cache"] = {}
+    try:
+        yield
+    finally:
+        for module in cached:
+            module.__dict__["_cache"] = {}

@@ -1,4 +1,4 @@
-"""Networks as functions of their parameters: written out or TorchRL's way, the same numbers and gradients."""
+"""Networks with parameters held apart: run as modules or as matrix products, the numbers and gradients agree."""
 
 import pytest
 import torch
@@ -8,9 +8,13 @@ from torch import nn
 from torchrl.data import Bounded
 from torchrl.modules import MLP, ValueOperator
 
-from torchrl_h2o.objectives import functional, make_actor
+from tests.objectives.conftest import Parts, make_batch
+from torchrl_h2o.objectives import accelerate, make_actor
+from torchrl_h2o.objectives.accelerated import PerceptronCalls
+from torchrl_h2o.objectives.network_calls import NetworkCalls
 
 KEYS = ["observation", "action"]
+both_ways = pytest.mark.parametrize("calls", [NetworkCalls(), PerceptronCalls()], ids=["modules", "products"])
 
 
 def qvalue(**kwargs):
@@ -41,10 +45,11 @@ def transitions(*batch_size):
 
 @pytest.mark.parametrize("batch_size", [(), (5,), (4, 3)], ids=str)
 @pytest.mark.parametrize("name", NETWORKS)
-def test_an_ensemble_gives_what_its_members_give(name, batch_size):
+@both_ways
+def test_an_ensemble_gives_what_its_members_give(calls, name, batch_size):
     members, batch = [NETWORKS[name]() for _ in range(3)], transitions(*batch_size)
     params = from_modules(*members, as_module=True)
-    out = functional.run(members[0], batch, params)
+    out = calls.outputs(members[0], batch, params)
     (key,) = members[0].out_keys
     assert out.batch_size == (3, *batch_size)
     expected = torch.stack([member(batch.copy())[key] for member in members])
@@ -57,49 +62,75 @@ def test_an_ensemble_gives_what_its_members_give(name, batch_size):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_one_network_runs_with_other_parameters_than_its_own(name):
+@both_ways
+def test_one_network_runs_with_other_parameters_than_its_own(calls, name):
     network, other, batch = NETWORKS[name](), NETWORKS[name](), transitions(4)
     (key,) = network.out_keys
-    got = functional.run(network, batch, TensorDictParams(TensorDict.from_module(other)))[key]
+    got = calls.outputs(network, batch, TensorDictParams(TensorDict.from_module(other)))[key]
     torch.testing.assert_close(got, other(batch.copy())[key])
     assert not torch.allclose(got, network(batch.copy())[key])
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_frozen_network_lets_gradients_through_and_gets_none(name):
+@both_ways
+def test_a_frozen_network_lets_gradients_through_and_gets_none(calls, name):
     network, batch = NETWORKS[name](), transitions(4)
     params = TensorDictParams(TensorDict.from_module(network))
     batch["observation"].requires_grad_()
     (key,) = network.out_keys
-    functional.run(network, batch, params, frozen=True)[key].square().sum().backward()
+    calls.outputs(network, batch, params, frozen=True)[key].square().sum().backward()
     assert batch["observation"].grad.any()
     assert all(leaf.grad is None for leaf in params.values(True, True))
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_mixed_precision_is_the_network_s_own(name):
+@both_ways
+def test_mixed_precision_is_the_network_s_own(calls, name):
     network, batch = NETWORKS[name](), transitions(4)
     params = TensorDictParams(TensorDict.from_module(network))
     (key,) = network.out_keys
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        got, expected = functional.run(network, batch, params)[key], network(batch.copy())[key]
+        got, expected = calls.outputs(network, batch, params)[key], network(batch.copy())[key]
     assert got.dtype == expected.dtype
     torch.testing.assert_close(got, expected)
     got.float().square().sum().backward()
     assert all(leaf.grad.isfinite().all() for leaf in params.values(True, True))
 
 
-def test_a_hook_is_called():
+@both_ways
+def test_a_hook_is_called(calls):
     network, batch = qvalue(), transitions(4)
     network.module[0].register_forward_hook(lambda module, inputs, output: output + 1.0)
-    got = functional.run(network, batch, TensorDictParams(TensorDict.from_module(network)))["state_action_value"]
+    got = calls.outputs(network, batch, TensorDictParams(TensorDict.from_module(network)))["state_action_value"]
     torch.testing.assert_close(got, network(batch.copy())["state_action_value"])
 
 
-def test_a_policy_with_other_parameters():
+@both_ways
+def test_a_policy_with_other_parameters(calls):
     actor, other = (make_actor(3, Bounded(-2, 2, (2,)), (8, 8)) for _ in range(2))
     batch = transitions(6)
-    got = functional.distribution(actor, batch, TensorDictParams(TensorDict.from_module(other)))
+    got = calls.distribution(actor, batch, TensorDictParams(TensorDict.from_module(other)))
     expected = other.get_dist(batch.select("observation"))
     action = 1.9 * torch.rand(6, 2)
     torch.testing.assert_close(got.log_prob(action), expected.log_prob(action))
+
+
+@pytest.mark.parametrize("build", ["bellman", "h2o_plus", "sac"])
+def test_accelerated_losses_have_the_same_numbers_and_gradients(build):
+    found = []
+    for change in (lambda loss: loss, accelerate):
+        loss = change(getattr(Parts(), build)())
+        torch.manual_seed(3)
+        terms = loss(make_batch())
+        sum(value for name, value in terms.items() if name.startswith("loss_")).backward()
+        found.append((terms.detach(), {n: p.grad for n, p in loss.named_parameters() if p.grad is not None}))
+    assert found[0][1].keys() == found[1][1].keys()
+    torch.testing.assert_close(found[0][0], found[1][0])
+    torch.testing.assert_close(found[0][1], found[1][1])
+
+
+def test_acceleration_reaches_every_loss_of_a_tree():
+    loss = accelerate(Parts().h2o_plus())
+    assert all(
+        isinstance(part.calls, PerceptronCalls) for part in (loss, loss.bellman_loss, loss.value_loss, loss.ratio_loss)
+    )

@@ -1,0 +1,164 @@
+"""Opt-in speed: run multilayer perceptrons as a few matrix products instead of module calls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TypeVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torch.distributions import Distribution
+from torch.nn import functional as F
+from torchrl.modules import MLP, ValueOperator
+
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss
+from torchrl_h2o.objectives.network_calls import NetworkCalls
+from torchrl_h2o.objectives.networks import GaussianParameters
+from torchrl_h2o.objectives.relu_perceptron import relu, relu_perceptron
+
+_ELEMENTWISE = (nn.ReLU, nn.Tanh, nn.ELU, nn.SiLU, nn.GELU, nn.Mish, nn.LeakyReLU, nn.Sigmoid, nn.Softplus, nn.Identity)
+_PLAIN = (TensorDictModule, ValueOperator)
+
+Path = tuple[str, ...]
+Module = TypeVar("Module", bound=nn.Module)
+
+
+def accelerate(module: Module) -> Module:
+    """Make every loss of this package inside a module run its perceptrons as plain matrix products.
+
+    Losses and gradients stay the same to rounding. Networks that are not perceptrons (convolutions, normalisation
+    layers, hooks) are still called as modules.
+
+    MEASURED_GAIN
+
+    Second derivatives (``create_graph=True``) are not available for networks with ReLU.
+
+    Args:
+        module: a loss, or any module that holds losses.
+
+    Returns:
+        The same module, changed in place.
+
+    Examples:
+        >>> from torchrl_h2o.objectives import ExpectileValueLoss, accelerate, make_value
+        >>> loss = accelerate(ExpectileValueLoss(make_value(observation_dim=3)))
+    """
+    for part in module.modules():
+        if isinstance(part, HybridLoss):
+            part.calls = PerceptronCalls()
+    return module
+
+
+class PerceptronCalls(NetworkCalls):
+    """Runs a perceptron, or an ensemble of them, as matrix products; any other network as a module."""
+
+    def outputs(
+        self,
+        network: TensorDictModuleBase,
+        tensordict: TensorDictBase,
+        params: TensorDictBase,
+        randomness: str = "error",
+        *,
+        frozen: bool = False,
+    ) -> TensorDictBase:
+        layers = _layers(network)
+        if layers is not None:
+            x = [tensordict.get(key) for key in network.in_keys]
+            outputs = _perceptron(layers, x[0] if len(x) == 1 else torch.cat(x, -1), params, frozen)
+            outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+            if len(outputs) == len(network.out_keys):
+                out = TensorDict({}, batch_size=(*params.batch_size, *tensordict.batch_size))
+                for key, value in zip(network.out_keys, outputs, strict=True):
+                    out.set(key, value)
+                return out
+        return super().outputs(network, tensordict, params, randomness, frozen=frozen)
+
+    def distribution(
+        self, network: ProbabilisticTensorDictSequential, tensordict: TensorDictBase, params: TensorDictBase
+    ) -> Distribution:
+        modules = getattr(network, "module", ())
+        if len(modules) == 2 and _layers(modules[0]) is not None:
+            return modules[1].get_dist(self.outputs(modules[0], tensordict, params.get(("module", "0"))))
+        return super().distribution(network, tensordict, params)
+
+
+def _layers(network: nn.Module) -> list[tuple[Path, nn.Module]] | None:
+    """The layers of a perceptron with the path to each one's parameters; None for any other network."""
+    several = len(network.in_keys) > 1
+    if type(network) not in _PLAIN or _is_hooked(network) or (several and type(network.module) is not MLP):
+        return None
+    layers = list(_flat(network.module, ("module",)))
+    plain = all(_is_plain(layer) for _, layer in layers) and any(type(layer) is nn.Linear for _, layer in layers)
+    return layers if plain else None
+
+
+def _flat(module: nn.Module, path: Path) -> Iterator[tuple[Path, nn.Module]]:
+    is_chain = type(module) is nn.Sequential or (type(module) is MLP and not module._reshape_out)
+    if is_chain and not _is_hooked(module):
+        for name, child in module.named_children():
+            yield from _flat(child, (*path, name))
+    else:
+        yield path, module
+
+
+def _is_plain(layer: nn.Module) -> bool:
+    """Whether a layer is linear, or acts on the last axis without parameters."""
+    if _is_hooked(layer):
+        return False
+    return type(layer) in (nn.Linear, *_ELEMENTWISE) or (
+        type(layer) is GaussianParameters and not any(True for _ in layer.parameters())
+    )
+
+
+def _is_hooked(module: nn.Module) -> bool:
+    return bool(module._forward_hooks or module._forward_pre_hooks)
+
+
+def _perceptron(
+    layers: list[tuple[Path, nn.Module]], x: Tensor, params: TensorDictBase, frozen: bool
+) -> Tensor | tuple[Tensor, ...]:
+    batch_size = x.shape[:-1]
+    x = x.reshape(-1, x.shape[-1])
+    compiling = torch.compiler.is_compiling()
+    layer_by_layer = compiling or torch.is_autocast_enabled(x.device.type)  # both must see each layer
+    depth = 0 if layer_by_layer else _depth_with_relu(layers)
+    if depth:
+        linear = [_weight_and_bias(params, path, frozen) for path, _ in layers[: 2 * depth - 1 : 2]]
+        x = relu_perceptron(x, *zip(*linear, strict=True))
+        layers = layers[2 * depth - 1 :]
+    for path, layer in layers:
+        if type(layer) is not nn.Linear:
+            x = relu(x) if compiling and type(layer) is nn.ReLU else layer(x)
+            continue
+        weight, bias = _weight_and_bias(params, path, frozen)
+        if weight.ndim == 2:
+            x = F.linear(x, weight, bias)
+        else:
+            x = x.expand(weight.shape[0], *x.shape[-2:])
+            x = torch.bmm(x, weight.mT) if bias is None else torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
+    if isinstance(x, tuple):
+        return tuple(part.reshape(*params.batch_size, *batch_size, part.shape[-1]) for part in x)
+    return x.reshape(*params.batch_size, *batch_size, x.shape[-1])
+
+
+def _depth_with_relu(layers: list[tuple[Path, nn.Module]]) -> int:
+    """Number of leading linear layers that have a bias and are separated by ReLU only."""
+    depth = 0
+    for index, (_, layer) in enumerate(layers):
+        if type(layer) is not (nn.ReLU if index % 2 else nn.Linear):
+            break
+        if not index % 2:
+            if layer.bias is None:
+                break
+            depth += 1
+    return depth
+
+
+def _weight_and_bias(params: TensorDictBase, path: Path, frozen: bool) -> tuple[Tensor, Tensor | None]:
+    own = params.get(path)
+    weight, bias = own.get("weight"), own.get("bias", None)
+    if frozen:
+        weight, bias = weight.detach(), None if bias is None else bias.detach()
+    return weight, bias

@@ -1,0 +1,55 @@
+"""Call networks whose parameters are held apart from them, as TorchRL's losses hold them."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch.distributions import Distribution
+from torchrl.objectives.utils import _vmap_func
+
+
+class NetworkCalls:
+    """TorchRL's way: the parameters are put into the module for one call, under ``vmap`` for an ensemble.
+
+    Every loss has one of these as its attribute ``calls``. :func:`~torchrl_h2o.objectives.accelerate` replaces it.
+    """
+
+    def outputs(
+        self,
+        network: TensorDictModuleBase,
+        tensordict: TensorDictBase,
+        params: TensorDictBase,
+        randomness: str = "error",
+        *,
+        frozen: bool = False,
+    ) -> TensorDictBase:
+        """Run a network on some parameters.
+
+        Args:
+            network: the module. Its own parameters are not read.
+            tensordict: inputs, ``[*B]``. Other entries are ignored.
+            params: parameters of one network, ``[]``, or of an ensemble, ``[N]``.
+            randomness: ``vmap``'s setting for an ensemble whose networks draw random numbers.
+            frozen: treat the parameters as constants, so that gradients reach the inputs only.
+
+        Returns:
+            A tensordict with the network's ``out_keys``, ``[*B]`` or ``[N, *B]``.
+        """
+        inputs, params = tensordict.select(*network.in_keys), params.detach() if frozen else params
+        if params.ndim:
+            return _vmap_func(network, (None, 0), randomness=randomness)(inputs, params)
+        with params.to_module(network, preserve_module_state=False):
+            return network(inputs)
+
+    def distribution(
+        self, network: ProbabilisticTensorDictSequential, tensordict: TensorDictBase, params: TensorDictBase
+    ) -> Distribution:
+        """Return a policy's distribution for some parameters.
+
+        Args:
+            network: the policy.
+            tensordict: inputs, ``[*B]``.
+            params: parameters, ``[]``.
+        """
+        with params.to_module(network, preserve_module_state=False):
+            return network.get_dist(tensordict.select(*network.in_keys))

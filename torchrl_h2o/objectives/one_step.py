@@ -1,0 +1,46 @@
+"""The discount of a one-step target, read from what TorchRL's ``make_value_estimator`` accepts."""
+
+from __future__ import annotations
+
+from torchrl.objectives import ValueEstimators
+from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
+
+ValueType = ValueEstimators | ValueEstimatorBase | type[ValueEstimatorBase] | None
+
+
+def one_step_discount(value_type: ValueType, hyperparams: dict, default: float) -> float:
+    """Return γ of a TD(0) estimator.
+
+    Args:
+        value_type: a ``ValueEstimators`` member, an estimator's class or instance, or None for TD(0).
+        hyperparams: ``gamma``; for a class, the arguments of its constructor.
+        default: γ if none is given.
+
+    Raises:
+        NotImplementedError: if the estimator is not TD(0): Eq. (7) has no other target.
+        ValueError: if a TD(0) estimator changes the rewards.
+        TypeError: for a hyperparameter that TD(0) does not have.
+    """
+    if isinstance(value_type, type) and issubclass(value_type, TD0Estimator):
+        value_type = value_type(**{"gamma": default, "value_network": None, **hyperparams})
+    if isinstance(value_type, TD0Estimator) and type(value_type).value_estimate is TD0Estimator.value_estimate:
+        if value_type.average_rewards:
+            raise ValueError(
+                "average_rewards=True standardises rewards batch by batch, which Eq. (7) does not: normalise the "
+                "rewards where they are stored, and pass average_rewards=False."
+            )
+        return float(value_type.gamma)
+    if value_type not in (None, ValueEstimators.TD0):
+        name = getattr(value_type, "__name__", None) or (
+            type(value_type).__name__ if isinstance(value_type, ValueEstimatorBase) else value_type
+        )
+        raise NotImplementedError(
+            f"Eq. (7) is a one-step target that mixes V(s') and Q(s', a'), so {name} does not apply: call "
+            "make_value_estimator(gamma=...). For n-step returns put MultiStepTransform into the replay buffer; the "
+            "loss reads its steps_to_next_obs."
+        )
+    hyperparams = {key: value for key, value in hyperparams.items() if key != "device"}
+    gamma = float(hyperparams.pop("gamma", default))
+    if hyperparams:
+        raise TypeError(f"TD0 takes gamma only, not {sorted(hyperparams)}.")
+    return gamma
