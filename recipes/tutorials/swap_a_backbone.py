@@ -2,7 +2,8 @@
 
 python recipes/tutorials/swap_a_backbone.py
 
-V(s) is fitted to Q(s, a) at the actions in the real data. How it weights positive and negative advantages is the backbone.
+V(s) is fitted to Q(s, a) at the actions in the real data. The backbone decides how positive and negative advantages
+are weighted.
 """
 
 # %% The task: Gymnasium's InvertedPendulum; the simulator has 1.5 times its gravity.
@@ -64,8 +65,8 @@ BACKBONES = {
 }
 
 
-# %% One training run. The backbone is one argument of H2OPlusLoss; nothing else depends on it. `mixing` is the weight of
-# V(s') in the target of Q, so the backbone matters more where it is larger.
+# %% One training run. The backbone is one argument of H2OPlusLoss; nothing else depends on it. `mixing` is the weight
+# of V(s') in the target of Q, so the backbone matters more where it is larger.
 def train(backbone):
     torch.manual_seed(0)
     simulator, widths = make_env(gravity=1.5), (64, 64)

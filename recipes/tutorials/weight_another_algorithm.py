@@ -52,7 +52,8 @@ actor = make_actor(4, simulator.action_spec, (64, 64))
 sac = SACLoss(actor, make_qvalue(4, 1, (64, 64)), reduction="none", scalar_output_mode="exclude")
 sac.make_value_estimator(gamma=0.99)
 
-# %% The weight. Only the Bellman error needs it: the policy may be improved in any state. Rows marked `real` keep weight 1.
+# %% The weight. Only the Bellman error needs it: the policy may be improved in any state. Rows marked
+# `real` keep weight 1.
 loss = ImportanceWeightedLoss(sac, terms=["loss_qvalue"])
 
 # %% The ratio. Two discriminators, trained beside the algorithm, tell real from simulated transitions. One sees (s, a),
@@ -73,8 +74,8 @@ for steps in tqdm(Collector(simulator, actor, frames_per_batch=100, total_frames
         optimiser.step()
         targets.step()
 
-# %% The result: what the simulated rows weighed at the end, and what the policy does in reality. A small weight means that
-# the discriminators hardly mistake the simulator for reality; then the algorithm learns mostly from the real data.
+# %% The result: what the simulated rows weighed at the end, and what the policy does in reality. A small weight means
+# that the discriminators hardly mistake the simulator for reality; then the algorithm learns mostly from the real data.
 with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
     returns = [reality.rollout(1000, actor)["next", "reward"].sum().item() for _ in range(5)]
 print(f"mean weight of simulated rows {batch['dynamics_ratio'][~batch['real']].mean():.2f}")

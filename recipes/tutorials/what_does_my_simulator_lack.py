@@ -34,7 +34,8 @@ folder.mkdir(parents=True, exist_ok=True)
 """)
 
 # %% The log. Yours comes from your robot; here a pendulum with more damping (0.1 N·m·s/rad) is driven by random torques
-# and sampled every 10 ms. Torques that vary, and motions that cover the range of interest, make effects distinguishable.
+# and sampled every 10 ms. Torques that vary, and motions that cover the range of interest, help to tell effects
+# apart.
 observed = ["pivot", "pivot_velocity"]  # a joint's name is its position; the suffix _velocity its velocity
 robot = Simulation.from_mjcf(folder / "pendulum.xml", observed, 0.01, [JointDamping(0.1, joints="pivot")])
 torque = np.repeat(np.random.default_rng(0).uniform(-2.0, 2.0, 80), 10)[:, None]
