@@ -13,7 +13,6 @@ import platform
 from collections.abc import Callable
 from pathlib import Path
 
-import h2o_plus
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -25,6 +24,7 @@ import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.learner import Learner
+from torchrl_h2o.training.methods import h2o_plus
 from torchrl_h2o.training.populations import PopulationReplay
 from torchrl_h2o.training.populations.learner import PopulationLearner
 

@@ -23,7 +23,7 @@ class Excitation:
     Args:
         bound: of the actions, (nu).
         strongest: standard deviation of the strongest burst, in bounds of the action.
-        brake: feedback gains (nu, n) from the observation, subtracted from the action, that limit the speed of joints with
+        brake: feedback gains (nu, n) from the observation, subtracted from the action to limit the speed of joints with
             little friction; None for none.
     """
 

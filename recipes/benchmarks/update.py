@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import h2o_plus
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -27,7 +26,7 @@ from turns import calls_per_second
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.compiling import compiled
-from torchrl_h2o.training.methods import rlpd, sac
+from torchrl_h2o.training.methods import h2o_plus, rlpd, sac
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
 
