@@ -1,4 +1,4 @@
-"""A case of the benchmark: what is simulated, what was measured, what is true, and what it takes to pass."""
+"""A case of the benchmark: simulator, measured data, true effects and pass criterion."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ TRANSITIONS = 5000
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One case. The code under test is given the simulation and the data, and nothing else.
+    """One case. The code under test receives only the simulation and the data.
 
     Args:
         name: of the case within its family.
         system: a name of :data:`~systems.SYSTEMS`.
-        judge: from a report and the case to what was reached, by name; ``ok`` is whether it passed.
-        truth: the effects that mend the simulator.
+        judge: maps a report and the case to scores by name; ``ok`` is whether the case passed.
+        truth: the effects that correct the simulator.
         in_simulator: effects of the simulator.
-        in_reality: effects of what is measured.
+        in_reality: effects of the measured system.
         noise: of the sensors, as a share of each signal's standard deviation.
         seed: of the recording.
-        transitions: how many are recorded.
-        episode: steps after which the system starts anew.
-        held_out: share of the data that no fit sees.
+        transitions: number of recorded transitions.
+        episode: steps until a reset.
+        held_out: fraction of the data excluded from fits.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Case:
     held_out: float = 0.3
 
     def simulation(self) -> Simulation:
-        """The imperfect simulator."""
+        """Build the imperfect simulator."""
         return Simulation.from_env(SYSTEMS[self.system].env(self.in_simulator))
 
     def measure(self) -> TensorDict:
-        """The data, TED ``(transitions,)``."""
+        """Record the data, TED ``(transitions,)``."""
         system = SYSTEMS[self.system]
         return system.record(self.in_reality, self.transitions, self.seed, noise=self.noise, episode=self.episode)
 
@@ -61,13 +61,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Family:
-    """A line of the benchmark's table.
+    """One line of the benchmark's table.
 
     Args:
-        draw: makes the case of a number, of a random generator that is that case's own.
-        size: how many cases it has.
-        asked: how many of them are to pass.
-        what: what is asked of each, in words.
+        draw: makes a case from its number and its own random generator.
+        size: number of cases.
+        asked: number of cases that should pass.
+        what: pass criterion, in words.
     """
 
     draw: Callable[[int, np.random.Generator], Case]
@@ -77,6 +77,6 @@ class Family:
 
 
 def draw_case(families: Mapping[str, Family], family: str, number: int, seed: int) -> Case:
-    """The case of a family and a number; the same seed draws the same truth, whatever else is drawn."""
+    """Draw a case by family and number; the result depends only on these and the seed."""
     stream = np.random.SeedSequence((seed, sorted(families).index(family), number))
     return families[family].draw(number, np.random.default_rng(stream))

@@ -1,11 +1,11 @@
-"""Measures how often close_the_loop finds the truth, blind: effects are drawn, it sees a simulator and data.
+"""Measures how often close_the_loop finds randomly drawn effects from a simulator and data.
 
 python recipes/benchmarks/close_the_loop.py                                    # the whole table, some hours
 python recipes/benchmarks/close_the_loop.py cases=[paper16,nothing] draws=3
 python recipes/benchmarks/close_the_loop.py cases=[several] numbers=[7]        # one case again
 python recipes/benchmarks/close_the_loop.py logs=path/to/logs                  # with the two real robots
 
-Leaves results.json, results.csv (a row a case) and each case's report.html in the run's folder.
+Writes results.json, results.csv (one row a case) and each case's report.html to the run's folder.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ from running import Job, run_all
 from speed import steps_per_second
 from systems import SYSTEMS
 
-import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.residuals import Simulation, close_the_loop
 
 

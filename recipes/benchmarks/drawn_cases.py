@@ -1,4 +1,4 @@
-"""Cases that are drawn: several effects of the catalogue, one that no catalogue holds, none at all, and a decoy."""
+"""Randomly drawn cases: several catalogue effects, one outside the catalogue, no effect, and an ambiguous pair."""
 
 import dataclasses
 import math
@@ -24,15 +24,15 @@ SYSTEMS_OF_SEVERAL = ("HalfCheetah", "Hopper", "pendulum", "wheel_legged")
 SYSTEMS_OF_NOTHING = (*SYSTEMS_OF_SEVERAL, "Walker2d")
 SYSTEMS_OF_UNDECLARED = (("pendulum", ("pivot",)), ("HalfCheetah", ("bthigh", "bshin", "fthigh", "fshin")))
 UNDECLARED = (TorqueRipple, CubicWind, MovingSpring, LateForce, PlaceFriction)
-VISIBLE = (0.05, 1.0)  # what an effect does in one step, as a share of the state's change in one
-LOOKED_AT = 500  # transitions of the plain system, to see what an effect does
+VISIBLE = (0.05, 1.0)  # bounds of an effect's one-step change, as a fraction of the state's one-step change
+LOOKED_AT = 500  # transitions used to measure an effect's size
 TRIES = 200
 EXPLAINABLE = 0.95  # of the error above the floor, of declared effects
 EXPLAINABLE_UNDECLARED = 0.8
 
 
 def visibility(effect: Effect, simulation: Simulation, measured: Measured) -> float:
-    """What an effect changes of one step, as a share of the state's change in one: of the dimension that it moves most.
+    """Size of an effect: its one-step change over the state's one-step change, in the dimension with the largest ratio.
 
     Args:
         effect: the effect.
@@ -52,18 +52,18 @@ def _size(values: np.ndarray) -> np.ndarray:
 def is_visible(effect: Effect, simulation: Simulation, measured: Measured) -> bool:
     try:
         return VISIBLE[0] <= visibility(effect, simulation, measured) <= VISIBLE[1]
-    except ValueError:  # an effect that this model cannot have
+    except ValueError:  # the model does not support this effect
         return False
 
 
 def plain(system: str, seed: int) -> tuple[Simulation, Measured]:
-    """A system without effects, and some transitions of it."""
+    """A system without effects, and transitions recorded from it."""
     simulation = Simulation.from_env(SYSTEMS[system].env())
     return simulation, Measured.from_ted(SYSTEMS[system].record((), LOOKED_AT, seed), simulation)
 
 
 def several(number: int, rng: np.random.Generator) -> Case:
-    """Two or three effects of the catalogue, of different classes, each of which can be seen."""
+    """Draw two or three visible catalogue effects of different classes."""
     system = SYSTEMS_OF_SEVERAL[number % len(SYSTEMS_OF_SEVERAL)]
     simulation, measured = plain(system, int(rng.integers(2**31)))
     entries = simulation.catalogue()
@@ -89,7 +89,7 @@ def several(number: int, rng: np.random.Generator) -> Case:
 
 
 def drawn_effect(entry: CatalogueEntry, rng: np.random.Generator) -> Effect | None:
-    """An entry of the catalogue at a value of half to one and a half times the way to one of its trials."""
+    """Draw a catalogue entry with a value 0.5 to 1.5 times as far from neutral as one of its trial values."""
     trial = entry.trials[rng.integers(len(entry.trials))]
     neutral = {name: entry.effect.parameters[name].neutral for name in trial}
     share = rng.uniform(0.5, 1.5)
@@ -104,7 +104,7 @@ def drawn_effect(entry: CatalogueEntry, rng: np.random.Generator) -> Effect | No
 
 
 def judge_several(report: Report, case: Case) -> dict:
-    """The exact set, or its groups, and the error that can be explained is gone."""
+    """Passed if the exact set (or its groups) is found and the explainable error is removed."""
     simulation = case.simulation()
     gone = reduction(report, _floor(report))
     return {
@@ -119,7 +119,7 @@ def _floor(report: Report) -> float:
 
 
 def undeclared(number: int, rng: np.random.Generator) -> Case:
-    """One effect that no catalogue holds, on one joint of a system that is never reset: two draws of each kind."""
+    """Draw one effect outside the catalogue, on one joint of a system that is never reset; two draws of each kind."""
     kind = UNDECLARED[number % len(UNDECLARED)]
     system, joints = SYSTEMS_OF_UNDECLARED[number // len(UNDECLARED) % len(SYSTEMS_OF_UNDECLARED)]
     simulation, measured = plain(system, int(rng.integers(2**31)))
@@ -145,7 +145,7 @@ def undeclared(number: int, rng: np.random.Generator) -> Case:
 def drawn_undeclared(
     kind: type[Effect], joint: str, simulation: Simulation, measured: Measured, rng: np.random.Generator
 ) -> Effect:
-    """A kind of undeclared effect, sized by what the joint's motor can do and by how the joint moves."""
+    """Draw an undeclared effect, scaled to the joint's motor torque and motion."""
     model, names = simulation.model, simulation.state_map.names
     motor = next(i for i in range(model.nu) if model.actuator_trnid[i, 0] == model.joint(joint).id)
     strongest = model.actuator_gear[motor, 0] * model.actuator_ctrlrange[motor, 1]
@@ -165,13 +165,13 @@ def drawn_undeclared(
 
 
 def judge_undeclared(report: Report, case: Case) -> dict:
-    """Marked undeclared; the data have no noise, so that all of the residual can be explained."""
+    """Passed if the effect is marked undeclared and the error is removed; the data are noise-free."""
     gone = reduction(report)
     return {"ok": is_marked_undeclared(report) and gone >= EXPLAINABLE_UNDECLARED, "reduction": gone}
 
 
 def nothing(number: int, rng: np.random.Generator) -> Case:
-    """No effect: the simulator is right, the sensors are noisy."""
+    """No effect: a correct simulator and noisy sensors."""
     system = SYSTEMS_OF_NOTHING[number % len(SYSTEMS_OF_NOTHING)]
     return Case(
         name=f"{system} {number}",
@@ -183,7 +183,7 @@ def nothing(number: int, rng: np.random.Generator) -> Case:
 
 
 def decoy(number: int, rng: np.random.Generator) -> Case:
-    """A heavier arm or a weaker motor: without friction, m l² q̈ = u - m g l sin q shows their ratio alone."""
+    """A heavier arm or a weaker motor: without friction, m l² q̈ = u - m g l sin q identifies only their ratio."""
     scale = float(rng.uniform(1.25, 2.0)) ** float(rng.choice([-1, 1]))
     mass, gain = BodyMass(scale, bodies="arm"), ActionGain(1.0 / scale, actuators=0)
     true = mass if number % 2 == 0 else gain

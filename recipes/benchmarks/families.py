@@ -1,4 +1,4 @@
-"""The lines of the benchmark's table, by name."""
+"""The families of cases by name, one line of the benchmark's table each."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -22,16 +22,16 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 
 
 def all_families(logs: Path | None = None) -> dict[str, Family]:
-    """All families, with those of the real logs if their folder is given."""
+    """All families, including those of the real logs if their folder is given."""
     return {**FAMILIES, **(log_families(logs) if logs is not None else {})}
 
 
 def choose_families(names: Iterable[str], logs: Path | None = None) -> dict[str, Family]:
-    """The families of these names, and those of the real logs if their folder is given.
+    """Select families by name, and those of the real logs if their folder is given.
 
     Raises:
-        ValueError: for a name that there is not.
-        FileNotFoundError: if there is no such folder.
+        ValueError: for an unknown name.
+        FileNotFoundError: if the folder does not exist.
     """
     if logs is not None and not logs.is_dir():
         raise FileNotFoundError(f"logs={logs}: there is no such folder")
@@ -39,5 +39,5 @@ def choose_families(names: Iterable[str], logs: Path | None = None) -> dict[str,
     names = [*names, *(there.keys() - FAMILIES.keys())]
     for name in names:
         if name not in there:
-            raise ValueError(f"cases={name}: choose of {', '.join(there)}")
+            raise ValueError(f"cases={name}: choose from {', '.join(there)}")
     return {name: family for name, family in there.items() if name in names}

@@ -1,4 +1,4 @@
-"""The logs of two real robots, which are not part of this repository: where they are is an option."""
+"""Cases from the logs of two real robots; the option ``logs`` names their folder."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from torchrl_h2o.effects import ActionDelay, ActionLag, JointDamping, JointFrict
 from torchrl_h2o.envs import WheelLeggedEnv
 from torchrl_h2o.residuals import Measured, Report, Simulation, residuals
 
-# RMSE 100 ms ahead of a direct linear predictor, in m/s, rad and rad/s, and what multiple of it is to be reached
+# RMSE 100 ms ahead of a direct linear predictor, in m/s, rad and rad/s, and the multiple of it to reach
 LINEAR_FLOOR = {"x_velocity": 0.067, "pitch": 0.021, "pitch_velocity": 0.27}
 TO_REACH = {"x_velocity": 1.2, "pitch": 1.7, "pitch_velocity": 1.45}
 AHEAD = 0.1  # s
@@ -24,7 +24,7 @@ CONTROL_STEP = 0.005  # s, of both logs
 
 @dataclass(frozen=True, kw_only=True)
 class LogCase(Case):
-    """A case whose data are a log.
+    """A case with a log as data.
 
     Args:
         path: of the log.
@@ -48,7 +48,7 @@ class LogCase(Case):
 
 
 def log_families(folder: Path) -> dict[str, Family]:
-    """The two lines of the table that stand on logs in a folder."""
+    """The two families of cases from logs in a folder."""
     wheel_legged = LogCase(
         name="standing_still",
         system="wheel_legged",
@@ -71,7 +71,7 @@ def log_families(folder: Path) -> dict[str, Family]:
 
 
 def judge_wheel_legged(report: Report, case: LogCase) -> dict:
-    """Late actuation of 10 to 20 ms, dry friction beside viscous, and the error 100 ms ahead."""
+    """Passed on actuation delay of 10 to 20 ms, dry and viscous friction, and the error 100 ms ahead."""
     ahead = _nearest_horizon(report)
     multiples = {name: ahead.get(name, np.inf) / floor for name, floor in LINEAR_FLOOR.items()}
     lateness = [_seconds(effect) for effect in report.effects if isinstance(effect, ActionDelay | ActionLag)]
@@ -89,14 +89,14 @@ def _seconds(effect: ActionDelay | ActionLag) -> float:
 
 
 def _nearest_horizon(report: Report) -> dict[str, float]:
-    """The error after mending by dimension, at the horizon that is nearest to 100 ms."""
+    """Error of the corrected simulator by dimension, at the horizon nearest to 100 ms."""
     if report.error is None or not report.error.horizons:
         return {}
     return dict(min(report.error.horizons, key=lambda horizon: abs(horizon.seconds - AHEAD)).after)
 
 
 def judge_pendulum(report: Report, case: LogCase) -> dict:
-    """Coulomb friction named, pushes set aside, the median error of a window halved on the second half."""
+    """Passed if Coulomb friction is named, pushes are excluded, and the median window error is halved."""
     simulation = case.simulation()
     measured = Measured.from_ted(case.measure(), simulation, held_out=case.held_out)
     before = median_window_error(simulation, measured)
@@ -113,7 +113,7 @@ def judge_pendulum(report: Report, case: LogCase) -> dict:
 
 
 def median_window_error(simulation: Simulation, measured: Measured, seconds: float = WINDOW) -> float:
-    """The median over held-out windows of the angle's RMS error within a window, in rad."""
+    """Median over held-out windows of the angle's RMS error within a window, rad."""
     horizon = round(seconds / simulation.control_step)
     starts = measured.windows(horizon, horizon // 2, held_out=True)
     errors = residuals(simulation, measured, starts, horizon)[:, :, 0]

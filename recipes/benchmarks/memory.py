@@ -1,4 +1,4 @@
-"""How much memory this process holds, takes at its height, and may take. Linux, or a GPU."""
+"""Memory of this process: held, peak and available. Linux, or a GPU."""
 
 import ctypes
 import os
@@ -10,22 +10,22 @@ import torch
 
 
 def held(device: str) -> int:
-    """Bytes that cannot be given back: of the GPU, or this process's own, without the pages of mapped files."""
+    """Bytes in use: allocated on the GPU, or private to this process (without mapped files)."""
     if torch.device(device).type == "cuda":
         return torch.cuda.memory_allocated(device)
-    ctypes.CDLL(None).malloc_trim(0)  # what was freed goes back
+    ctypes.CDLL(None).malloc_trim(0)  # return freed memory to the system first
     return _of_this_process("RssAnon")
 
 
 def taken_by(call: Callable[[], object], device: str) -> int:
-    """Bytes that a call adds to what is held, at its height."""
+    """Peak bytes that a call adds to those in use."""
     before = held(device)
     if torch.device(device).type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         call()
         return torch.cuda.max_memory_allocated(device) - before
     before = _of_this_process("VmRSS")
-    Path("/proc/self/clear_refs").write_text("5")  # forget the height so far
+    Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     call()
     return _of_this_process("VmHWM") - before
 
@@ -36,10 +36,10 @@ def _of_this_process(entry: str) -> int:
 
 
 def room_in_memory() -> int:
-    """Bytes that a benchmark may take: half of what the machine has."""
+    """Bytes that a benchmark may allocate: half of the machine's memory."""
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
 
 
 def room_on_disk(folder: str | Path) -> int:
-    """Bytes that a benchmark may write: nine tenths of what is free."""
+    """Bytes that a benchmark may write: nine tenths of the free disk space."""
     return shutil.disk_usage(folder).free * 9 // 10

@@ -1,4 +1,4 @@
-"""The paper's sixteen gaps: the simulator has one, the data are of the unmodified task."""
+"""The paper's sixteen gaps: the simulator has a gap, the data come from the unmodified task."""
 
 import numpy as np
 from cases import Case, Family
@@ -20,16 +20,16 @@ from torchrl_h2o.residuals import Report
 
 GAPS = [(task, gap) for gap, entry in PAPER_GAPS.items() for task in entry.tasks]
 SENSOR_NOISE = 0.01
-WITHIN, NOISE_WITHIN = 0.02, 0.1  # of a parameter
-GONE = 0.99  # of the held-out one-step error
+WITHIN, NOISE_WITHIN = 0.02, 0.1  # relative error of a parameter
+GONE = 0.99  # reduction of the held-out one-step error
 
 
 def what_mends(gap: str) -> tuple[Effect, ...]:
-    """The effects that undo one of the paper's gaps."""
+    """The effects that undo a gap of the paper."""
     strength = PAPER_GAPS[gap].strength
-    if gap == "soft_feet":  # what is left of a spring of no stiffness cannot be scaled
+    if gap == "soft_feet":  # a spring of zero stiffness cannot be scaled back
         return JointSpring(120.0, joints="bfoot"), JointSpring(60.0, joints="ffoot")
-    if gap == "joint_noise":  # noise that the simulator has and reality has not
+    if gap == "joint_noise":  # only the simulator has noise
         return (ActionNoise(-strength),)
     made = {
         "gravity": lambda scale: Gravity(scale),
@@ -44,7 +44,7 @@ def what_mends(gap: str) -> tuple[Effect, ...]:
 
 
 def paper_case(number: int, rng: np.random.Generator, noise: float = 0.0) -> Case:
-    """One of the sixteen; the generator draws the recording alone."""
+    """One of the sixteen cases; only the recording is random."""
     task, gap = GAPS[number]
     return Case(
         name=f"{task} {gap}",
@@ -58,15 +58,15 @@ def paper_case(number: int, rng: np.random.Generator, noise: float = 0.0) -> Cas
 
 
 def judge_exactly(report: Report, case: Case) -> dict:
-    """Named first, with its value, and the error gone."""
+    """Passed if the effect is named first with its value and the error is removed."""
     scores = judge_named(report, case)
-    is_noise = isinstance(case.truth[0], ActionNoise)  # a distribution: it takes no error away
+    is_noise = isinstance(case.truth[0], ActionNoise)  # noise is a distribution, so correcting it removes no error
     right = scores["parameter_error"] <= (NOISE_WITHIN if is_noise else WITHIN)
     return scores | {"ok": scores["ok"] and right and (is_noise or scores["reduction"] >= GONE)}
 
 
 def judge_named(report: Report, case: Case) -> dict:
-    """Named first."""
+    """Passed if the effect is named first."""
     simulation = case.simulation()
     return {
         "ok": is_named_first(report, case.truth, simulation),

@@ -1,4 +1,4 @@
-"""The benchmark's pendulum, the smallest of its systems, as a Gymnasium task."""
+"""A pendulum as a Gymnasium task, the smallest system of the benchmark."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 MODEL_PATH = Path(__file__).with_name("pendulum.xml")
 CONTROL_STEP = 0.01  # s
 FRAME_SKIP = 4
-NO_REWARD = 0.0  # there is nothing to be learned here
+NO_REWARD = 0.0  # the benchmark trains no policy
 
 
 class PendulumEnv(MujocoEnv):

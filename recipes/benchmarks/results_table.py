@@ -1,4 +1,4 @@
-"""What the benchmark prints: reached beside asked, what failed, and how fast."""
+"""Prints the benchmark's results: cases passed and expected, failures and speed."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from cases import Family
 
 
 def table(families: Mapping[str, Family], rows: Sequence[dict]) -> str:
-    """A line a family: how many cases passed, how many are asked for, and what of each."""
+    """Format one line a family: cases passed, cases expected to pass, and the criterion."""
     lines = [f"{'cases':<18}{'reached':>10}{'asked':>10}  of each"]
     for name, family in families.items():
         passed = [row["ok"] for row in rows if row["family"] == name]
@@ -18,7 +18,7 @@ def table(families: Mapping[str, Family], rows: Sequence[dict]) -> str:
 
 
 def print_table(families: Mapping[str, Family], rows: Sequence[dict], directory: Path) -> None:
-    """The table, the cases that were missed, and where the rest lies."""
+    """Print the table, the failed cases and the paths of the result files."""
     print(f"\n{table(families, rows)}")
     missed = [row for row in rows if not row["ok"]]
     if missed:
@@ -30,7 +30,7 @@ def print_table(families: Mapping[str, Family], rows: Sequence[dict], directory:
 
 
 def print_speed(rows: Sequence[dict], rates: Mapping[str, float], processes: int) -> None:
-    """Control steps a second, in tracing and on their own, beside bare ``mujoco.rollout``."""
+    """Print control steps a second in tracing and in isolation, relative to ``mujoco.rollout``."""
     traced = [row for row in rows if row.get("system") == "HalfCheetah"]
     if traced:
         simulated = sum(row["steps"] for row in traced) / sum(row["simulating_s"] for row in traced)

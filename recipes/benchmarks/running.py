@@ -1,4 +1,4 @@
-"""Runs the cases of a benchmark, several at once; one that fails is a row that says so."""
+"""Runs the cases of a benchmark in parallel; a case that raises an error becomes a row with that error."""
 
 import csv
 import json
@@ -23,7 +23,7 @@ MEASURED = ("error_before", "error_after", "error_floor", "auc_before", "auc_aft
 
 @dataclass(frozen=True)
 class Job:
-    """One case to be run.
+    """One case to run.
 
     Args:
         family: its family.
@@ -41,14 +41,14 @@ class Job:
 
 
 def run_case(job: Job, trace: Callable[..., Report]) -> dict:
-    """Draws a case, measures, traces and judges it.
+    """Draw, measure, trace and judge a case.
 
     Args:
         job: the case.
         trace: the code under test.
 
     Returns:
-        What was true, what was found, and what that is worth.
+        The true effects, the effects found, and the scores.
     """
     torch.set_num_threads(1)
     case = draw_case(all_families(job.logs), job.family, job.number, job.seed)
@@ -78,11 +78,11 @@ def run_case(job: Job, trace: Callable[..., Report]) -> dict:
 
 
 def run_all(jobs: Sequence[Job], processes: int, trace: Callable[..., Report], *, progress: bool = True) -> list[dict]:
-    """Runs all cases, and saves what there is after each.
+    """Run all cases and save the results after each.
 
     Args:
         jobs: the cases.
-        processes: how many at once; 1 runs them in this process.
+        processes: number of worker processes; 1 runs the cases in this process.
         trace: the code under test.
         progress: whether to show a progress bar.
 
@@ -101,7 +101,7 @@ def run_all(jobs: Sequence[Job], processes: int, trace: Callable[..., Report], *
 
 
 def _outcomes(jobs: Sequence[Job], processes: int, trace: Callable[..., Report]):
-    """Each job with a function that returns its row, or raises what went wrong, as they come in."""
+    """Yield each finished job with a function that returns its row or raises its error."""
     if processes == 1:
         for job in jobs:
             yield job, lambda job=job: run_case(job, trace)
@@ -116,14 +116,14 @@ def _outcomes(jobs: Sequence[Job], processes: int, trace: Callable[..., Report])
 def _row(job: Job, outcome: Callable[[], dict]) -> dict:
     try:
         return outcome()
-    except Exception as error:  # whatever it is, the other cases go on
+    except Exception as error:  # a failed case must not end the others
         failure = "".join(traceback.format_exception(error))
         found = f"failed: {type(error).__name__}: {error}"
         return {"family": job.family, "number": job.number, "ok": False, "found": found, "traceback": failure}
 
 
 def save_rows(rows: Sequence[dict], directory: Path) -> None:
-    """results.json with all that is known, results.csv with what fits into a table."""
+    """Write results.json (all fields) and results.csv (the columns of a table)."""
     directory.mkdir(parents=True, exist_ok=True)
     (directory / "results.json").write_text(json.dumps(rows, indent=1, default=float, ensure_ascii=False) + "\n")
     with open(directory / "results.csv", "w", newline="", encoding="utf-8") as file:

@@ -1,11 +1,11 @@
-"""Measures how the cost of an update grows: seconds and memory against buffer, batch, width and population.
+"""Measures the cost of an update: seconds and memory against buffer, batch, width and population.
 
 python recipes/benchmarks/scaling.py                       # three minutes; up to ten million transitions
 python recipes/benchmarks/scaling.py buffer_sizes=[100_000,100_000_000] scratch=/data
 python recipes/benchmarks/scaling.py device=cuda
 
-One thing grows at a time. Contenders take turns. Memory-mapped buffers are removed in the end; one that does not fit is
-left out, with a note. Leaves scaling.json and scaling.png in the run's folder.
+One factor varies at a time, and configurations take turns. Memory-mapped buffers are removed at the end; a buffer that
+does not fit is skipped with a message. Writes scaling.json and scaling.png to the run's folder.
 """
 
 import json
@@ -15,37 +15,37 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import h2o_plus
 import hydra
 import torch
+from cost_figure import draw_scaling
 from hydra.core.hydra_config import HydraConfig
 from memory import held, room_in_memory, room_on_disk, taken_by
 from omegaconf import DictConfig, OmegaConf
 from population import make_population
-from scaling_figure import draw_scaling
 from tensordict import TensorDict
 from tqdm import tqdm
 from turns import calls_per_second
 from update import action_spec, recipe_on, some_transitions
 
-import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.learner import Learner
+from torchrl_h2o.training.methods import h2o_plus
 from torchrl_h2o.training.populations.learner import PopulationLearner
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What an update costs.
+    """Cost of an update.
 
     Args:
-        grows: buffer, batch (rows of a stream), width (of a hidden layer) or population (runs).
-        size: of what grows.
-        storage: where simulated transitions are.
-        memory: bytes that a buffer holds, without mapped files; of what else grows, what a first update takes at its
-            height: gradients, the optimiser's state, activations.
-        seconds_per_update: sampling included.
-        seconds_per_sample: of all batches of an update.
+        grows: the factor: buffer, batch (rows of a stream), width (of a hidden layer) or population (runs).
+        size: value of the factor.
+        storage: of the simulated transitions.
+        memory: bytes of a buffer without mapped files; for other factors the peak of the first update (gradients,
+            optimiser state, activations).
+        seconds_per_update: including sampling.
+        seconds_per_sample: for all batches of an update.
     """
 
     grows: str
@@ -60,7 +60,7 @@ class Cost:
 
 
 def fill(real: TensorDict, size: int, device: str, folder: str | None = None) -> HybridReplayBuffer:
-    """A buffer with so many simulated transitions, written piece by piece, in memory or in files of a folder."""
+    """Fill a buffer with ``size`` simulated transitions, in memory or in files of a folder."""
     replay = HybridReplayBuffer(real, size, device=device, scratch_dir=folder)
     for first in range(0, size, len(real)):
         replay.extend(real[: size - first])
@@ -68,12 +68,12 @@ def fill(real: TensorDict, size: int, device: str, folder: str | None = None) ->
 
 
 def make_learner(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, **constants: object) -> Learner:
-    """H2O+ with the recipe's own constants, or these."""
+    """H2O+ with the recipe's constants, overridden by ``constants``."""
     return h2o_plus.make_learner(OmegaConf.merge(run, constants), cfg.observation_dim, action_spec(cfg), replay)
 
 
 def larger_buffers(cfg: DictConfig, run: DictConfig, real: TensorDict, scratch: str) -> Iterator[tuple[Cost, Learner]]:
-    """Learners on buffers that grow, each in memory and in files."""
+    """Learners on buffers of increasing size, each in memory and in files."""
     rows = real.select("observation", "action", "next")
     each = sum(value.nbytes for value in rows.values(True, True)) // len(rows)
     on_gpu = torch.device(cfg.device).type == "cuda"
@@ -81,7 +81,9 @@ def larger_buffers(cfg: DictConfig, run: DictConfig, real: TensorDict, scratch: 
         rooms = {"in memory": room_in_memory()} | ({} if on_gpu else {"memory-mapped": room_on_disk(scratch)})
         for storage, room in rooms.items():
             if size * each > room:
-                tqdm.write(f"left out: {size:,} transitions {storage} take {size * each:,} bytes, there are {room:,}")
+                tqdm.write(
+                    f"skipped: {size:,} transitions {storage} need {size * each:,} bytes, {room:,} are available"
+                )
                 continue
             before = held(cfg.device)
             folder = f"{scratch}/{size}" if storage == "memory-mapped" else None
@@ -90,9 +92,9 @@ def larger_buffers(cfg: DictConfig, run: DictConfig, real: TensorDict, scratch: 
 
 
 def larger_learners(cfg: DictConfig, run: DictConfig, real: TensorDict) -> Iterator[tuple[Cost, Learner]]:
-    """Learners with batches, or networks, that grow, on one buffer."""
+    """Learners with increasing batches or networks, on one buffer."""
     replay = fill(real, cfg.transitions, cfg.device)
-    make_learner(cfg, run, replay).update()  # takes what only a process's first one does
+    make_learner(cfg, run, replay).update()  # one-time allocations of the process
     batches = {size: {"batch_size": [size] * 2, "discriminator_batch_size": [2 * size] * 2} for size in cfg.batch_sizes}
     widths = {width: {"num_cells": [width] * 2} for width in cfg.widths}
     for grows, choices in {"batch": batches, "width": widths}.items():
@@ -102,14 +104,14 @@ def larger_learners(cfg: DictConfig, run: DictConfig, real: TensorDict) -> Itera
 
 
 def larger_populations(cfg: DictConfig, run: DictConfig) -> Iterator[tuple[Cost, PopulationLearner]]:
-    """Populations that grow, each member with a buffer of its own."""
+    """Populations of increasing size, each member with its own buffer."""
     for size in cfg.populations:
         learner = make_population(cfg, run, size)
         yield Cost("population", size, "in memory", taken_by(learner.update, cfg.device)), learner
 
 
 def measure(cfg: DictConfig, run: DictConfig, scratch: str) -> list[Cost]:
-    """Seconds and memory of each contender."""
+    """Seconds and memory of each configuration."""
     real = some_transitions(cfg)
     contenders = [
         *larger_buffers(cfg, run, real, scratch),

@@ -1,4 +1,4 @@
-"""How a report is scored against the truth: small questions, each with a plain answer."""
+"""Scores a report against the true effects."""
 
 import dataclasses
 import math
@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals import Report, Simulation
 
-TINY = 1e-9  # a value so small is a rounded zero, of which nothing is a share
+TINY = 1e-9  # values below this are rounded zeros, for which relative errors are undefined
 
 
 def elements(effect: Effect, simulation: Simulation) -> frozenset:
-    """The names or indices of what an effect acts on; empty for one that acts on the world.
+    """Names or indices of the elements an effect acts on; empty for effects on the whole model.
 
     Two effects that select the same elements by other patterns are the same.
     """
@@ -28,40 +28,40 @@ def elements(effect: Effect, simulation: Simulation) -> frozenset:
 
 
 def part_of(effect: Effect, truth: Effect, simulation: Simulation) -> bool:
-    """Whether an effect is the true one, on all of its elements or on some."""
+    """Whether an effect equals a true one on all or some of its elements."""
     return type(effect) is type(truth) and elements(effect, simulation) <= elements(truth, simulation)
 
 
 def is_named_first(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
-    """Whether the first effect found is one of the true ones, or stands in one group with it."""
+    """Whether the first effect found is a true one or in one group with a true one."""
     if not report.found:
         return False
     return any(part_of(e, true, simulation) for e in _alternatives(report, report.effects[0]) for true in truth)
 
 
 def is_exact_set(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
-    """Whether all true effects were found, each itself or by its group, and no other."""
+    """Whether exactly the true effects were found, each directly or through its group."""
     found = [_alternatives(report, effect) for effect in report.effects]
     no_other = all(any(part_of(e, true, simulation) for e in group for true in truth) for group in found)
     return no_other and all(_is_found(true, found, simulation) for true in truth)
 
 
 def _is_found(true: Effect, found: Sequence[Sequence[Effect]], simulation: Simulation) -> bool:
-    """Whether the found effects cover all elements of a true one: one of them does, or several together."""
+    """Whether one or several found effects together cover all elements of a true one."""
     parts = [[elements(e, simulation) for e in group if part_of(e, true, simulation)] for group in found]
     parts = [max(group, key=len) for group in parts if group]
     return bool(parts) and frozenset().union(*parts) == elements(true, simulation)
 
 
 def _alternatives(report: Report, effect: Effect) -> list[Effect]:
-    """An effect that was found, and those that the data cannot tell from it."""
+    """An effect found, and those indistinguishable from it."""
     groups = [group.effects for group in report.indistinguishable if effect in group.effects]
     return [effect, *(other for group in groups for other in group if other != effect)]
 
 
 def parameter_error(report: Report, truth: Sequence[Effect], simulation: Simulation) -> float:
-    """The largest relative error of a parameter of the true effects; infinite if one was not found."""
-    # what stands in a group has a value of its own, fitted in the place of the one that was put in
+    """Largest relative error of a parameter of the true effects; infinite if an effect was not found."""
+    # members of a group have values of their own, each fitted in place of the chosen effect
     in_groups = [e for effect in report.effects for e in _alternatives(report, effect)]
     errors = []
     for true in truth:
@@ -77,23 +77,23 @@ def _relative_error(effect: Effect, true: Effect) -> float:
 
 
 def reduction(report: Report, floor: float = 0.0) -> float:
-    """The share of the held-out error that is gone, of what lies above a floor; NaN where nothing was measured."""
+    """Fraction of the held-out error above the floor that was removed; NaN without a measured error."""
     if report.error is None or not report.error.before > floor:
         return math.nan
     return (report.error.before - report.error.after) / (report.error.before - floor)
 
 
 def is_marked_undeclared(report: Report) -> bool:
-    """Whether the report holds an effect that no catalogue entry is."""
+    """Whether the report contains an effect outside the catalogue."""
     return any(not found.declared for found in report.found)
 
 
 def says_nothing_is_missing(report: Report) -> bool:
-    """Whether the report concludes that nothing is missing; to conclude nothing is not that."""
+    """Whether the report concludes that nothing is missing; a report without a conclusion does not."""
     return not report.found and report.conclusion is None
 
 
 def is_reported_as_group(report: Report, alike: Sequence[Effect]) -> bool:
-    """Whether effects of all these classes stand in one group."""
+    """Whether effects of all these classes are in one group."""
     classes = {type(effect) for effect in alike}
     return any(classes <= {type(effect) for effect in group.effects} for group in report.indistinguishable)

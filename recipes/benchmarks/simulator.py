@@ -1,4 +1,4 @@
-"""Measures simulated steps a second: one world at a time, many at once, and what ``mujoco.rollout`` alone makes.
+"""Measures simulated steps a second: one world, many worlds at once, and ``mujoco.rollout`` alone.
 
 python recipes/benchmarks/simulator.py                     # a minute or two
 python recipes/benchmarks/simulator.py task=wheel_legged worlds=[64]
@@ -26,11 +26,11 @@ from torchrl.envs import EnvBase, GymEnv
 from torchrl.envs.utils import step_mdp
 from turns import calls_per_second
 
-import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.envs import BatchedMujocoEnv, WheelLeggedEnv
 
-AHEAD = 20  # control steps of one bare rollout
-EPISODE = 1000  # control steps of the env's way
+AHEAD = 20  # control steps of one call of mujoco.rollout
+EPISODE = 1000  # control steps of the recorded trajectory
 
 
 def make(cfg: DictConfig) -> EnvBase:
@@ -38,7 +38,7 @@ def make(cfg: DictConfig) -> EnvBase:
 
 
 def begin(env: EnvBase) -> tuple[TensorDict, torch.Tensor]:
-    """Where an env begins, and the actions of all its steps; the same for envs of the same task and size."""
+    """Initial state and actions of an env; equal for envs of the same task and size."""
     torch.manual_seed(0)
     env.set_seed(0)
     td = env.reset()
@@ -46,7 +46,7 @@ def begin(env: EnvBase) -> tuple[TensorDict, torch.Tensor]:
 
 
 def stepping(env: EnvBase) -> Callable[[], object]:
-    """One step of an env after another, worlds that end being reset."""
+    """Step an env repeatedly, resetting worlds that end."""
     td, action = begin(env)
 
     def step() -> None:
@@ -57,7 +57,7 @@ def stepping(env: EnvBase) -> Callable[[], object]:
 
 
 def gymnasium_stepping(env: EnvBase) -> Callable[[], object]:
-    """Gymnasium's own loop."""
+    """Step a Gymnasium env without TorchRL."""
     task = env._env
     task.reset(seed=0)
     action = 0.1 * task.action_space.sample()
@@ -71,7 +71,7 @@ def gymnasium_stepping(env: EnvBase) -> Callable[[], object]:
 
 
 def bare_rollout(env: BatchedMujocoEnv, threads: int) -> Callable[[], object]:
-    """``mujoco.rollout`` along an env's way, a piece at a time."""
+    """Call ``mujoco.rollout`` along an env's trajectory, ``AHEAD`` steps at a time."""
     _, action = begin(env)
     step, starts = stepping(env), []
     for number in range(EPISODE):

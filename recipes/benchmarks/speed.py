@@ -1,4 +1,4 @@
-"""How fast states are simulated: in tracing, and by the library beside bare ``mujoco.rollout`` on the same states."""
+"""Simulation speed: in tracing, and of the library compared with ``mujoco.rollout`` on the same states."""
 
 import dataclasses
 import time
@@ -17,7 +17,7 @@ BATCH, HORIZON = 4096, 20
 
 @dataclass
 class Count:
-    """Control steps that were simulated, and the seconds that this took."""
+    """Number of simulated control steps and the seconds they took."""
 
     steps: int = 0
     seconds: float = 0.0
@@ -25,13 +25,13 @@ class Count:
 
 @dataclass(frozen=True, eq=False)
 class CountingSimulation(Simulation):
-    """A simulation that counts what it and those made of it, with more effects, are asked to simulate."""
+    """A simulation that counts its control steps and those of simulations derived from it."""
 
     count: Count = field(default_factory=Count)
 
     @classmethod
     def of(cls, simulation: Simulation) -> "CountingSimulation":
-        """The same simulation, counting from zero."""
+        """Wrap a simulation, counting from zero."""
         return cls(**{part.name: getattr(simulation, part.name) for part in dataclasses.fields(simulation)})
 
     def rollout(self, states: np.ndarray, actions: np.ndarray, **options: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ class CountingSimulation(Simulation):
 
 
 def steps_per_second(simulation: Simulation, seed: int = 0) -> dict[str, float]:
-    """Control steps a second of the library and of ``mujoco.rollout`` alone, the better of two tries each."""
+    """Control steps a second of the library and of ``mujoco.rollout``, the better of two measurements each."""
     model = simulation.model
     rng = np.random.default_rng(seed)
     states = simulation.state_map.offset + 0.01 * rng.standard_normal((BATCH, model.nq + model.nv))

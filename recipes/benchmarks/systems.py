@@ -1,4 +1,4 @@
-"""The systems of the benchmark: how their envs are made, what moves them, and how they are measured."""
+"""The systems of the benchmark: their envs, excitation policies and sensors."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -18,16 +18,16 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 
 class Excitation:
-    """Smooth random actions: an Ornstein-Uhlenbeck process whose strength and mean change in bursts.
+    """Smooth random actions from an Ornstein-Uhlenbeck process whose scale and mean change at random times.
 
     Args:
         bound: of the actions, (nu).
         strongest: standard deviation of the strongest burst, in bounds of the action.
-        brake: feedback from the observation (n) against each action, (nu, n), that keeps joints with little friction
-            from ever faster turns; None for none.
+        brake: feedback gains (nu, n) from the observation, subtracted from the action to limit the speed of joints with
+            little friction; None for none.
     """
 
-    memory = math.exp(-1 / 5)  # of the process, from one control step to the next
+    memory = math.exp(-1 / 5)  # correlation between consecutive control steps
     burst = 50  # steps, on average
     weakest = 0.2  # standard deviation, in bounds of the action
 
@@ -50,12 +50,12 @@ class Excitation:
 
 @dataclass(frozen=True)
 class System:
-    """A system that data are recorded of.
+    """A system to record data from.
 
     Args:
-        make: makes its env; an episode has at most so many steps.
-        policy: makes what moves it.
-        sensor_limit: the largest velocity that is reported; what is there stays there under noise.
+        make: builds its env from the maximum number of steps of an episode.
+        policy: builds the excitation policy.
+        sensor_limit: largest velocity that sensors report; saturated readings stay saturated under noise.
     """
 
     make: Callable[[int], EnvBase]
@@ -63,20 +63,20 @@ class System:
     sensor_limit: float = math.inf
 
     def env(self, effects: Sequence[Effect] = (), episode: int = 500) -> EnvBase:
-        """The env with effects in it, and with episodes of at most so many steps."""
+        """Build the env with effects and episodes of at most ``episode`` steps."""
         return TransformedEnv(self.make(episode), DynamicsGap(*effects))
 
     def record(
         self, effects: Sequence[Effect], transitions: int, seed: int, *, noise: float = 0.0, episode: int = 500
     ) -> TensorDict:
-        """Measures the system with effects in it.
+        """Record the system with effects.
 
         Args:
             effects: those of reality.
-            transitions: how many.
-            seed: of env, policy and noise.
+            transitions: number of transitions.
+            seed: for env, policy and noise.
             noise: standard deviation of every sensor's noise, as a share of the signal's own.
-            episode: steps after which the system starts anew.
+            episode: steps until a reset.
 
         Returns:
             TED, ``(transitions,)``.
@@ -86,7 +86,7 @@ class System:
 
 
 def with_sensor_noise(data: TensorDict, share: float, seed: int, limit: float = math.inf) -> TensorDict:
-    """The data with noise on every observation, drawn once: what ends a row is what begins the next.
+    """Add noise to every observation; the end of a row and the start of the next get the same noise.
 
     Args:
         data: TED, ``(T,)``.
@@ -111,7 +111,7 @@ def with_sensor_noise(data: TensorDict, share: float, seed: int, limit: float = 
 
 def _measured(true: torch.Tensor, std: torch.Tensor, limit: float, generator: torch.Generator) -> torch.Tensor:
     noisy = true + std * torch.randn(true.shape, generator=generator)
-    # a sensor that is at its end stays there: how far beyond it the signal is, it does not know
+    # saturated sensors stay saturated: they do not show how far the signal exceeds the limit
     return torch.where(true.abs() >= limit, true, noisy.clamp(-limit, limit))
 
 
@@ -131,7 +131,7 @@ def _gymnasium(
 
 
 def _braked_joints(actions: int, observations: int, brake: float) -> torch.Tensor:
-    """Feedback from each joint's velocity to its own motor, where these velocities are the last observations."""
+    """Gains from each joint's velocity to its motor; the velocities are the last observations."""
     gains = torch.zeros(actions, observations)
     gains[:, observations - actions :] = brake * torch.eye(actions)
     return gains
@@ -140,7 +140,8 @@ def _braked_joints(actions: int, observations: int, brake: float) -> torch.Tenso
 SYSTEMS: Mapping[str, System] = MappingProxyType(
     {
         "HalfCheetah": _gymnasium("HalfCheetah-v5", actions=6),
-        # gently, or most velocities are out of the sensors' range; goes on after a fall, or no thigh reaches its stop
+        # weak excitation keeps velocities in the sensors' range; episodes continue after a fall so that thighs reach
+        # their joint limits
         "Walker2d": _gymnasium(
             "Walker2d-v5",
             actions=6,

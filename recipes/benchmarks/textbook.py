@@ -1,4 +1,4 @@
-"""H2O+ as a textbook would write it: from the formulas, one optimiser a network, one forward a term.
+"""H2O+ written directly from the formulas: one optimiser a network, one forward pass a term.
 
 What the library's update is compared to in speed. Nothing here is shared with the library.
 """
@@ -23,7 +23,7 @@ def mlp(inputs: int, outputs: int, width: int) -> nn.Sequential:
 
 
 class Policy(nn.Module):
-    """A Gaussian behind a tanh, for actions in [-1, 1]."""
+    """Tanh-transformed Gaussian policy for actions in [-1, 1]."""
 
     def __init__(self, observation_dim: int, action_dim: int, width: int) -> None:
         super().__init__()
@@ -33,13 +33,13 @@ class Policy(nn.Module):
         loc, log_std = self.network(observation).chunk(2, -1)
         normal = torch.distributions.Normal(loc, (log_std - 1.0).clamp(-20.0, 2.0).exp())
         before = normal.rsample()
-        # log(1 - tanh(u)^2), in a form that does not cancel
+        # log(1 - tanh(u)^2) without cancellation
         log_slope = 2.0 * (torch.log(torch.tensor(2.0)) - before - F.softplus(-2.0 * before))
         return torch.tanh(before), (normal.log_prob(before) - log_slope).sum(-1)
 
 
 class TextbookH2OPlus:
-    """Eqs. (4) and (7) to (10), after the authors' constants."""
+    """Eqs. (4) and (7) to (10) of H2O+ with the authors' constants."""
 
     def __init__(self, observation_dim: int, action_dim: int, width: int = 256) -> None:
         pair = observation_dim + action_dim
@@ -55,7 +55,7 @@ class TextbookH2OPlus:
         self.alpha_optimiser = torch.optim.Adam([self.log_alpha], lr=LR)
 
     def update(self, real: Batch, sim: Batch, real_pairs: Batch, sim_pairs: Batch) -> None:
-        """One update: from batches of both streams, and from the discriminators' own."""
+        """One update from batches of both streams and separate batches for the discriminators."""
         self._step([self.sa, self.sas], self._discriminators_loss(real_pairs, sim_pairs))
         alpha = self.log_alpha.detach().exp()
         self._step([self.value], self._value_loss(real))

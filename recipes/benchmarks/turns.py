@@ -1,4 +1,4 @@
-"""Timing by turns: contenders one after another, several times over, so that what else a machine does falls on all."""
+"""Times functions in turns, repeated several times, so that other load on the machine affects all of them alike."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -20,10 +20,10 @@ def calls_per_second(
 
     Args:
         functions: by name.
-        seconds: of one turn.
-        turns: of each function, after one to warm up.
-        device: where they compute; a GPU is waited for.
-        least: how many calls a turn has at least.
+        seconds: length of one turn.
+        turns: number of turns of each function, after one to warm up.
+        device: of the computation; a GPU is synchronised.
+        least: minimum number of calls in a turn.
     """
     synchronise = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
     best = dict.fromkeys(functions, 0.0)

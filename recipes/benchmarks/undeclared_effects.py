@@ -1,4 +1,4 @@
-"""Effects that no catalogue holds: forces that the code under test has never heard of."""
+"""Effects outside the catalogue: forces that the code under test does not define."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from torchrl_h2o.effects import ForceEffect, Names, parameter, selection
 from torchrl_h2o.effects.effect import BatchedForce, Force
 
 _TORQUE = {"unit": "N·m", "bounds": (-1000.0, 1000.0), "neutral": 0.0}
-_SLOW = 0.05  # rad/s, below which dry friction fades, so that nothing rattles
+_SLOW = 0.05  # rad/s; below it dry friction fades to avoid chattering
 
 
 @dataclass(frozen=True)
 class _TorqueOnJoint(ForceEffect):
-    """A torque on one joint, a function of its angle, its velocity and the time since the start."""
+    """A torque on one joint as a function of its angle, its velocity and the time since the start."""
 
     torque: float = parameter(**_TORQUE)
     joint: Names = "*"
@@ -39,12 +39,12 @@ class _TorqueOnJoint(ForceEffect):
 
     @abstractmethod
     def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """The torque, (B,), in N·m, at angles (rad), velocities (rad/s) and times (s), each (B,)."""
+        """Torque (B,), N·m, at angles (rad), velocities (rad/s) and times (s), each (B,)."""
 
 
 @dataclass(frozen=True)
 class TorqueRipple(_TorqueOnJoint):
-    """What the teeth of a gear or the poles of a motor do: a torque that goes with sin(k q)."""
+    """Torque ripple of gear teeth or motor poles, proportional to sin(k q)."""
 
     wording: ClassVar[str] = "ripple of {torque}, sin({waves} q), on {joint}"
     waves: float = parameter(unit="1", bounds=(0.1, 100.0), neutral=1.0)
@@ -55,7 +55,7 @@ class TorqueRipple(_TorqueOnJoint):
 
 @dataclass(frozen=True)
 class CubicWind(_TorqueOnJoint):
-    """A resistance that grows with the velocity cubed; ``torque`` is what it comes to at ``speed``."""
+    """Resistance proportional to the velocity cubed; ``torque`` is its value at ``speed``."""
 
     wording: ClassVar[str] = "wind of {torque} at {speed}, with v³, on {joint}"
     speed: float = parameter(unit="rad/s", bounds=(0.01, 1000.0), neutral=1.0)
@@ -66,7 +66,7 @@ class CubicWind(_TorqueOnJoint):
 
 @dataclass(frozen=True)
 class MovingSpring(_TorqueOnJoint):
-    """A spring to a point that swings to and fro; ``torque`` is what it comes to at a distance of ``swing``."""
+    """Spring to an oscillating point; ``torque`` is its value at a distance of ``swing``."""
 
     wording: ClassVar[str] = "spring of {torque} to a point that swings by {swing} in {period}, on {joint}"
     swing: float = parameter(unit="rad", bounds=(0.01, 10.0), neutral=1.0)
@@ -79,7 +79,7 @@ class MovingSpring(_TorqueOnJoint):
 
 @dataclass(frozen=True)
 class LateForce(_TorqueOnJoint):
-    """A torque that is there from some time on, as of a hose that came loose."""
+    """Constant torque that starts at a given time, such as a dragging hose."""
 
     wording: ClassVar[str] = "{torque} from {start} on, on {joint}"
     start: float = parameter(unit="s", bounds=(0.0, 10000.0), neutral=0.0)
@@ -90,7 +90,7 @@ class LateForce(_TorqueOnJoint):
 
 @dataclass(frozen=True)
 class PlaceFriction(_TorqueOnJoint):
-    """Dry friction that depends on the position, as of a bent axle: most at one angle, none at the opposite one."""
+    """Dry friction that depends on the angle, such as a bent axle: largest at one angle, zero at the opposite."""
 
     wording: ClassVar[str] = "friction of {torque} · (1 + sin({waves} q)) / 2 on {joint}"
     waves: float = parameter(unit="1", bounds=(0.1, 100.0), neutral=1.0)

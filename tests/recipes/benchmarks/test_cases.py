@@ -323,7 +323,7 @@ def test_steps_are_counted_in_all_that_is_made_of_a_simulation():
 
 def test_families_are_chosen_by_name_and_logs_by_their_folder(tmp_path):
     assert list(choose_families(["nothing", "paper16"])) == ["paper16", "nothing"]
-    with pytest.raises(ValueError, match="cases=paper: choose of paper16"):
+    with pytest.raises(ValueError, match="cases=paper: choose from paper16"):
         choose_families(["paper"])
     with pytest.raises(FileNotFoundError, match="no such folder"):
         choose_families([], tmp_path / "nowhere")

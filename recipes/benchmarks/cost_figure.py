@@ -1,4 +1,4 @@
-"""The picture of how the cost of an update grows: a column for each thing that does, seconds above and memory below."""
+"""Draws the cost of an update: one column a factor, seconds above and memory below."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ COLOURS = {"in memory": "#0b6e4f", "memory-mapped": "#c8553d"}
 
 
 def draw_scaling(path: Path, costs: list[dict]) -> None:
-    """Draws scaling.png; both axes are logarithmic.
+    """Draw scaling.png with logarithmic axes.
 
     Args:
-        path: of the picture.
-        costs: what scaling.json has: what grows, its size, seconds and bytes.
+        path: PNG file to write.
+        costs: entries of scaling.json: the factor, its size, seconds and bytes.
     """
     columns = list(dict.fromkeys(cost["grows"] for cost in costs))
     figure, axes = plt.subplots(
