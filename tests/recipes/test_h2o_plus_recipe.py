@@ -57,7 +57,7 @@ def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("interruption", [signal.SIGKILL, signal.SIGINT])
 def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption):
-    small = [*SMALL, *ROBOT, "baseline=false", "updates=100"]
+    small = [*SMALL, *ROBOT, "updates=100"]
     run(command(*small, "hydra.run.dir=unbroken"))
 
     broken = tmp_path / "broken"
@@ -79,7 +79,7 @@ def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, i
 
 @pytest.mark.slow
 def test_every_job_of_a_multirun_has_a_folder_and_a_seed_of_its_own(command, tmp_path):
-    run(command("--multirun", *SMALL, *ROBOT, "baseline=false", "updates=20", "seed=0,1"))
+    run(command("--multirun", *SMALL, *ROBOT, "updates=20", "seed=0,1"))
     summaries = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/multirun/*/*/summary.json")]
     assert sorted(summary["seed"] for summary in summaries) == [0, 1]
     assert summaries[0]["return_real"] != summaries[1]["return_real"]
@@ -87,7 +87,7 @@ def test_every_job_of_a_multirun_has_a_folder_and_a_seed_of_its_own(command, tmp
 
 @pytest.mark.slow
 def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(command, tmp_path):
-    run(command(*SMALL, *ROBOT, "baseline=false", "updates=20"))
+    run(command(*SMALL, *ROBOT, "updates=20"))
     (summary,) = tmp_path.glob("outputs/wheel_legged/*/summary.json")
     again = subprocess.run(**command(*SMALL, f"hydra.run.dir={summary.parent}"), text=True, check=False)
     assert again.returncode != 0
@@ -200,7 +200,7 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured data ar
 @needs_data
 def test_the_real_robot_s_log_is_an_override(command, tmp_path):
     log = DATA / "wheel_legged" / "standing_still.txt"
-    run(command(*SMALL, *ROBOT, f"data={log}", "baseline=false", "updates=20", "hydra.run.dir=out"))
+    run(command(*SMALL, *ROBOT, f"data={log}", "updates=20", "hydra.run.dir=out"))
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["transitions"] > 16_000
 
 
@@ -217,7 +217,7 @@ def test_data_of_another_task_are_refused(command):
 @needs_data
 def test_a_minari_dataset_and_a_gap_are_overrides(command, tmp_path):
     data = DATA / "minari" / "walker2d" / "medium-replay-v0"
-    chosen = ["env=walker2d", "gap=gravity", f"data={data}", "baseline=false", "updates=20", "hydra.run.dir=out"]
+    chosen = ["env=walker2d", "gap=gravity", f"data={data}", "updates=20", "hydra.run.dir=out"]
     run(command(*SMALL, *chosen))
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["gap"] == "gravity"
