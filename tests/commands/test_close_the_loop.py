@@ -252,7 +252,7 @@ def test_a_report_mends_the_simulator_behind_its_own_gap(compose, tmp_path):
 
 def test_a_report_without_effects_and_a_file_that_is_none_are_refused(compose, tmp_path):
     path = report().save(tmp_path)
-    with pytest.raises(ValueError, match="found nothing to put into the simulator; leave gap_fix out"):
+    with pytest.raises(ValueError, match="contains no effects to add to the simulator; leave gap_fix out"):
         make_simulator(compose(f"gap_fix={path}", config="h2o_plus"))
     with pytest.raises(ValueError, match="cannot be read"):
         make_simulator(compose(f"gap_fix={tmp_path / 'none.json'}", config="h2o_plus"))

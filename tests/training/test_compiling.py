@@ -90,4 +90,4 @@ def test_losses_are_compiled_where_it_pays_or_is_asked_for(chosen, updates, pays
     def losses_of(batch):
         return batch
 
-    assert (maybe_compiled(losses_of, cfg.compiled, cfg.updates, pays=pays) is not losses_of) == compiles
+    assert (maybe_compiled(losses_of, cfg.get("compiled", False), cfg.updates, pays=pays) is not losses_of) == compiles
