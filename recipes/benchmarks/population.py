@@ -3,8 +3,8 @@
 python recipes/benchmarks/population.py                                # on a CPU
 python recipes/benchmarks/population.py device=cuda compiled=[1,8,32,128]   # and with CUDA graphs, as there is CUDA
 
-Beside it, in the same run, a single run as `recipes/h2o_plus.py` makes it. Sampling is in all figures, the simulator in
-none. Leaves population.json in the run's folder.
+Measures a single run, as `recipes/h2o_plus.py` makes it, in the same session. All figures include sampling and exclude
+the simulator. Writes population.json into the run's folder.
 """
 
 import json
@@ -32,7 +32,7 @@ SINGLE = "a single run"
 
 
 def make_population(cfg: DictConfig, run: DictConfig, num_members: int) -> PopulationLearner:
-    """Runs of other seeds on the same data, with buffers of their own."""
+    """Build runs of different seeds on the same data, each with its own buffer."""
     replay = PopulationReplay(some_transitions(cfg), cfg.transitions, run.batch_size, num_members, device=cfg.device)
     learners = []
     for seed, buffer in enumerate(replay.buffers):
@@ -48,7 +48,7 @@ def make_single(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, se
 
 
 def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, Callable[[], object]]:
-    """The ways to make one update of every member."""
+    """Build the contenders, each a function that makes one update of every member."""
     chosen = {"stacked": make_population(cfg, run, num_members).update}
     if num_members == 1:
         replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
@@ -67,7 +67,7 @@ def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, 
 
 
 def captured(learner: PopulationLearner) -> Callable[[], object]:
-    """An update as one CUDA graph; nobody looks at the losses in between."""
+    """Capture an update as one CUDA graph, without the check of the losses."""
 
     def update() -> None:
         learner.differentiate()
@@ -76,7 +76,7 @@ def captured(learner: PopulationLearner) -> Callable[[], object]:
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
-        for _ in range(3):  # what is allocated or compiled at the first calls must not be captured
+        for _ in range(3):  # allocations and compilation of the first calls must not be captured
             update()
     torch.cuda.current_stream().wait_stream(side)
     graph = torch.cuda.CUDAGraph()
@@ -86,7 +86,7 @@ def captured(learner: PopulationLearner) -> Callable[[], object]:
 
 
 def measure(cfg: DictConfig, run: DictConfig) -> list[dict]:
-    """A line for each size and way: updates of the population a second, and of its members together."""
+    """Measure each size and contender: updates per second of the population, and of its members together."""
     lines = []
     for num_members in cfg.members:
         functions = contenders(cfg, run, num_members)

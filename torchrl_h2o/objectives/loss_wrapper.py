@@ -53,6 +53,11 @@ class LossWrapper(HybridLoss):
         return self
 
     @property
+    def value_estimator(self):
+        """The value estimator of the loss inside."""
+        return self._inside.value_estimator
+
+    @property
     def vmap_randomness(self) -> str:
         return self._inside.vmap_randomness
 

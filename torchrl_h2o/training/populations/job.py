@@ -1,4 +1,4 @@
-"""A population of H2O+ runs: trained at once, judged one by one, each with its files in a folder of its own."""
+"""Train a population of H2O+ runs together, evaluate each, and write each one's files into a folder of its own."""
 
 import time
 from pathlib import Path
@@ -15,12 +15,18 @@ from torchrl_h2o.training.real_data import behaviour_in
 
 
 def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: Path) -> None:
-    """The same for many runs at once, each with its files in a folder of its own; no baseline and no films."""
+    """Train and evaluate all members; without a baseline and without films.
+
+    Args:
+        cfg: the settings that the members share.
+        members: each member's settings, by name.
+        directory: the population's folder.
+    """
     start = time.perf_counter()
     for own in members.values():
-        make_simulator(own, raw=True)  # a gap that there is not
+        make_simulator(own, raw=True)  # an unknown gap fails before the data are read
     real = prepare(cfg, directory)
-    members = members_of(cfg)  # with what was measured from the data
+    members = members_of(cfg)  # again, with the statistics measured from the data
     wall_s = time.perf_counter() - start
     outcomes = train_population(make_learner, cfg, members, real, directory)
     in_reality = {}

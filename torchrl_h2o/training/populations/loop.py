@@ -1,8 +1,8 @@
-"""Many runs in one process: every combination of ``seeds``, ``gaps`` and ``mixings``, stacked and trained as one.
+"""Many runs in one process: every combination of ``seeds``, ``gaps`` and ``mixings``, stacked and trained together.
 
-Each member has its simulator, its buffer and its random stream, and draws from it in the order in which a single run
-draws: on a CPU it reaches that run's numbers, to rounding. A member whose losses are no finite numbers any more stops:
-its networks stay as they are, it is neither simulated nor evaluated, and the others go on as if nothing had happened.
+Each member has its own simulator, buffer and random stream, and draws from it in the order of a single run. So on a CPU
+it follows that run, to rounding. A member whose losses stop being finite is stopped: its networks are kept, it is
+neither simulated nor evaluated, and the others are not affected.
 """
 
 from contextlib import ExitStack
@@ -35,10 +35,10 @@ SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
 
 def members_of(cfg: DictConfig) -> dict[str, DictConfig]:
-    """The configuration of each member by its name, such as ``seed_0_gravity``; none for a single run.
+    """Build the configuration of each member, by name such as ``seed_0_gravity``; empty for a single run.
 
     Raises:
-        ValueError: for what is no list, is empty, or names a member twice.
+        ValueError: if a swept setting is not a list, is empty, or names a member twice.
     """
     swept = {one: _listed(cfg, many) for many, one in SWEPT.items() if cfg.get(many) is not None}
     members = {}
@@ -65,15 +65,15 @@ def _word(key: str, value: object) -> str:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a member.
+    """Result of a member.
 
     Args:
-        policy: the one to hand over.
-        rows: its metrics, one row an evaluation.
-        updates: that it made.
-        updates_per_second: of this member; the population made as many of each.
-        seconds: that the whole population took.
-        failure: after how many updates it stopped, and why; or None.
+        policy: the policy that ``keep`` selects.
+        rows: its metrics, one row per evaluation.
+        updates: number of updates it made.
+        updates_per_second: of each member.
+        seconds: duration of the whole population's training.
+        failure: the number of updates after which it stopped, and the reason; or None.
     """
 
     policy: torch.nn.Module
@@ -85,42 +85,42 @@ class Outcome:
 
 
 class PopulationTraining(Training):
-    """Epochs and checkpoints of a population, and the metrics of each member in a folder of its own."""
+    """Epochs and checkpoints of a population, with each member's metrics in a folder of its own."""
 
     def rows_of(self, member: str) -> list[dict]:
         return [{k: v for k, v in row.items() if k != "member"} for row in self.rows if row["member"] == member]
 
     def log_member(self, epoch: int, member: str, **metrics: float) -> None:
-        """Adds a row of metrics and writes the member's metrics.csv."""
+        """Add a row of metrics and write the member's metrics.csv."""
         self.rows.append({"member": member, **self._row(epoch, metrics)})
         write_metrics(self.directory / member, self.name, self.rows_of(member))
 
     def note_failure(self, member: str, failure: dict) -> None:
-        """Reports that a member has stopped, once; a checkpoint remembers it."""
+        """Report once that a member has stopped, and store it in the checkpoints."""
         if member not in self.failures:
             self.failures[member] = failure
             tqdm.write(f"{member} stopped after {failure['updates']} updates: {failure['why']}; the others go on")
 
     @property
     def failures(self) -> dict[str, dict]:
-        """By the members that stopped: after how many updates, and why."""
+        """For each stopped member, the number of updates it made and the reason."""
         return self.progress.setdefault("failures", {})
 
 
 def train_population(
     make_learner: MakeLearner, cfg: DictConfig, members: dict[str, DictConfig], real: TensorDictBase, directory: Path
 ) -> dict[str, Outcome]:
-    """Trains all members.
+    """Train all members.
 
     Args:
-        make_learner: of one run.
-        cfg: what the members have in common.
+        make_learner: builds the learner of one run.
+        cfg: the settings that the members share.
         members: their configurations, by name.
         real: the measured transitions.
-        directory: of the population; each member has a folder of its own in it, like a single run's.
+        directory: the population's folder. Each member gets a folder in it, like a single run's.
 
     Returns:
-        What became of each member.
+        Each member's result, by name.
     """
     for name, own in members.items():
         (directory / name).mkdir(parents=True, exist_ok=True)
@@ -133,7 +133,7 @@ def train_population(
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)
     }
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    learner.losses_of = maybe_compiled(cfg, learner.losses_of, pays=False)  # on a CPU, stacked ones are slower so
+    learner.losses_of = maybe_compiled(cfg, learner.losses_of, pays=False)  # on a CPU, compiled stacks are slower
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=num_epochs(cfg))
     training = PopulationTraining("H2O+", cfg, directory, **_components(trainees, learner), schedule=schedule)
     learner.updates = training.progress["epoch"] * cfg.updates_per_epoch
@@ -164,7 +164,7 @@ def train_population(
 
 
 def _components(trainees: dict[str, Trainee], learner: PopulationLearner) -> dict:
-    """What a checkpoint of the population holds: its members', and the optimiser that is theirs together."""
+    """Collect what a checkpoint holds: the members' components and the shared optimiser."""
     parts = {
         f"{name}_{part}": component
         for name, trainee in trainees.items()
@@ -175,7 +175,7 @@ def _components(trainees: dict[str, Trainee], learner: PopulationLearner) -> dic
 
 
 def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outcome:
-    """Also leaves the policy in the member's folder, where evaluate.py looks for it."""
+    """Build a member's result, and save its policy in its folder for evaluate.py."""
     policies = {key: trainee.components[key] for key in ("actor", "policy") if key in trainee.components}
     rotation = CheckpointRotation(checkpoint_folder(training.directory / name, training.name), keep_last=1)
     failure = training.failures.get(name)

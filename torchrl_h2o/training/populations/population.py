@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
 from torch import Tensor, nn
+from torchrl.objectives import LossModule
 
 from torchrl_h2o.training.populations.noise_tape import Draw, Playback, Tape, record
 
@@ -241,7 +242,7 @@ def _look_into(held: Stackable, stack: TensorDictBase | Tensor, number: int) -> 
     for key in held.keys(True, True):
         held.get(key).data = stack.get(key).data[number]
     own = held._param_td
-    for params in (own, *(value for value in own.values(True) if is_tensor_collection(value))):
+    for params in (held, own, *(value for value in own.values(True) if is_tensor_collection(value))):
         params._erase_cache()  # a locked tensordict caches values computed from its old tensors
 
 
@@ -262,7 +263,7 @@ def _in_place_of_own(member: nn.Module, tensors: dict[tuple[str, ...], TensorDic
 @contextmanager
 def _without_caches(member: nn.Module) -> Iterator[None]:
     """Empty what TorchRL's losses cache of their parameters, before and after the parameters are exchanged."""
-    cached = [module for module in member.modules() if "_cache" in module.__dict__]
+    cached = [module for module in member.modules() if isinstance(module, LossModule)]
     for module in cached:
         module.__dict__["_cache"] = {}
     try:

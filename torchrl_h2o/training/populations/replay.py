@@ -1,7 +1,7 @@
-"""The replay buffers of many runs on the same real data, sampled in one go.
+"""Replay buffers of many runs on the same real data, sampled in one call.
 
-Each run has a ``HybridReplayBuffer`` of its own. The simulated rows of all of them lie in one piece of memory, so that
-the batches of all runs are gathered by one index, however many runs there are.
+Each run has its own ``HybridReplayBuffer``. The simulated rows of all runs share one piece of memory, so one index
+operation gathers the batches of all of them.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ class PopulationReplay:
     """N replay buffers that share their real data.
 
     Args:
-        real: flat TED transitions, batch size [T], of all runs.
-        sim_capacity: how many simulated transitions each run keeps.
+        real: flat TED transitions, batch size [T], shared by all runs.
+        sim_capacity: simulated transitions that each run keeps.
         batch_size: (real, simulated) rows of a run's batch.
         num_members: N.
         keys: the entries of a batch, as in :class:`HybridReplayBuffer`.
-        device: where the data are kept and the batches are made.
+        device: of the data and of the batches.
 
     Attributes:
-        buffers: the members' own, to be extended, saved and sampled one by one.
+        buffers: one per member, to be extended and saved separately.
 
     Example:
         >>> import torch
@@ -39,7 +39,7 @@ class PopulationReplay:
         >>> replay.sample()["next", "reward"].shape
         torch.Size([3, 8, 1])
         >>> streams = [torch.Generator().manual_seed(seed) for seed in range(3)]
-        >>> batch = replay.sample(generators=streams)  # each member's row is what its own buffer would have sampled
+        >>> batch = replay.sample(generators=streams)  # each row is what that member's buffer samples
     """
 
     def __init__(
@@ -72,8 +72,8 @@ class PopulationReplay:
 
         Args:
             batch_size: (real, simulated) rows of a member's batch, instead of the buffers' own.
-            generators: one a member, which then gets what its own buffer draws with it. Without them all members draw
-                from torch's global generator, in one call.
+            generators: one per member, which then gets the rows that its own buffer draws with it. Without them all
+                members draw from torch's global generator, in one call.
 
         Returns:
             TensorDict of batch size [N, real + simulated]: the buffers' entries, and ``real``, bool; the real rows
@@ -92,7 +92,7 @@ class PopulationReplay:
         return TensorDict(batch, batch_size=size, device=self.device)
 
     def _find_lengths(self, n_sim: int) -> None:
-        """Keeps the buffers' lengths on the device: a copy for every batch would wait for it."""
+        """Keep the buffers' lengths on the device, to avoid a synchronising copy for every batch."""
         lengths = [len(buffer.real) for buffer in self.buffers], [len(buffer.sim) for buffer in self.buffers]
         if n_sim and not all(lengths[1]):
             raise RuntimeError(
