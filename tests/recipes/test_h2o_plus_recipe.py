@@ -1,4 +1,4 @@
-"""The main job as its user runs it: a command line in, files out, and going on after an interruption."""
+"""The main job as its user runs it: a command line in, files out, and continuing after an interruption."""
 
 import json
 import os
@@ -8,17 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import CheckpointRotation
 
-from tests.small_runs import ROBOT, ROOT, SMALL, interrupt_at, rows, run, trained
-from torchrl_h2o.data import write_ted
-from torchrl_h2o.training.environments import make_simulator
-from torchrl_h2o.training.loop import train
-from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
-from torchrl_h2o.training.methods.sac import SAC
-from torchrl_h2o.training.progress import Training
-from torchrl_h2o.training.returns import evaluate
-from torchrl_h2o.training.trained_policy import load_policy
+from tests.small_runs import ROBOT, ROOT, SMALL, rows, run, trained
 
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
 
@@ -31,27 +23,51 @@ def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
     assert summary["updates"] == 60
     assert summary["env"] == "wheel_legged"
     assert summary["return_real"].keys() >= {"mean", "std", "episodes"}
-    assert {
-        "gap",
-        "data",
-        "backbone",
-        "mixing",
-        "seed",
-        "return_sim",
-        "updates_per_second",
-        "wall_s",
-        "versions",
-    } <= set(summary)
-    assert {row["method"] for row in rows(out)} == {"H2O+", "SAC in the simulator"}
+    told = {"gap", "data", "backbone", "mixing", "seed", "return_sim", "updates_per_second", "wall_s", "versions"}
+    assert told <= set(summary)
+    assert {row["method"] for row in rows(out)} == {"H2O+"}
     assert (out / "learning_curve.png").stat().st_size > 10_000
     assert "warn" not in printed.lower()
-    for name in ("H2O+", "SAC in the simulator", "the data's behaviour"):
+    for name in ("H2O+", "the data's behaviour"):
         assert name in printed
 
     replayed = run(command("checkpoint=out", "episodes=1", "film=null", script="evaluate.py"))
     assert "H2O+ in reality" in replayed
     evaluation = json.loads((out / "evaluation.json").read_text())
     assert evaluation["episodes"] == 1
+
+
+@pytest.mark.slow
+def test_a_baseline_is_trained_and_reported_beside_the_method(command, tmp_path):
+    printed = run(command(*SMALL, *ROBOT, "baselines=[sac]", "hydra.run.dir=out", script="train.py"))
+    assert {row["method"] for row in rows(tmp_path / "out")} == {"H2O+", "SAC in the simulator"}
+    assert "SAC in the simulator" in printed
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["baselines"].keys() == {"SAC in the simulator"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("keep", ["last", "best_in_simulator"])
+def test_the_loop_of_the_recipe_reaches_the_numbers_of_the_loop_of_train(command, tmp_path, keep):
+    small = [*SMALL, *ROBOT, f"keep={keep}"]
+    run(command(*small, "hydra.run.dir=recipe"))
+    run(command(*small, "hydra.run.dir=package", script="train.py"))
+    assert trained(tmp_path / "recipe") == trained(tmp_path / "package")
+    assert rows(tmp_path / "recipe") == rows(tmp_path / "package")
+
+
+@pytest.mark.slow
+def test_a_population_is_trained_by_its_lists_of_options(command, tmp_path):
+    printed = run(command(*SMALL, *ROBOT, "seeds=[0,1]", "hydra.run.dir=out", script="train.py"))
+    assert all(name in printed for name in ("seed_0", "seed_1"))
+    assert (tmp_path / "out" / "seed_1" / "summary.json").exists()
+
+
+@pytest.mark.slow
+def test_a_population_of_another_method_is_refused(command):
+    done = subprocess.run(**command("seeds=[0,1]", "method=sac", script="train.py"), text=True, check=False)
+    assert done.returncode != 0
+    assert "a population trains h2o_plus alone" in done.stdout
 
 
 @pytest.mark.slow
@@ -113,84 +129,6 @@ def test_what_cannot_be_is_said_with_what_to_do(command, overrides, said):
     done = subprocess.run(**command(*overrides), text=True, check=False)
     assert done.returncode != 0
     assert said in done.stdout
-
-
-def test_recorded_data_can_be_named_by_their_folder(compose, tmp_path):
-    cfg, real = compose()
-    again, same = compose(f"data={write_ted(real, tmp_path / 'recording')}")
-    assert (same == real).all()
-    assert again.observation_norm == cfg.observation_norm
-
-
-@pytest.mark.slow
-def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
-    chosen = [(), ("backbone=sparse",), ("backbone=exponential",), ("mixing=0.9",), ("ratio=false",), ("gamma=0.5",)]
-    losses = []
-    for number, overrides in enumerate(chosen):
-        cfg, real = compose("updates=20", *overrides)
-        _, training = train(H2O_PLUS, cfg, real, tmp_path / str(number))
-        losses.append((training.rows[-1]["loss_qvalue"], training.rows[-1]["loss_value"]))
-    assert len(set(losses)) == len(chosen)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", [H2O_PLUS, SAC])
-def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, method, monkeypatch):
-    cfg, real = compose("updates=60", "lr_end_factor=0.1")
-    train(method, cfg, real, tmp_path / "whole")
-    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
-    with pytest.raises(KeyboardInterrupt):
-        train(method, cfg, real, tmp_path / "parts")
-    monkeypatch.undo()
-    train(method, cfg, real, tmp_path / "parts")
-    (name,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
-    assert trained(tmp_path / "parts", name) == trained(tmp_path / "whole", name)
-
-
-@pytest.mark.slow
-def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
-    cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=1")
-    policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
-    promised = [row["return_sim"] for row in training.rows]
-    assert max(promised) > promised[-1]
-    assert evaluate(make_simulator(cfg, 1), policy, 1).mean == max(promised)
-    assert evaluate(make_simulator(cfg, 1), load_policy(cfg, tmp_path / "whole"), 1).mean == max(promised)
-
-    monkeypatch.setattr(
-        "torchrl_h2o.training.progress.Training.log",
-        interrupt_at(epoch=promised.index(max(promised)) + 1, log=Training.log),
-    )
-    with pytest.raises(KeyboardInterrupt):
-        train(H2O_PLUS, cfg, real, tmp_path / "parts")
-    monkeypatch.undo()
-    train(H2O_PLUS, cfg, real, tmp_path / "parts")
-    assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
-
-
-@pytest.mark.slow
-def test_ctrl_c_waits_until_the_checkpoint_is_written(compose, tmp_path, monkeypatch):
-    cfg, real = compose("updates=60")
-    save = CheckpointRotation.save
-
-    def interrupted(self, *args, **kwargs):
-        signal.raise_signal(signal.SIGINT)
-        return save(self, *args, **kwargs)
-
-    monkeypatch.setattr(CheckpointRotation, "save", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        train(SAC, cfg, real, tmp_path)
-    latest = CheckpointRotation(tmp_path / "checkpoints" / "sac_in_the_simulator", keep_last=1).latest()
-    assert Checkpoint.manifest(latest)["metadata"]["progress"]["epoch"] == 1
-
-
-@pytest.mark.slow
-def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
-    cfg, real = compose("updates=20")
-    train(SAC, cfg, real, tmp_path)
-    (archive,) = (tmp_path / "checkpoints" / "sac_in_the_simulator").glob("checkpoint*")
-    archive.write_bytes(archive.read_bytes()[:-2000])
-    with pytest.raises(RuntimeError, match="no checkpoint that can be read"):
-        train(SAC, cfg, real, tmp_path)
 
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured data are not there: {DATA}")

@@ -1,0 +1,94 @@
+"""The training loop of train.py: options reach the losses, and an interrupted training continues exactly."""
+
+import signal
+
+import pytest
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
+
+from tests.small_runs import interrupt_at, trained
+from torchrl_h2o.data import write_ted
+from torchrl_h2o.training.environments import make_simulator
+from torchrl_h2o.training.loop import train
+from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
+from torchrl_h2o.training.methods.sac import SAC
+from torchrl_h2o.training.progress import Training
+from torchrl_h2o.training.returns import evaluate
+from torchrl_h2o.training.trained_policy import load_policy
+
+
+def test_recorded_data_can_be_named_by_their_folder(compose, tmp_path):
+    cfg, real = compose()
+    again, same = compose(f"data={write_ted(real, tmp_path / 'recording')}")
+    assert (same == real).all()
+    assert again.observation_norm == cfg.observation_norm
+
+
+@pytest.mark.slow
+def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
+    chosen = [(), ("backbone=sparse",), ("backbone=exponential",), ("mixing=0.9",), ("ratio=false",), ("gamma=0.5",)]
+    losses = []
+    for number, overrides in enumerate(chosen):
+        cfg, real = compose("updates=20", *overrides)
+        _, training = train(H2O_PLUS, cfg, real, tmp_path / str(number))
+        losses.append((training.rows[-1]["loss_qvalue"], training.rows[-1]["loss_value"]))
+    assert len(set(losses)) == len(chosen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [H2O_PLUS, SAC])
+def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, method, monkeypatch):
+    cfg, real = compose("updates=60", "lr_end_factor=0.1")
+    train(method, cfg, real, tmp_path / "whole")
+    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
+    with pytest.raises(KeyboardInterrupt):
+        train(method, cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    train(method, cfg, real, tmp_path / "parts")
+    (name,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
+    assert trained(tmp_path / "parts", name) == trained(tmp_path / "whole", name)
+
+
+@pytest.mark.slow
+def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
+    cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=1")
+    policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
+    promised = [row["return_sim"] for row in training.rows]
+    assert max(promised) > promised[-1]
+    assert evaluate(make_simulator(cfg, 1), policy, 1).mean == max(promised)
+    assert evaluate(make_simulator(cfg, 1), load_policy(cfg, tmp_path / "whole"), 1).mean == max(promised)
+
+    monkeypatch.setattr(
+        "torchrl_h2o.training.progress.Training.log",
+        interrupt_at(epoch=promised.index(max(promised)) + 1, log=Training.log),
+    )
+    with pytest.raises(KeyboardInterrupt):
+        train(H2O_PLUS, cfg, real, tmp_path / "parts")
+    monkeypatch.undo()
+    train(H2O_PLUS, cfg, real, tmp_path / "parts")
+    assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_ctrl_c_waits_until_the_checkpoint_is_written(compose, tmp_path, monkeypatch):
+    cfg, real = compose("updates=60")
+    save = CheckpointRotation.save
+
+    def interrupted(self, *args, **kwargs):
+        signal.raise_signal(signal.SIGINT)
+        return save(self, *args, **kwargs)
+
+    monkeypatch.setattr(CheckpointRotation, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(SAC, cfg, real, tmp_path)
+    latest = CheckpointRotation(tmp_path / "checkpoints" / "sac_in_the_simulator", keep_last=1).latest()
+    assert Checkpoint.manifest(latest)["metadata"]["progress"]["epoch"] == 1
+
+
+@pytest.mark.slow
+def test_a_damaged_checkpoint_is_an_error(compose, tmp_path):
+    cfg, real = compose("updates=20")
+    train(SAC, cfg, real, tmp_path)
+    (archive,) = (tmp_path / "checkpoints" / "sac_in_the_simulator").glob("checkpoint*")
+    archive.write_bytes(archive.read_bytes()[:-2000])
+    with pytest.raises(RuntimeError, match="no checkpoint that can be read"):
+        train(SAC, cfg, real, tmp_path)
