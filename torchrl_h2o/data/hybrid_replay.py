@@ -13,7 +13,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -208,7 +208,7 @@ class HybridReplayBuffer:
             (folder / "stream.json").write_text(json.dumps(state), encoding="utf-8")
             if self._sim_rows:
                 rows = TensorDict(dict(zip(self.keys, self._sim_rows, strict=True)), [len(self.sim)])
-                rows.cpu().memmap(folder / "rows", copy_existing=True)
+                rows.cpu().memmap(cast("str", folder / "rows"), copy_existing=True)  # as in write_ted
 
     def loads(self, path: str | Path) -> None:
         """Read a folder written by :meth:`dumps` into a buffer with the same real data and keys.

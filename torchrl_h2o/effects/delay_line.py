@@ -22,7 +22,7 @@ def delay_line(steps: float, before: Callable[[np.ndarray], np.ndarray]) -> Call
 
     def late(value: np.ndarray) -> np.ndarray:
         if not line:
-            line.extend([before(value).copy()] * (line.maxlen - 1))
+            line.extend([before(value).copy()] * (int(whole) + 1))
         line.append(value.copy())
         return (1.0 - fraction) * line[1] + fraction * line[0]
 

@@ -133,8 +133,8 @@ def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> s
     """Words for a selection: "all joints" for ``"*"``; "actuators 0, 2" for ``(0, 2)``, or the names of these."""
     if chosen is None or chosen == "*":
         return f"all {field}"
-    chosen = (chosen,) if isinstance(chosen, str) else chosen
-    return f"{field} {', '.join(names[i] if i in range(len(names)) else str(i) for i in chosen)}"
+    selected: tuple[Any, ...] = (chosen,) if isinstance(chosen, str) else chosen
+    return f"{field} {', '.join(names[int(i)] if i in range(len(names)) else str(i) for i in selected)}"
 
 
 class ModelEffect(Effect):

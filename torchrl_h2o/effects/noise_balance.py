@@ -6,6 +6,7 @@ reduced instead.
 
 from collections.abc import Sequence
 from math import sqrt
+from typing import TypeGuard
 
 from torchrl_h2o.effects.action.signal import ActionNoise
 from torchrl_h2o.effects.effect import Effect
@@ -64,6 +65,6 @@ def _without(negative: ActionNoise, before: Sequence[Effect], settings: EffectSe
     ]
 
 
-def _same_actuators(effect: Effect, noise: ActionNoise) -> bool:
+def _same_actuators(effect: Effect, noise: ActionNoise) -> TypeGuard[ActionNoise]:
     # None stands for all actuators and compares as the empty set
     return isinstance(effect, ActionNoise) and set(effect.actuators or ()) == set(noise.actuators or ())

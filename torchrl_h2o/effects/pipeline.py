@@ -10,7 +10,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeGuard, TypeVar, cast
 
 import mujoco
 import numpy as np
@@ -107,7 +107,8 @@ class Pipeline:
 
     def of_kind(self, kind: type[Kind]) -> list[Kind]:
         """Returns the effects of a class that are not neutral, with negative noise settled."""
-        effects = self.settled if issubclass(kind, ActionEffect) else self.effects  # only action noise is settled
+        only_actions = issubclass(cast("type[Effect]", kind), ActionEffect)  # the cast keeps the type of ``kind``
+        effects = self.settled if only_actions else self.effects  # only action noise is settled
         return [effect for effect in effects if isinstance(effect, kind) and not effect.is_neutral]
 
     # ---------------------------------------------------------------------------------------------- model
@@ -137,7 +138,7 @@ class Pipeline:
                 draws random numbers although its class is not marked ``random``.
         """
 
-        def processes(kind: type[Effect], on: Any) -> list:
+        def processes(kind: type[ActionEffect | ForceEffect | ObservationEffect], on: Any) -> list:
             return [effect.process(on, _generator_for(effect, rng)) for effect in self.of_kind(kind)]
 
         # effects that draw at the start of an episode share the generator: this order is part of a seed's meaning
@@ -201,7 +202,7 @@ class Pipeline:
                 and not effect.is_neutral
                 and not effect.random
             ):
-                observations = effect.process(dt, _NoGenerator(effect))(observations)
+                observations = effect.process(dt, _generator_for(effect, None))(observations)
         return observations
 
     def _restored(self, observations: np.ndarray, dt: float, kind: type[ObservationEffect]) -> np.ndarray:
@@ -228,7 +229,7 @@ def _generator_for(effect: Effect, rng: np.random.Generator | None) -> Any:
     return rng if effect.random else _NoGenerator(effect)
 
 
-def _delays_all(effect: Effect) -> bool:
+def _delays_all(effect: Effect) -> TypeGuard[ObservationDelay]:
     return isinstance(effect, ObservationDelay) and effect.entries is None
 
 

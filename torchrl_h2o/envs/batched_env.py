@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import cpu_count
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -73,7 +74,7 @@ class BatchedMujocoEnv(EnvBase):
     ) -> None:
         if num_worlds < 1:
             raise ValueError(f"num_worlds is {num_worlds}; there must be at least one world")
-        super().__init__(device=torch.device("cpu"), batch_size=[num_worlds])
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_worlds]))
         backend = _backend_in(env)
         self._task = backend.owner
         self._rules = rules_of(self._task)
@@ -84,7 +85,7 @@ class BatchedMujocoEnv(EnvBase):
         self.physics_steps = self._task.frame_skip
         self._models = self._compiled(backend)
         self._differ = len(set(self._pipelines)) > 1
-        threads = min(num_threads or cpu_count(), num_worlds)
+        threads = min(num_threads or cpu_count() or 1, num_worlds)
         self._pool = Rollout(nthread=threads if threads > 1 else 0)  # 0 runs in the calling thread
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
         self.states = np.zeros((num_worlds, mujoco.mj_stateSize(self._models[0], FULL_PHYSICS)))
@@ -119,10 +120,11 @@ class BatchedMujocoEnv(EnvBase):
 
     def _make_specs(self, env: EnvBase) -> None:
         n = self.num_worlds
-        self.observation_spec = env.observation_spec.expand(n)
-        self.action_spec = env.action_spec_unbatched.expand(n, *env.action_spec_unbatched.shape)
-        self.reward_spec = env.reward_spec.expand(n, *env.reward_spec.shape)
-        self.done_spec = Composite({key: spec.expand(n, 1) for key, spec in env.full_done_spec.items()}, shape=(n,))
+        self.observation_spec = env.observation_spec.expand(torch.Size((n,)))
+        self.action_spec = env.action_spec_unbatched.expand(torch.Size((n, *env.action_spec_unbatched.shape)))
+        self.reward_spec = env.reward_spec.expand(torch.Size((n, *env.reward_spec.shape)))
+        done = {key: spec.expand(torch.Size((n, 1))) for key, spec in env.full_done_spec.items()}
+        self.done_spec = Composite(done, shape=torch.Size((n,)))
         # stored here, because looking up a spec in every step is slow
         self._observation_dtype = env.observation_spec["observation"].dtype
         self._reward_dtype = env.reward_spec.dtype
@@ -220,14 +222,14 @@ def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
 
 
 def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_worlds: int) -> list[tuple[Effect, ...]]:
-    effects = list(effects)
-    if all(isinstance(effect, Effect) for effect in effects):
-        return [tuple(effects)] * num_worlds
-    if len(effects) != num_worlds:
+    given = list(effects)
+    if all(isinstance(effect, Effect) for effect in given):
+        return [cast("tuple[Effect, ...]", tuple(given))] * num_worlds
+    if len(given) != num_worlds:
         raise ValueError(
-            f"there are {len(effects)} lists of effects for {num_worlds} worlds: give one per world, or one for all"
+            f"there are {len(given)} lists of effects for {num_worlds} worlds: give one per world, or one for all"
         )
-    return [tuple(own) for own in effects]
+    return [tuple(cast("Sequence[Effect]", own)) for own in given]
 
 
 def _backend_in(env: EnvBase) -> GymnasiumBackend:
@@ -248,7 +250,7 @@ def _backend_in(env: EnvBase) -> GymnasiumBackend:
 
 def _time_limit(env: EnvBase) -> float:
     """Returns the number of steps after which the task's TimeLimit wrapper truncates; infinite without one."""
-    wrapper = env._env
+    wrapper = cast("Any", env._env)
     while wrapper is not wrapper.unwrapped:
         if isinstance(wrapper, TimeLimit):
             return wrapper._max_episode_steps

@@ -1,5 +1,7 @@
 """DynamicsGap, the TorchRL transform that applies effects to a simulator."""
 
+from typing import cast
+
 import mujoco
 import numpy as np
 import torch
@@ -98,7 +100,7 @@ class DynamicsGap(Transform):
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # a copied or unpickled env may have rebuilt its simulator without the gaps
-        env = _env_of(self)
+        env = self._own_env()
         self._check_place(env)
         gaps = self._gaps_on(env)
         effects = {gap._identity: gap.effects for gap in gaps}
@@ -113,7 +115,7 @@ class DynamicsGap(Transform):
         return super()._reset_env_preprocess(tensordict)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        find_backend(_env_of(self)).episodes.pop(self._identity, None)
+        find_backend(self._own_env()).episodes.pop(self._identity, None)
         return self._call(tensordict_reset)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -121,6 +123,10 @@ class DynamicsGap(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._episode().observe(next_tensordict)
+
+    def _own_env(self) -> EnvBase:
+        """The env of a transform that is on one, as in all methods that an env calls."""
+        return cast("EnvBase", _env_of(self))
 
     def _episode(self) -> GapEpisode:
         """The current episode, begun if there is none."""
@@ -141,7 +147,7 @@ class DynamicsGap(Transform):
     def _pipeline(self, backend: MujocoBackend) -> Pipeline:
         """The gap's effects, with negative noise settled across all gaps of the simulation."""
         # backend.gaps also lists gaps on envs around this one, but not yet a gap that is being put on
-        of_gap = {gap._identity: gap.effects for gap in self._gaps_on(_env_of(self))} | backend.gaps
+        of_gap = {gap._identity: gap.effects for gap in self._gaps_on(self._own_env())} | dict(backend.gaps)
         return Pipeline.balanced_together(of_gap)[self._identity]
 
     @staticmethod
@@ -211,7 +217,7 @@ def _transforms_of(transform: Transform, env: EnvBase) -> list[Transform]:
     root = transform
     while isinstance(container := root.__dict__["_container"](), Transform):
         root = container
-    return [*transforms_of(env.base_env), *transforms_of(root)]
+    return [*transforms_of(cast("TransformedEnv", env).base_env), *transforms_of(root)]
 
 
 def transforms_of(node: EnvBase | Transform) -> list[Transform]:
@@ -219,5 +225,5 @@ def transforms_of(node: EnvBase | Transform) -> list[Transform]:
     if isinstance(node, TransformedEnv):
         return [*transforms_of(node.base_env), *transforms_of(node.transform)]
     if isinstance(node, Compose):
-        return [leaf for child in node for leaf in transforms_of(child)]
+        return [leaf for child in node for leaf in transforms_of(cast("Transform", child))]
     return [node] if isinstance(node, Transform) else []

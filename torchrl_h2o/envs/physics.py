@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -51,7 +52,7 @@ def roll_out(
         control = np.repeat(control, physics_steps, axis=1)
         reached, _ = pool.rollout(models, data, states, control, control_spec=spec)
         return reached[:, physics_steps - 1 :: physics_steps]
-    model = models if isinstance(models, mujoco.MjModel) else models[0]
+    model = cast("mujoco.MjModel", models if isinstance(models, mujoco.MjModel) else models[0])
     reached = []
     for step in range(actions.shape[1]):
         ctrl = actions[:, step]

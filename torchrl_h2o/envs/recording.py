@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -76,7 +77,7 @@ def record(
         for _ in tqdm(range(num_transitions), "recording", unit="step", disable=not progress):
             transition, state = tracked.step_and_maybe_reset(policy(state))
             transitions.append(transition.select(*keys))
-    recording = torch.stack(transitions)
+    recording = cast("TensorDict", torch.stack(transitions))
     recording["next", "truncated"][-1] |= ~recording["next", "terminated"][-1]
     recording["next", "done"][-1] = True
     for key in ("observation", "action", ("next", "observation"), ("next", "reward")):

@@ -55,6 +55,8 @@ class TaskRules(ABC):
 class Running(TaskRules):
     """HalfCheetah: rewards forward velocity minus control cost; never terminates."""
 
+    task: HalfCheetahEnv | HopperEnv | Walker2dEnv
+
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         skipped = int(self.task._exclude_current_positions_from_observation)
         return np.concatenate([qpos[:, skipped:], qvel], axis=1)
@@ -75,6 +77,8 @@ class Running(TaskRules):
 class Walking(Running):
     """Walker2d: as HalfCheetah, with clipped velocities, a healthy reward, and termination when unhealthy."""
 
+    task: HopperEnv | Walker2dEnv
+
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         return super().observe(qpos, np.clip(qvel, -10.0, 10.0))  # Gymnasium's own bounds
 
@@ -93,6 +97,8 @@ class Walking(Running):
 class Hopping(Walking):
     """Hopper: as Walker2d, and healthy only while all other coordinates are within a range."""
 
+    task: HopperEnv
+
     def _is_healthy(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         rest = np.concatenate([qpos[:, 2:], qvel], axis=1)
         return super()._is_healthy(qpos, qvel) & _within(rest, self.task._healthy_state_range).all(1)
@@ -100,6 +106,8 @@ class Hopping(Walking):
 
 class Balancing(TaskRules):
     """The wheel-legged robot: the reward of its task; terminates when it falls."""
+
+    task: WheelLeggedMujocoEnv
 
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         x, theta, v, theta_dot = qpos[:, 0], qpos[:, 2], qvel[:, 0], qvel[:, 2]

@@ -40,7 +40,7 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
     try:
         entries = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except yaml.constructor.ConstructorError as error:
-        line = error.problem_mark.line + 1
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
         raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DataError(f"invalid YAML: {error}", "correct the file", source=source) from error

@@ -84,6 +84,6 @@ def require_finite(
         f"the value is {values[index, position]}",
         "every value must be finite in float32: remove the row and the rows that depend on it, or ignore the column",
         source=source,
-        column=columns[position],
+        column=columns[int(position)],
         row=row_of(int(index)),
     )

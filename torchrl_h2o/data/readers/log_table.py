@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class LogTable:
         return self.values[:, [self.names.index(name) for name in names]]
 
 
-def read_table(path: str, layout: LogColumns) -> LogTable:
+def read_table(path: str | Path, layout: LogColumns) -> LogTable:
     """Read and check the numbers of a log.
 
     Args:

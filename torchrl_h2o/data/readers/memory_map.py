@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -54,7 +55,7 @@ def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
                 column=entry_name(key),
             )
     with whole_folder(folder) as partial:
-        td.detach().contiguous().memmap(partial)
+        td.detach().contiguous().memmap(cast("str", partial))  # annotated for strings; it takes paths as well
     return Path(folder)
 
 

@@ -7,7 +7,7 @@ torchrl 0.14.1 returns zeros for these files without an error.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from tensordict import TensorDict, TensorDictBase
@@ -134,8 +134,9 @@ def write_minari(
     _require_recordable(td, source=dataset_id)
     if env is not None:
         check_specs(td, env, source=dataset_id)
+    make_buffer = cast("Any", EpisodeBuffer)  # annotated for lists; it takes arrays as well
     buffers = [
-        EpisodeBuffer(
+        make_buffer(
             observations=np.concatenate([_array(episode["observation"]), _array(episode["next", "observation"][-1:])]),
             actions=_array(episode["action"]),
             rewards=_array(episode["next", "reward"]).flatten(),
@@ -250,7 +251,7 @@ def _spaces(td: TensorDictBase, env: EnvBase | None) -> tuple:
 
     low, high = -np.inf, np.inf
     if env is not None:
-        space = env.action_spec_unbatched.space
+        space = cast("Any", env.action_spec_unbatched.space)
         low, high = _array(space.low).astype(np.float32), _array(space.high).astype(np.float32)
     return (
         Box(-np.inf, np.inf, td["observation"].shape[1:], np.float32),

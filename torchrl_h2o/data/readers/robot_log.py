@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -134,20 +135,20 @@ def _done(table: LogTable, layout: LogColumns) -> np.ndarray:
             "it must be 0 or 1",
             source=table.source,
             column=column.name,
-            row=table.rows[wrong[0]],
+            row=int(table.rows[wrong[0]]),
         )
     return values.astype(bool)
 
 
 def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndarray) -> None:
-    restarts = np.flatnonzero(done[:-1] & ~done[1:])
-    if len(restarts) and layout.after_done == "error":
+    column, restarts = layout.named("done"), np.flatnonzero(done[:-1] & ~done[1:])
+    if column is not None and len(restarts) and layout.after_done == "error":
         raise DataError(
             "done falls back to 0 after the run has ended",
             "declare what these rows are: after_done: drop, or after_done: new_episode",
             source=table.source,
-            column=layout.named("done").name,
-            row=table.rows[restarts[0] + 1],
+            column=column.name,
+            row=int(table.rows[restarts[0] + 1]),
         )
 
 
@@ -158,7 +159,7 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
         return np.zeros(len(linked), bool)
     time = table.columns([column.name])[:, 0]
     steps = np.diff(time)
-    place = {"source": table.source, "column": column.name}
+    place: dict[str, Any] = {"source": table.source, "column": column.name}
     backwards = np.flatnonzero(linked & (steps <= 0))
     if len(backwards):
         index = backwards[0]
@@ -166,7 +167,7 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
             f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
             "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
             "end of the file with zeros",
-            row=table.rows[index + 1],
+            row=int(table.rows[index + 1]),
             **place,
         )
     dt = _dt(steps[linked], layout, place, settings)
@@ -176,13 +177,13 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
         raise DataError(
             f"the time step is {steps[index]:.9g} s, dt is {dt:.9g} s",
             "correct dt, widen time_tolerance, or set on_time_jump: split",
-            row=table.rows[index + 1],
+            row=int(table.rows[index + 1]),
             **place,
         )
     return jumps
 
 
-def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, str], settings: ReaderSettings) -> float:
+def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any], settings: ReaderSettings) -> float:
     """Return the layout's dt after comparing it with the steps between linked rows, or else their median."""
     if layout.dt is None or not len(steps):
         return float(np.median(steps)) if len(steps) else 0.0
@@ -202,7 +203,7 @@ def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, str], settings: 
 def _time(table: LogTable, layout: LogColumns) -> np.ndarray:
     column = layout.named("time")
     if column is None:
-        return np.arange(len(table.rows)) * layout.dt
+        return np.arange(len(table.rows)) * cast("float", layout.dt)  # a layout has dt or a time column
     return table.columns([column.name])[:, 0]
 
 
@@ -219,7 +220,7 @@ def _bounded(action: np.ndarray, start: np.ndarray, table: LogTable, layout: Log
             "correct unit, scale or bounds, or set outside_bounds: clip",
             source=table.source,
             column=layout.action[position],
-            row=table.rows[start[index]],
+            row=int(table.rows[start[index]]),
         )
     return np.clip(action, low, high), int(outside.sum())
 
@@ -251,5 +252,5 @@ def _rewards(
             source=table.source,
         )
     values = values.reshape(-1, 1)
-    require_finite(values, ["reward"], source=table.source, row_of=lambda index: table.rows[start[index]])
+    require_finite(values, ["reward"], source=table.source, row_of=lambda index: int(table.rows[start[index]]))
     return values

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -93,7 +94,7 @@ def episodes(td: TensorDictBase) -> Iterator[TensorDictBase]:
     Yields:
         One TensorDict per episode, including an unfinished last one.
     """
-    ends = (td["next", "done"].flatten().nonzero().flatten() + 1).tolist()
+    ends = (cast("torch.Tensor", td["next", "done"]).flatten().nonzero().flatten() + 1).tolist()
     if not ends or ends[-1] != len(td):
         ends.append(len(td))
     start = 0
@@ -152,8 +153,9 @@ def require_continuous(td: TensorDictBase, *, source: str | Path = "transitions"
         torchrl_h2o.data.readers.error.DataError: transitions, column 'observation', row 3: the observation
         is not the next observation of the row before; ...
     """
-    inside = ~td["next", "done"][:-1].flatten()
-    same = (td["next", "observation"][:-1] == td["observation"][1:]).flatten(1).all(-1)
+    inside = ~cast("torch.Tensor", td["next", "done"])[:-1].flatten()
+    following, observation = cast("torch.Tensor", td["next", "observation"]), cast("torch.Tensor", td["observation"])
+    same = (following[:-1] == observation[1:]).flatten(1).all(-1)
     jumps = (inside & ~same).nonzero().flatten()
     if len(jumps):
         raise DataError(

@@ -32,6 +32,7 @@ def named_choices(
         {'hip': (0,), 'bknee': (1,), 'fknee': (2,), '*knee*': (1, 2), '*': (0, 1, 2)}
     """
     labels = {i: paths[i][1] or (f"{paths[i][0]}/*" if paths[i][0] else "") for i in eligible}
+    wanted: list[tuple[tuple[int, ...], tuple[Names, ...]]]
     wanted = [((i,), (label,)) for i, label in labels.items() if label]
     if groups and eligible:
         for word, members in families([paths[i][1] for i in eligible]).items():
@@ -39,7 +40,7 @@ def named_choices(
             everything = ("*",) if len(indices) == len(eligible) else ()
             wanted.append((indices, (*everything, f"*{word}*", tuple(labels[i] for i in indices))))
         wanted.append((tuple(eligible), ("*", tuple(labels.values()))))
-    chosen = {}
+    chosen: dict[Names, tuple[int, ...]] = {}
     for indices, patterns in wanted:
         for pattern in patterns:
             if "" in (pattern if isinstance(pattern, tuple) else (pattern,)):  # an element without a name
@@ -50,7 +51,9 @@ def named_choices(
     return chosen
 
 
-def indexed_choices(names: Sequence[str], *, groups: bool = False, singles: bool = True) -> dict[Indices, tuple]:
+def indexed_choices(
+    names: Sequence[str], *, groups: bool = False, singles: bool = True
+) -> dict[Indices, tuple[int, ...]]:
     """Returns selections by indices, no two of which select the same entries.
 
     Args:
@@ -68,7 +71,7 @@ def indexed_choices(names: Sequence[str], *, groups: bool = False, singles: bool
     everything = tuple(range(len(names)))
     if not everything:
         return {}
-    chosen = {None: everything}
+    chosen: dict[Indices, tuple[int, ...]] = {None: everything}
     if singles and len(everything) > 1:
         chosen |= {(i,): (i,) for i in everything}
     if groups:

@@ -62,7 +62,7 @@ class CatalogueEntry:
 def entries_of(
     effect: type[Effect],
     field: str,
-    choices: Mapping[Names | Indices, tuple[int, ...]],
+    choices: Mapping[Names, tuple[int, ...]] | Mapping[Indices, tuple[int, ...]],
     trials: Callable[[tuple[int, ...]], Trials],
 ) -> Iterator[CatalogueEntry]:
     """Yields one entry per selection of what an effect acts on.

@@ -85,7 +85,7 @@ def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[Catalogu
     lengthy = {g for g in shaped if model.geom(g).name in spanned}
     yield from _factors(mechanism, GeomLength, "geoms", chosen(lengthy, everything - lengthy))
     rubbing = chosen(touching, everything - set(touching))
-    own = {names: geoms for names, geoms in rubbing.items() if len(geoms) > 1 or geoms[0] in moving}
+    own = {names: geoms for names, geoms in rubbing.items() if len(geoms) != 1 or geoms[0] in moving}
     yield from entries_of(
         GeomFriction,
         "geoms",

@@ -33,7 +33,7 @@ class JointForce(ForceEffect):
     torque: float = parameter(unit="N·m", bounds=(-1000.0, 1000.0), neutral=0.0)
     joints: Names = "*"
 
-    def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
+    def process(self, model: mujoco.MjModel, rng: np.random.Generator | None) -> Force:
         force = np.zeros(model.nv)
         force[selection.joint_dofs(model, self.joints)] = self.torque
         return lambda data: force
@@ -91,7 +91,7 @@ class QuadraticDrag(ForceEffect):
         return _drag(model, self.bodies, lambda speed: self.coefficient * speed)
 
 
-def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[float], float]) -> Force:
+def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[np.floating], float | np.floating]) -> Force:
     """Returns the drag on bodies for a resistance in N·s/m that depends on the speed in m/s."""
     bodies = selection.body_ids(model, names)
     jacobian = np.zeros((3, model.nv))

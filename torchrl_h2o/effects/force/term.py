@@ -6,6 +6,7 @@ A term is a coefficient times factors from a fixed set. Terms are parsed with pa
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Factor:
         )
 
     @classmethod
-    def _read(cls, function: str, groups: Sequence[str | None]) -> "Factor":
+    def _read(cls, function: str, groups: Sequence[str | Any]) -> "Factor":
         if function == "power":
             return cls(function, groups[0], int(groups[1] or 1))
         if function == "sin":

@@ -29,6 +29,7 @@ class DMControlBackend(MujocoBackend):
     """A dm_control ``Physics``, with the model that the task's module builds."""
 
     owner: Physics
+    env: DMControlWrapper
 
     @classmethod
     def inside(cls, env: EnvBase) -> DMControlBackend | None:

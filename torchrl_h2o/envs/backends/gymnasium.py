@@ -18,6 +18,7 @@ class GymnasiumBackend(MujocoBackend):
     """A :class:`gymnasium.envs.mujoco.MujocoEnv`, with the model of the file ``fullpath``."""
 
     owner: MujocoEnv
+    env: GymWrapper
 
     @classmethod
     def inside(cls, env: EnvBase) -> GymnasiumBackend | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -34,6 +35,9 @@ class StateFeedback(nn.Module):
         target: target in units of the observation, (n,).
         max_torque: bound of the torque, in N·m.
     """
+
+    gains: torch.Tensor
+    target: torch.Tensor
 
     def __init__(self, gains: torch.Tensor, target: torch.Tensor, max_torque: float) -> None:
         super().__init__()
@@ -137,9 +141,11 @@ def noisy_balance_controller(
     # sigma^2 dt / (1 - (1 - theta dt)^2)
     decay = 1.0 - CONTROL_PERIOD / noise_time
     noise = OrnsteinUhlenbeckProcessModule(
-        spec=Bounded(-max_torque, max_torque, (1,)),
+        spec=Bounded(-max_torque, max_torque, torch.Size((1,))),
         theta=1.0 / noise_time,
         sigma=noise_std * math.sqrt((1.0 - decay**2) / CONTROL_PERIOD),
         dt=CONTROL_PERIOD,
     )
-    return TensorDictSequential(BalanceController(task, gains, max_torque), noise)
+    # Any, because TensorDictSequential is annotated to take lists
+    modules: list[Any] = [BalanceController(task, gains, max_torque), noise]
+    return TensorDictSequential(*modules)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from gymnasium import utils
@@ -69,9 +69,9 @@ def reward(task: str, observation: Array, action: Array, next_observation: Array
     """
     effort = (action * action).sum(-1)
     if task == "standing_still":
-        return 30.0 - (next_observation * next_observation).sum(-1) - effort
+        return cast("Array", 30.0 - (next_observation * next_observation).sum(-1) - effort)
     if task == "moving_forward":
-        return 15.0 - (next_observation[..., 0] - TARGET_VELOCITY) ** 2 - effort
+        return cast("Array", 15.0 - (next_observation[..., 0] - TARGET_VELOCITY) ** 2 - effort)
     raise ValueError(_unknown_task(task))
 
 
@@ -154,7 +154,7 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         # this form also terminates for a NaN pitch
         terminated = not abs(self.data.qpos[2]) <= MAX_PITCH
         # the observation before the step is not stored, because neither reward uses it
-        value = reward(self.task, observation, action, observation)
+        value = cast("np.floating", reward(self.task, observation, action, observation))
         return observation, value, terminated, False, {}
 
     def reset_model(self) -> np.ndarray:

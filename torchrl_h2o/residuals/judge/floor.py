@@ -72,7 +72,11 @@ def _standard(values: np.ndarray, rows: np.ndarray, clip: float) -> np.ndarray:
 
 
 def _trained(
-    x: torch.Tensor, y: torch.Tensor, rows: np.ndarray, stopping: np.ndarray, settings: JudgeSettings
+    x: torch.Tensor,
+    y: torch.Tensor,
+    rows: np.ndarray | torch.Tensor,
+    stopping: np.ndarray | torch.Tensor,
+    settings: JudgeSettings,
 ) -> nn.Module:
     """A network trained on some rows, with the weights of its best epoch on others."""
     width = settings.floor_width

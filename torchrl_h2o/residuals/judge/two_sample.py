@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 import torch
 from sklearn.metrics import roc_auc_score
@@ -84,7 +86,7 @@ def _real_and_simulated(
 
     observation = standardised(measured.observation[rows], measured.observation)
     action = standardised(measured.action[rows], measured.action)
-    parts = [
+    parts: list[Any] = [  # torch.cat is annotated for tensors alone
         TensorDict(
             {
                 "observation": observation,
@@ -96,4 +98,4 @@ def _real_and_simulated(
         )
         for outcome, real in ((change[rows], True), (change[rows] - missed, False))
     ]
-    return torch.cat(parts)
+    return cast("TensorDict", torch.cat(parts))

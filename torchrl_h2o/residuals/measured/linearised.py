@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -49,8 +50,9 @@ class Linearised:
     @property
     def known(self) -> np.ndarray:
         """Mask (T) of the rows with a finite observation, step and derivative."""
-        return (
-            np.isfinite(self.observed).all(1) & np.isfinite(self.reached).all(1) & np.isfinite(self.slope).all((1, 2))
+        return cast(
+            "np.ndarray",
+            np.isfinite(self.observed).all(1) & np.isfinite(self.reached).all(1) & np.isfinite(self.slope).all((1, 2)),
         )
 
     def states_at(self, estimate: np.ndarray, state_map) -> np.ndarray:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]  (compiled, without stubs)
 
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -120,7 +120,7 @@ def _exceptional(surprising: np.ndarray, windows: int, settings: OutsideSettings
     """Whether the windows with these first rows, and the events they form, are rare."""
     events = 1 + np.count_nonzero(np.diff(surprising) > settings.horizon)
     few_events = events <= max(2.0, settings.max_event_rate * windows)
-    return 0 < len(surprising) <= settings.max_share * windows and few_events
+    return bool(0 < len(surprising) <= settings.max_share * windows and few_events)
 
 
 def _window_sizes(

@@ -54,7 +54,7 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
     states = state_map.states(true)
     if state_map.hidden:
         rows = np.arange(len(measured)) if rows is None else rows
-        states[np.ix_(rows, state_map.hidden)] = _settled(simulation, measured, states, rows)
+        states[np.ix_(rows, np.asarray(state_map.hidden))] = _settled(simulation, measured, states, rows)
     return states
 
 
@@ -69,7 +69,7 @@ def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, row
     first = np.maximum(rows - measured.settings.settling_steps, 0)
     # before the start of a run, its first row is repeated
     begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])[rows]
-    carried = states[np.ix_(rows, hidden)]
+    carried = states[np.ix_(rows, np.asarray(hidden))]
     for step in range(measured.settings.settling_steps):
         row = np.maximum(first + step, begins)
         now = states[row]

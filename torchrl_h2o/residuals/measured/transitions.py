@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from torchrl_h2o.data import DataError
@@ -69,7 +71,7 @@ class Measured:
         following = _float64(data["next", "observation"])
         _require_width(observation, simulation.state_map.names, "observation", source)
         _require_width(action, simulation.actuators, "action", source)
-        ends = data["next", "done"].flatten().numpy()
+        ends = cast("torch.Tensor", data["next", "done"]).flatten().numpy()
         breaks = ends[:-1] | (following[:-1] != observation[1:]).any(1)
         run = np.concatenate([[0], np.cumsum(breaks)])
         clipped = simulation.state_map.clipped(observation) | simulation.state_map.clipped(following)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy.stats import norm
@@ -55,7 +56,7 @@ class Scatter:
         residual, by_action, by_sensor = residual[calm], by_action[calm], by_sensor[calm]
         if scale is None:
             smallest = 1e-9 * measured.observation.std(0) + 1e-12
-            scale = np.maximum(np.abs(residual).mean(0), smallest)
+            scale = cast("np.ndarray", np.maximum(np.abs(residual).mean(0), smallest))
         model = simulation.model
         free = ~model.actuator_ctrllimited.astype(bool)
         limits = np.where(free[:, None], [-np.inf, np.inf], model.actuator_ctrlrange)

@@ -7,6 +7,7 @@ import html
 import re
 from collections.abc import Sequence
 from io import StringIO
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -24,7 +25,7 @@ _VARIABLES = {_INK: "--ink", _MUTED: "--muted", _SHADE: "--shade", _FLOOR: "--fl
 # points are an image, so their colours are fixed: legible on light and dark pages
 BEFORE, AFTER = "#d9730d", "#2a7de1"
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "report",  # makes the page reproducible
     "text.parse_math": False,  # column names may contain a dollar sign
@@ -161,7 +162,7 @@ def _figure(width: float = 4.0, height: float = 2.4) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _log_scale(axes: Axes, name: str, values: Sequence[float | None]) -> None:
+def _log_scale(axes: Axes, name: Literal["x", "y"], values: Sequence[float | None]) -> None:
     """Sets a logarithmic scale around the values, with ticks in plain numbers."""
     finite = [value for value in map(_positive, values) if np.isfinite(value)]
     low, high = (min(finite), max(finite)) if finite else (0.1, 1.0)

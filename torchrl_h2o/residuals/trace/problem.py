@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -133,13 +134,14 @@ class Problem:
     def _made_by_noise(self) -> np.ndarray:
         """Mean square of the residual that sensor noise causes in each window, (T, H, n)."""
         measured, rng = self.measured, np.random.default_rng(0)
+        sensor_std = cast("np.ndarray", self.sensor_std)  # called only with noisy sensors
         starts = np.concatenate([measured.fitted(self.horizon), measured.judged(self.horizon)])
-        squares = np.zeros((len(measured), self.horizon, len(self.sensor_std)))
+        squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
         for _ in range(self.settings.noise_draws):
-            noise = self.sensor_std * rng.standard_normal(measured.observation.shape)
+            noise = sensor_std * rng.standard_normal(measured.observation.shape)
             moved = np.nan_to_num(self._moved(noise, starts) ** 2, nan=self.settings.worst**2)
             squares[starts] += moved / self.settings.noise_draws
-        return squares + self.sensor_std**2
+        return squares + sensor_std**2
 
     def _rounding(self, starts: np.ndarray) -> np.ndarray:
         """Mean residual, (n), that single-precision rounding of the start states causes."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 from scipy.stats import t as student
 from scipy.stats import wilcoxon
@@ -36,7 +38,7 @@ def p_value(gain: np.ndarray, settings: SignificanceSettings = DEFAULTS.signific
     if spread == 0.0:
         return 0.0 if blocks.mean() > 0.0 else 1.0
     by_size = student.sf(blocks.mean() / spread, len(blocks) - 1)
-    by_rank = wilcoxon(blocks, alternative="greater").pvalue
+    by_rank = cast("Any", wilcoxon(blocks, alternative="greater")).pvalue
     return float(min(1.0, 2.0 * min(by_size, by_rank)))
 
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
+from torchrl_h2o.effects import ResidualForce
 from torchrl_h2o.residuals.explanation import Explanation, Part
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -140,8 +142,8 @@ def _pays(
     gains = after.mean() < (1.0 - rules.min_gain_over_catalogue) * before.mean()
     if not (gains and p_value_of_losses(before, after, test) < test.level):
         return False
-    at_first = (first.held_out_loss([part.effect for part in some]) for some in ((), parts, candidate))
-    return matters(*at_first, rules.min_share)
+    none, present, proposed = (first.held_out_loss([part.effect for part in some]) for some in ((), parts, candidate))
+    return matters(none, present, proposed, rules.min_share)
 
 
 def _beyond_noise(candidate: _Candidate, measured: Measured, rng: np.random.Generator, settings: LoopSettings) -> bool:
@@ -170,4 +172,4 @@ def _shortest(paying: Sequence[tuple[Parts, float]], settings: LoopSettings) -> 
 
 def _description_length(parts: Parts) -> int:
     """Description length: one per effect of the catalogue, one per term of a force."""
-    return sum(1 if part.declared else len(part.effect.terms) for part in parts)
+    return sum(1 if part.declared else len(cast("ResidualForce", part.effect).terms) for part in parts)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.effects import ResidualForce
+from torchrl_h2o.effects import Effect, ResidualForce
 from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -77,8 +78,8 @@ def find_undeclared(
     if p > settings.significance.level or gain.mean() < settings.undeclared.min_gain * losses(before).mean():
         return None
     size = problem.scale_of(judged)
-    errors = [np.sqrt(((size * residual)[:, 0] ** 2).mean(0)) for residual in (before, after)]
-    return Undeclared(found.effects[0], found.ci95(0), *errors, p)
+    error_before, error_after = (np.sqrt(((size * residual)[:, 0] ** 2).mean(0)) for residual in (before, after))
+    return Undeclared(_force_of(found), found.ci95(0), error_before, error_after, p)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +131,7 @@ def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | 
     best, left = None, regression.before
     barred = set()  # degrees of freedom on which a term did not pay
     for _ in range(rules.rounds):
-        effect = best.effects[0] if best else ResidualForce()
+        effect = _force_of(best) if best else ResidualForce()
         added = _best_terms(regression, effect, barred)
         exhausted = left < rules.min_term_gain * regression.before
         if exhausted or not added.terms or len(effect.terms) >= rules.max_terms:
@@ -146,13 +147,13 @@ def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | 
 
 
 def _p_value_further(
-    regression: _Regression, before: Sequence[ResidualForce], after: Sequence[ResidualForce], *, held_out: bool
+    regression: _Regression, before: Sequence[Effect], after: Sequence[Effect], *, held_out: bool
 ) -> float:
     """p-value of the decrease of the loss several steps ahead, from one force to another."""
     measured, steps = regression.problem.measured, regression.settings.undeclared.further_steps
     starts = measured.judged(steps) if held_out else measured.fitted(steps)
-    ahead = [losses(regression.further.residual(forces, starts)) for forces in (before, after)]
-    return p_value_of_losses(*ahead, regression.settings.significance)
+    loss_before, loss_after = (losses(regression.further.residual(forces, starts)) for forces in (before, after))
+    return p_value_of_losses(loss_before, loss_after, regression.settings.significance)
 
 
 def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]) -> SparseForce:
@@ -163,7 +164,7 @@ def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]
     forces = residual_forces(
         simulation, problem.measured, starts, residual=residual, response=regression.response, settings=settings
     )
-    observed = simulation.state_map.restore.any(1)
+    observed = cast("np.ndarray", simulation.state_map.restore.any(1))
     found = [
         sparse_force(
             TermLibrary(freedom, regression.path, observed, settings),
@@ -176,6 +177,11 @@ def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]
     return max(found, key=lambda candidate: candidate.gain, default=SparseForce())
 
 
+def _force_of(fitted: Fit) -> ResidualForce:
+    """Returns the force of a fit that has no other effect."""
+    return cast("ResidualForce", fitted.effects[0])
+
+
 def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
     """The force fitted in the simulation; starting times of steps are kept."""
     free = tuple(name for name in effect.parameters if not name.startswith("start"))
@@ -185,7 +191,7 @@ def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
 def _pruned(regression: _Regression, best: Fit) -> Fit:
     """Removes the term that explains least, as long as the others make up for it."""
     problem, starts = regression.problem, regression.starts
-    while len(terms := best.effects[0].terms) > 1:
+    while len(terms := _force_of(best).terms) > 1:
         rest = [ResidualForce(terms[:i] + terms[i + 1 :]) for i in range(len(terms))]
         alone = [losses(problem.residual((effect,), starts)).mean() for effect in rest]
         candidate = _fitted(regression, rest[int(np.argmin(alone))])

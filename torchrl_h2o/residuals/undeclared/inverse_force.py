@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -57,7 +58,7 @@ def residual_forces(
         residual = residuals(simulation, measured, starts)[:, 0]
     if response is None:
         response = force_response(simulation, measured, starts, settings=settings)
-    finite = np.isfinite(residual).all(1) & np.isfinite(response).all((1, 2))
+    finite = cast("np.ndarray", np.isfinite(residual).all(1) & np.isfinite(response).all((1, 2)))
     residual, response = np.where(finite[:, None], residual, 0.0), np.where(finite[:, None, None], response, 0.0)
     precision, rows = _precision(residual, finite, settings)
     towards = np.einsum("wnv,nm->wmv", response, precision)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -105,7 +106,7 @@ class TermLibrary:
         """The best ``sin(omega t + phase)``, from the peak of a periodogram and a refinement."""
         time = self.path.time.mean(1)
         span = np.ptp(time)
-        step = np.median(np.diff(np.unique(time)))
+        step = np.median(cast("np.ndarray", np.diff(np.unique(time))))
         place = np.round((time - time.min()) / step).astype(int)
         if place.max() > 50 * len(place):  # runs recorded on different days: the periodogram would be too long
             return
