@@ -29,7 +29,7 @@ def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco
     """
     edit_spec(spec, effects)
     with warnings.catch_warnings():
-        # HalfCheetah's own file uses this attribute, and its user cannot change that file
+        # Gymnasium's HalfCheetah file uses this attribute, and the user cannot change that file
         warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")
         return spec.compile()
 
