@@ -23,7 +23,7 @@ def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTIN
         settings: the tolerance for negative noise that exceeds the noise before it.
 
     Returns:
-        The same number of effects in the same order; identical objects where there is no negative noise.
+        The same number of effects in the same order; the same objects if there is no negative noise.
 
     Raises:
         ValueError: if negative noise exceeds the noise before it by more than ``settings.noise_excess``. A smaller

@@ -112,7 +112,7 @@ class Pipeline:
 
     # ---------------------------------------------------------------------------------------------- model
     def edit(self, spec: mujoco.MjSpec) -> None:
-        """Edits a specification in place by the model effects; see :func:`edit_spec`."""
+        """Edits a specification in place with the model effects; see :func:`edit_spec`."""
         edit_spec(spec, self.effects)
 
     def compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:

@@ -9,7 +9,7 @@ from torchrl_h2o.effects.effect import Effect, ModelEffect
 
 
 def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco.MjModel:
-    """Edits a specification by the model effects in their order, then compiles it once.
+    """Edits a specification with the model effects in their order, then compiles it once.
 
     Args:
         spec: the specification, edited in place.
@@ -35,7 +35,7 @@ def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco
 
 
 def edit_spec(spec: mujoco.MjSpec, effects: Iterable[Effect]) -> None:
-    """Edits a specification in place by the model effects in their order, without compiling it.
+    """Edits a specification in place with the model effects in their order, without compiling it.
 
     Args:
         spec: the specification.
