@@ -1,4 +1,4 @@
-"""Runs that take seconds: their settings, and how they are started, read and broken off."""
+"""Runs that take seconds: their settings, and functions that start, read and interrupt them."""
 
 import csv
 import subprocess
@@ -32,7 +32,7 @@ def run(options):
 
 
 def trained(directory, method="h2o+"):
-    """Every number of the last checkpoint, by the file that it stands in."""
+    """Reads the last checkpoint: the bytes of its components, by file name."""
     latest = CheckpointRotation(directory / "checkpoints" / method, keep_last=1).latest()
     with zipfile.ZipFile(latest) as archive:
         return {name: archive.read(name) for name in archive.namelist() if name.startswith("components")}

@@ -1,4 +1,4 @@
-"""Closing the loop as its user does: a command line in, a report out, and training in the mended simulator."""
+"""The close-the-loop command: its report, its errors, and training in the mended simulator."""
 
 import json
 import os
@@ -47,7 +47,7 @@ columns:
 
 @pytest.fixture
 def robot(tmp_path):
-    """An MJCF file, and a log of a robot that is damped more."""
+    """An MJCF file, and a log of a robot with more joint damping than in the file."""
     (tmp_path / "robot.xml").write_text(PENDULUM)
     (tmp_path / "log.yaml").write_text(COLUMNS)
     reality = Simulation.from_mjcf(
@@ -127,7 +127,7 @@ def test_the_overrides_of_a_task_work_as_they_are_said(compose, tmp_path):
 
 
 class GymRecording:
-    """Forty rows that have the sizes of HalfCheetah's."""
+    """Writes 40 random transitions with the dimensions of HalfCheetah's observations and actions."""
 
     @staticmethod
     def write(folder):

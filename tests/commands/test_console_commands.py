@@ -1,4 +1,4 @@
-"""The console commands: declared, complete without a clone, and alike the recipes."""
+"""The console commands: declared in the package, complete without a clone, and with the same help as the recipes."""
 
 import subprocess
 import sys
@@ -31,4 +31,4 @@ def test_command_and_recipe_have_the_same_help(tmp_path, name):
         for arguments in (as_command, as_recipe)
     ]
     assert printed[0] == printed[1]
-    assert printed[0].count(f"  {name} ") >= 3  # examples
+    assert printed[0].count(f"  {name} ") >= 3  # at least three examples

@@ -1,4 +1,4 @@
-"""The paper's grids: which runs they hold, and that a grid loses nothing when it is killed or when a run dies."""
+"""The paper's grids: their runs, and that no result is lost when a grid is killed or a run fails."""
 
 import signal
 import subprocess
@@ -131,7 +131,7 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     process = subprocess.Popen(**asked, text=True)
     while not (second := checkpoint_of(tmp_path, "cql")):
         assert process.poll() is None, process.communicate()[0]
-    process.send_signal(signal.SIGSTOP)  # as good as at work, for as long as we need
+    process.send_signal(signal.SIGSTOP)  # a stopped process keeps its lock on the run folder
     beside = subprocess.run(**command(*GRID, "methods=[cql]", "updates=200", "retries=0", script="paper.py"), text=True)
     assert beside.returncode != 0
     assert "RuntimeError: another process is at work in outputs/paper/results/cql__" in beside.stdout
@@ -151,7 +151,7 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
 
     one = load_config(second)
-    assert one.seeds is None  # or h2o_plus.py would go on with it as a population
+    assert one.seeds is None  # otherwise h2o_plus.py would resume it as a population
     moved = [*GRID[:-1], "results=elsewhere/results.csv", "methods=[cql]", "updates=200"]
     done = subprocess.run(**command(*moved, script="paper.py"), text=True, check=False)
     assert done.returncode == 0, done.stdout
@@ -189,7 +189,7 @@ def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
 
 
 def test_a_run_that_died_once_is_done_by_the_second_try(tmp_path, monkeypatch):
-    """As when a worker is killed, which takes the launcher's other jobs with it."""
+    """The launcher fails as a whole, as it does when one worker is killed."""
     launched = []
 
     class Launcher:
@@ -229,7 +229,7 @@ def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path
 
 
 def checkpoint_of(folder, method):
-    """The folder of that method's run, once it has a checkpoint."""
+    """Returns the folder of a method's run if it has a checkpoint, otherwise a false value."""
     found = list(folder.glob(f"outputs/paper/results/{method}__*"))
     return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
 
@@ -242,4 +242,4 @@ def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(comman
     assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
     assert "these runs failed:\n  method=h2o_plus" in done.stdout
     assert "ValueError: backbone=huber: choose expectile" in done.stdout
-    assert done.stdout.count("run folder:") == 3  # it was tried again, once
+    assert done.stdout.count("run folder:") == 3  # IQL once, H2O+ twice, because it is tried again once

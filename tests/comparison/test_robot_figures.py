@@ -1,4 +1,4 @@
-"""The robot's figures: what they show is what the run's own table and data hold, in metres and radians."""
+"""The robot's figures: their values, in metres and radians, equal those in the run's table and data."""
 
 import json
 import math
@@ -33,13 +33,13 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     lasts = json.loads((folder / "summary.json").read_text())["return_real"]["mean_length"] * cfg.env.seconds_per_step
     seen = (~np.isnan(way)).sum() / 5 * EVERY
     assert seen <= lasts < seen + EVERY
-    assert 0.0 < abs(way[:, 0]).max() < 0.5  # m, after 0.2 s from the origin
+    assert 0.0 < abs(way[:, 0]).max() < 0.5  # m; position 0.2 s after the start at the origin
 
     pitch, rate = simulated_states(cfg, folder).T
     assert len(pitch) == states.sum() == cfg.steps_per_epoch
-    assert abs(pitch[0]) <= 0.05 + 1e-3  # rad, where episodes begin at most
+    assert abs(pitch[0]) <= 0.05 + 1e-3  # rad; bound of the initial pitch
     assert abs(rate[0]) <= 0.05 + 1e-3
-    assert 0.05 < abs(pitch).max() < 1.5 * MAX_PITCH  # and where they end
+    assert 0.05 < abs(pitch).max() < 1.5 * MAX_PITCH  # rad; episodes end at MAX_PITCH
 
     shutil.rmtree(folder)
     again = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)

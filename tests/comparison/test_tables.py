@@ -1,4 +1,4 @@
-"""The report, from a fixture of results: what stands in its tables, and its statistics against plain arithmetic."""
+"""The tables of a fixture of results, and their statistics compared with plain arithmetic."""
 
 import csv
 import subprocess
@@ -30,7 +30,7 @@ GAPS = ("gravity", "friction")
 
 
 def fixture():
-    """Three methods, two gaps, three seeds; IQL saw no simulator."""
+    """Three methods, two gaps, three seeds; IQL uses no simulator."""
     rows = []
     for seed in range(3):
         rows.append(row("iql", seed, 1000 + 100 * seed, gap=""))
@@ -74,7 +74,7 @@ def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
     head, _, *lines = text.splitlines()
     assert head.endswith("| H2O+ | SAC |")
     assert lines[-1].endswith("| paper |  | 4,513 ± 513 |")
-    assert lines[-2].endswith("| score | 19.2 | 7.1 |")  # of D4RL's -280 to 12,135
+    assert lines[-2].endswith("| score | 19.2 | 7.1 |")  # 0 is -280, 100 is 12,135, as in D4RL
     assert lines[-3].endswith("| ours | 2,100 ± 100 (3) | 600 ± 100 (3) |")
 
 
@@ -137,10 +137,11 @@ def test_the_interquartile_mean_is_that_of_the_middle_half():
     means = interquartile_means(scores, reps=100)
     assert scores.seeds == [0, 1, 2]
     values = sorted(normalised(2000 + 100 * s - h, REFERENCES["HalfCheetah-v5"]) for s in range(3) for h in (0, 500))
-    assert means["h2o_plus"].value == pytest.approx(np.mean(values[1:-1]))  # a quarter of six is one and a half: one
+    # a quarter of six values is 1.5, so one value is dropped at each end
+    assert means["h2o_plus"].value == pytest.approx(np.mean(values[1:-1]))
     assert means["h2o_plus"].low <= means["h2o_plus"].value <= means["h2o_plus"].high
     np.random.seed(7)
-    assert interquartile_means(scores, reps=100) == means  # whatever state the global generator is in
+    assert interquartile_means(scores, reps=100) == means  # independent of the global generator's state
 
 
 def test_the_probability_of_improvement_counts_pairs_of_runs():

@@ -99,7 +99,7 @@ def test_what_is_added_to_a_joint_adds_up_on_that_joint(effect, field):
 def test_more_damping_than_there_is_cannot_be_taken_away():
     less = compile_model(spec("HalfCheetah"), [JointDamping(-2.0, joints="bthigh")])
     assert less.dof_damping[3] == 4.0
-    with pytest.raises(ValueError, match=r"joint 'bthigh' has a damping of 6, 7 cannot be removed"):
+    with pytest.raises(ValueError, match=r"joint 'bthigh' has a damping of 6, so 7 cannot be removed"):
         compile_model(spec("HalfCheetah"), [JointDamping(-7.0, joints="bthigh")])
 
 

@@ -1,4 +1,4 @@
-"""Negative noise: the remaining noise of the effects before it, and errors if there is too little."""
+"""Negative noise: the remaining noise of the effects before it, and errors if they add too little noise."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The pipeline: effects applied step by step and to whole runs, in order, with settled noise and marked randomness."""
+"""The pipeline: effects applied step by step and to whole runs, in order, with negative noise and ``random``."""
 
 from dataclasses import dataclass
 from typing import ClassVar

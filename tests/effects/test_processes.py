@@ -68,7 +68,7 @@ def test_a_delayed_step_has_the_impulse_of_the_delayed_command_signal(delay, com
     late = ActionDelay(delay).process(DT, rng())
     for step, command in enumerate(commands):
         executed = late(command)
-        # reference: each command held for a step, zero before the first, integrated over this step
+        # reference: each command is held for a step, zero before the first one; the result is integrated over this step
         start, expected = step - delay / DT, np.zeros(3)
         for index, held in enumerate(commands[: step + 1]):
             expected += held * max(0.0, min(start + 1, index + 1) - max(start, index))

@@ -117,8 +117,8 @@ def test_text_that_is_no_term_is_refused(text):
     ("text", "complaint"),
     [
         ("torque on elbow: 1", "no joint named 'elbow'; it has slider, hinge"),
-        ("torque on slider: 1", "acts a force"),
-        ("force on hinge: 1", "acts a torque"),
+        ("torque on slider: 1", "takes a force"),
+        ("force on hinge: 1", "takes a torque"),
         ("torque on hinge: 1 · a2", "counted from 0"),
     ],
 )

@@ -53,7 +53,7 @@ def test_a_damped_spring_settles_at_its_shifted_rest(angle):
 def test_what_has_no_spring_has_no_rest_and_no_stiffness_to_take():
     with pytest.raises(ValueError, match="no joint of hinge has a stiffness"):
         sprung(JointRest(0.1))
-    with pytest.raises(ValueError, match="joint 'hinge' has a stiffness of 1, 2 cannot be removed"):
+    with pytest.raises(ValueError, match="joint 'hinge' has a stiffness of 1, so 2 cannot be removed"):
         sprung(JointSpring(-2.0), stiffness=1.0)
 
 

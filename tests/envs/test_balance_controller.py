@@ -150,7 +150,7 @@ def test_controller_balances_in_reality_but_wanders(task):
 
 def test_gains_that_are_best_in_the_simulator_alone_fall_in_reality():
     # the linear-quadratic regulator of the simulator's linearisation with costs of
-    # theta^2 + 300 x^2 + 0.001 tau^2: stiff, and optimal only without actuation delay
+    # theta^2 + 300 x^2 + 0.001 tau^2: high gains, optimal only without actuation delay
     stiff = {"theta": 207.6, "theta_dot": 36.0, "x": 428.5, "v": 164.0}
     for world, falls in (("simulator", False), ("reality", True)):
         data = record(make(world), BalanceController(gains=stiff), 1200, 0, progress=False)

@@ -42,7 +42,7 @@ def test_a_gap_of_the_paper_holds_the_specs_and_changes_the_model(task, name):
     assert same == (name == "joint_noise")
 
 
-@pytest.mark.parametrize(("domain", "name"), sorted(MISSING))  # every worker must collect the same order
+@pytest.mark.parametrize(("domain", "name"), sorted(MISSING))  # every worker of pytest needs the same order
 def test_a_gap_that_walker_does_not_have_is_refused(domain, name):
     with pytest.raises(ValueError, match="cannot be put into model 'planar walker'"):
         TransformedEnv(DMControlEnv(domain, "walk"), dynamics_gap(name))
@@ -58,7 +58,7 @@ def test_neutral_effects_leave_every_bit_of_a_rollout(task):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_force_of_nothing_leaves_every_bit_of_a_rollout(task):
-    # 1e-320 is not neutral, so the physics steps are taken one by one; the force vanishes in rounding
+    # 1e-320 is not neutral, so physics steps are taken one by one, but the force is below rounding
     env = TransformedEnv(DMControlEnv(*task), DynamicsGap(LinearDrag(1e-320)))
     assert (rollout(env) == rollout(DMControlEnv(*task))).all()
 

@@ -1,4 +1,4 @@
-"""DynamicsGap with negative noise, settled within one gap and across gaps."""
+"""DynamicsGap with negative noise, subtracted within one gap and across gaps."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""Small networks and batches for the losses' tests, all seeded, in float64 unless a test asks otherwise."""
+"""Small seeded networks and batches for the tests of the losses; float64 by default."""
 
 import pytest
 import torch
@@ -21,7 +21,7 @@ CELLS = (8, 8)
 
 
 def _spread(module: torch.nn.Module) -> torch.nn.Module:
-    """Last layers start close to zero; spread them, so that a term that is missing shows."""
+    """Draws all parameters anew: last layers start near zero, where a missing term would go unnoticed."""
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.5)
@@ -53,7 +53,7 @@ def make_batch(num_real: int = 4, num_sim: int = 3, seed: int = 0, dtype=torch.f
 
 
 class Parts:
-    """Fresh networks of one seed and the losses built of them."""
+    """Newly built networks of one seed, and the losses that use them."""
 
     def __init__(self, seed: int = 0, dtype=torch.float64) -> None:
         torch.manual_seed(seed)
@@ -81,13 +81,13 @@ class Parts:
 
 
 def _split(kwargs: dict) -> tuple[dict, dict]:
-    """Arguments of H2OPlusLoss, and those of its MixedBellmanLoss."""
+    """Splits keyword arguments into those of H2OPlusLoss and those of its MixedBellmanLoss."""
     own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "target_entropy") if key in kwargs}
     return own, {key: value for key, value in kwargs.items() if key not in own}
 
 
 def _move_targets(loss):
-    """Targets apart from the online networks, so that reading the wrong one shows."""
+    """Moves the target networks away from the online ones, so that a test fails if a loss uses the wrong one."""
     with torch.no_grad():
         for target in loss.target_qvalue_network_params.values(True, True):
             target.add_(0.1 * torch.randn_like(target))

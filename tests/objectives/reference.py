@@ -1,4 +1,4 @@
-"""The paper's formulas once more, in Python floats and loops, sharing no line with the code under test."""
+"""Independent reference of the paper's formulas, in Python floats and loops."""
 
 import math
 

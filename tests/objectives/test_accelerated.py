@@ -1,4 +1,4 @@
-"""Networks with parameters held apart: run as modules or as matrix products, the numbers and gradients agree."""
+"""Networks evaluated as modules or as matrix products: values and gradients agree."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Mixed Bellman loss: Eqs. (7) and (8), their limits, and invariance to how a batch is put together."""
+"""Mixed Bellman loss: Eqs. (7) and (8), their limits, and invariance to the order and composition of a batch."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ from torchrl_h2o.objectives import MixedBellmanLoss
 
 @pytest.fixture(autouse=True)
 def noise(monkeypatch):
-    """The policy's noise, the same for a row wherever the row stands in the batch."""
+    """Replaces the policy's noise by a function of the row, independent of the row's position in the batch."""
     from torchrl.modules import TanhNormal
 
     def of_rows(loc):
@@ -30,7 +30,7 @@ def noise(monkeypatch):
 
 
 def reference_loss(loss, batch, mixing, noise, gamma=0.99, alpha=1.0):
-    """Eq. (8) row by row; also the targets."""
+    """Eq. (8), computed row by row; also returns the targets."""
     actor = reference.layers(loss.actor_network_params)
     value = reference.layers(loss.value_network_params)
     qvalues, targets = (

@@ -1,4 +1,4 @@
-"""H2O's objective, Eq. (1): its conservative term, its weights, and what it is without them."""
+"""H2O's objective, Eq. (1): its conservative term, its weights, and the objective without weights."""
 
 import copy
 import math
@@ -22,7 +22,7 @@ def h2o(parts, alpha_c=0.3, **kwargs):
 
 
 def weighted(parts, batch):
-    """The batch with everything that H2O's objective reads."""
+    """Adds the entries that H2O's objective reads to a batch."""
     parts.estimator(batch)
     return batch.set("dynamics_divergence", torch.linspace(0.2, 3.0, batch.shape[0], dtype=torch.float64))
 
@@ -72,7 +72,7 @@ def test_the_bellman_terms_are_those_of_equation_1(parts, batch):
 
 
 def test_the_divergence_is_the_mean_log_ratio_at_noisy_next_states_clamped(parts, batch):
-    with torch.no_grad():  # rows look simulated, some more, some less: above the bounds, below, and between them
+    with torch.no_grad():  # ratios of the rows lie above, below and between the bounds
         parts.estimator.sas_network.module[-1].weight *= 0.2
         parts.estimator.sas_network.module[-1].bias[:] = torch.tensor([-0.2, 0.2])
     noise = torch.tensor([0.1, 1.0, 3.0], dtype=torch.float64)
@@ -94,7 +94,7 @@ def test_the_divergence_is_the_mean_log_ratio_at_noisy_next_states_clamped(parts
 
 def test_next_states_are_noisy_whatever_their_key_is(parts, batch):
     sas = parts.estimator.sas_network
-    with torch.no_grad():  # rows look simulated, some more, some less
+    with torch.no_grad():  # ratios differ between rows
         sas.module[-1].bias[:] = torch.tensor([-2.0, 2.0])
     flat = TensorDictModule(sas.module, in_keys=["observation", "action", "next_observation"], out_keys=sas.out_keys)
     batch["next_observation"] = batch["next", "observation"].clone()

@@ -1,4 +1,4 @@
-"""H2O+ as a whole: Eq. (10), beta, who moves whom, and swapping its parts."""
+"""H2O+ as a whole: Eq. (10), beta, which loss moves which parameters, and exchange of its parts."""
 
 import copy
 
@@ -173,7 +173,7 @@ def test_the_loss_s_own_ratio_weighs_the_simulated_rows(parts, batch):
     own, given = parts.h2o_plus(), Parts().h2o_plus(ratio=False)
     given.load_state_dict({k: v for k, v in own.state_dict().items() if not k.startswith("ratio_loss")})
     losses = own(batch)
-    assert "dynamics_ratio" not in batch.keys()  # a stale ratio would weigh the next call
+    assert "dynamics_ratio" not in batch.keys()  # a stored ratio would be used as weight in the next call
     ratio = parts.estimator(batch.copy())["dynamics_ratio"]
     assert losses["dynamics_ratio"].item() == pytest.approx(ratio[~batch["real"]].mean().item())
     torch.manual_seed(2)
@@ -181,7 +181,7 @@ def test_the_loss_s_own_ratio_weighs_the_simulated_rows(parts, batch):
     torch.manual_seed(2)
     weighted = given(batch.copy().set("dynamics_ratio", ratio))["loss_qvalue"]
     assert weighted != unweighted
-    own.ratio_loss.eval()  # no input noise: the policy's samples are the same in both
+    own.ratio_loss.eval()  # without input noise the policy's samples are the same in both calls
     torch.manual_seed(2)
     torch.testing.assert_close(own(batch)["loss_qvalue"], weighted)
 

@@ -1,4 +1,4 @@
-"""Dynamics ratio: Eq. (9), its switches, and what the trained estimator says where the truth is known."""
+"""Dynamics ratio: Eq. (9), its options, and the trained estimator compared with known ratios."""
 
 import math
 
@@ -87,7 +87,7 @@ def test_ratio_is_a_constant(parts, batch):
 def test_accuracy_weighs_both_streams_the_same(parts):
     batch = make_batch(90, 10)
     estimator = parts.estimator
-    with torch.no_grad():  # a classifier that says 'real' whatever it sees
+    with torch.no_grad():  # a classifier that predicts 'real' for every input
         for network in (estimator.sa_network, estimator.sas_network):
             network.module[-1].weight.zero_()
             network.module[-1].bias.copy_(torch.tensor([1.0, -1.0]))
@@ -95,11 +95,11 @@ def test_accuracy_weighs_both_streams_the_same(parts):
 
 
 def gaussian_transitions(size, real_shift, sim_shift, rng, std=0.5):
-    """s' = s + a + shift(s, a) + std * noise on the line; returns a marked batch and the true log ratio."""
+    """s' = s + a + shift(s, a) + std * noise on the line; returns a batch with ``real`` and the true log ratio."""
     real = torch.arange(size) < size // 2
     observation = torch.randn(size, 1, generator=rng)
     action = torch.rand(size, 1, generator=rng) * 2 - 1
-    action = torch.where(real[:, None], action + 0.3, action)  # other behaviour: the ratio must not see it
+    action = torch.where(real[:, None], action + 0.3, action)  # the ratio must not depend on the policy
     means = [observation + action + shift * torch.sin(observation + action) for shift in (real_shift, sim_shift)]
     mean = torch.where(real[:, None], *means)
     following = mean + std * torch.randn(size, 1, generator=rng)

@@ -1,4 +1,4 @@
-"""The perceptron that is one node of the graph: values, gradients, and what stacks losses."""
+"""The perceptron as a single node of the autograd graph: values, gradients, and stacking with vmap."""
 
 import itertools
 

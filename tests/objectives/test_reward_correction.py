@@ -1,4 +1,4 @@
-"""DARC's reward: what a simulated step is paid, and that nothing changes where the simulator is right."""
+"""DARC's reward: the correction of simulated steps, which is zero if the simulator is exact."""
 
 import math
 
@@ -28,7 +28,7 @@ def networks(estimator):
 
 
 def without_gap(estimator):
-    """Discriminators that find nothing in s' that (s, a) did not tell."""
+    """Discriminators for which s' adds no information to (s, a)."""
     with torch.no_grad():
         for parameter in estimator.sas_network.parameters():
             parameter.zero_()
@@ -81,7 +81,7 @@ def test_discriminators_that_have_learnt_correct_little_in_a_right_simulator_and
 
 
 def two_streams(gap, size=256):
-    """s' = s + a + noise in both, ``gap`` more in the simulator, where states lie elsewhere too."""
+    """s' = s + a + noise in both streams, plus ``gap`` in the simulator; the states also differ between the streams."""
     real = torch.arange(size) < size // 2
     observation = torch.randn(size, 1) + 0.5 * real[:, None]
     action = torch.randn(size, 1)

@@ -1,4 +1,4 @@
-"""What a TorchRL user expects of any loss: keys, dispatch, reductions, copies, dtypes and compilation."""
+"""TorchRL's conventions for losses: keys, dispatch, reductions, copies, dtypes and compilation."""
 
 import copy
 import pickle

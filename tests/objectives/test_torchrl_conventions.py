@@ -1,4 +1,4 @@
-"""What TorchRL's own test base asks of a loss module, asked of ours."""
+"""The checks of TorchRL's own test base for loss modules, applied to these losses."""
 
 import copy
 

@@ -1,4 +1,4 @@
-"""In-sample value losses: the formulas, their gradients, and which rows count."""
+"""In-sample value losses: the formulas, their gradients, and which rows enter the loss."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""The main job as its user runs it: a command line in, files out, and continuing after an interruption."""
+"""The main job as a command: its files, and its resumption after an interruption."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""A motored pendulum with forces that are in no catalogue, and data recorded from it."""
+"""A motored pendulum with forces outside the catalogue, and data recorded from it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -25,7 +25,7 @@ FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1
 ROWS = 5000
 
 
-# the classifier is tested by itself; here it only has to run
+# the classifier has its own tests; here it only has to run
 SETTINGS = LoopSettings(judge=JudgeSettings(classifier_updates=20))
 
 

@@ -33,14 +33,14 @@ def test_a_force_that_nobody_declared_stands_beside_declared_effects():
 
 
 def test_a_force_stands_in_the_place_of_effects_that_it_explains_better():
-    """Friction and gravity of the catalogue do not take a part of the ripple."""
+    """The explanation is the force alone; friction and gravity of the catalogue do not explain a part of the ripple."""
     (part,) = explained(RIPPLE).parts
     assert not part.declared
     assert part.effect.parameters["frequency_1"].value == pytest.approx(7.0, rel=0.01)
 
 
 def test_a_force_that_starts_late_is_not_called_one_that_was_always_there():
-    """After a constant force is fitted, the remaining residual resembles no term beside it."""
+    """No term beside the catalogue's constant force fits the residual; a step in time replaces this force."""
     late = UnknownForce(0.2, lambda q, v, t: (t >= 8.0) + 0.0 * q)
     (part,) = explained(late, catalogue=[CONSTANT], rows=2500).parts
     assert not part.declared

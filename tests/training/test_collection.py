@@ -1,4 +1,4 @@
-"""Workers, on this machine or on many, feed the same recipe: weights go out, transitions come in, none stays behind."""
+"""Collection by workers on one machine or several: weights are sent, transitions arrive, and all workers are closed."""
 
 import multiprocessing
 import shutil
@@ -22,7 +22,7 @@ WORKERS = ["multi_sync", pytest.param("ray", marks=needs_ray)]
 
 @pytest.fixture
 def compose(compose, monkeypatch):
-    monkeypatch.setenv("RAY_ADDRESS", "local")  # whatever cluster this machine is in, or was
+    monkeypatch.setenv("RAY_ADDRESS", "local")  # ignores any cluster that this machine is or was part of
     return lambda *overrides: compose("updates=20", "updates_per_epoch=10", "keep=last", *overrides)
 
 
@@ -44,7 +44,7 @@ def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind,
 
     def stop_and_go_on(self, epoch, **metrics):
         workers.append(len(multiprocessing.active_children()))
-        if epoch == 1:  # what is on disk is what an interruption would leave
+        if epoch == 1:  # the files on disk are those that an interruption would leave
             shutil.copytree(self.directory, tmp_path / "parts")
         log(self, epoch, **metrics)
 
@@ -94,7 +94,7 @@ def test_an_epoch_is_drawn_from_its_seed_and_the_weights_that_were_sent(compose,
     assert (first == not_sent).all()
     assert not torch.equal(first["action"], other["action"])
     assert not torch.equal(first["action"], sent["action"])
-    assert not torch.equal(first["action"][0], first["action"][1])  # workers have streams of their own
+    assert not torch.equal(first["action"][0], first["action"][1])  # each worker has its own random stream
     assert not ray.is_initialized()
 
 

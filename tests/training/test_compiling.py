@@ -1,4 +1,4 @@
-"""Compiled losses: the same numbers, where they pay and where they can be had."""
+"""Compiled losses: same values, used where they are faster and available."""
 
 import shutil
 
@@ -19,7 +19,7 @@ def learner_of(cfg, real):
 
 
 def updated(learner, updates=4):
-    """What some updates make of the parameters."""
+    """Returns the parameters after some updates."""
     torch.manual_seed(0)
     for _ in range(updates):
         learner.update()
@@ -41,7 +41,7 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     counters.clear()
     learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
     torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-6)
-    assert counters["stats"]["unique_graphs"] == 1  # neither broken, nor compiled a second time
+    assert counters["stats"]["unique_graphs"] == 1  # no graph break and no recompilation
     assert not counters["graph_break"]
 
 

@@ -1,4 +1,4 @@
-"""What the learner sees: real data and environments show it in the same way."""
+"""Observations for the learner: real data and environments are transformed in the same way."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def cfg():
 
 
 def rollout(env):
-    """Twenty transitions of the same torques, over three episodes that start alike."""
+    """Twenty transitions under fixed random torques, over three episodes with fixed initial states."""
     env.set_seed(0)
     torch.manual_seed(0)
     data = env.rollout(20, break_when_any_done=False)
@@ -41,7 +41,8 @@ def test_real_data_are_stacked_as_the_environment_stacks(cfg):
     for key in ("observation", ("next", "observation")):
         torch.testing.assert_close(shown[key], seen[key], atol=1e-5, rtol=1e-4)
     assert not torch.equal(shown["observation"][1, :4], shown["observation"][1, 8:])
-    assert torch.equal(shown["observation"][7, :4], shown["observation"][7, 8:])  # an episode's first, repeated
+    # at the start of an episode the first observation is repeated
+    assert torch.equal(shown["observation"][7, :4], shown["observation"][7, 8:])
     assert raw["observation"].shape == (20, 4)
 
 
@@ -66,7 +67,7 @@ def test_a_world_is_evaluated_as_one_env_is(cfg, actor):
     OmegaConf.update(cfg, "env.make.reset_noise", 0.0, force_add=True)
     alone, batched = evaluate(make_reality(cfg), actor, episodes=1), evaluate(make_reality(cfg, 1), actor, episodes=1)
     assert batched.lengths == alone.lengths
-    assert alone.lengths[0] < 500  # it fell over
+    assert alone.lengths[0] < 500  # the robot fell
     assert batched.returns == pytest.approx(alone.returns, rel=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""The learning curve: the label of the data's own return."""
+"""The learning curve: the label of the return of the data."""
 
 from types import SimpleNamespace
 

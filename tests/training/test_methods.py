@@ -1,4 +1,4 @@
-"""Every method of the comparison: it trains through the one recipe, goes on where it stopped, and can be replayed."""
+"""Every method of the comparison: it trains with the common loop, resumes where it stopped, and can be evaluated."""
 
 import json
 import math
@@ -60,7 +60,7 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
 
 
 def method_policy(method, cfg, real, directory):
-    """The policy that the method starts with."""
+    """The method's initial policy: training with a learning rate of zero."""
     still = cfg.copy()
     still.lr = 0.0
     return train(method, still, real, directory)[0]
@@ -103,7 +103,7 @@ def test_no_gap_touches_a_method_that_learns_from_real_data_alone(compose, tmp_p
 
 
 def parts(name, compose, *overrides):
-    """A method's learner and its first batches, the same at each call."""
+    """Returns a method's learner and its first batches; every call returns the same numbers."""
     cfg, real = compose(f"method={name}", *overrides, config="train")
     torch.manual_seed(0)
     spec = make_reality(cfg).action_spec_unbatched

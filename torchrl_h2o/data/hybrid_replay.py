@@ -1,8 +1,8 @@
 """A replay buffer whose batches contain real and simulated transitions, marked by the entry ``real``.
 
-TorchRL's ``ReplayBufferEnsemble`` and ``OfflineToOnlineReplayBuffer`` do not serve here. The first stacks equal shares
+TorchRL's ``ReplayBufferEnsemble`` and ``OfflineToOnlineReplayBuffer`` are not used here. The first stacks equal shares
 into [2, B/2], cannot write to a single member and saves the real data with every checkpoint. The second does not mark
-the rows and has no checkpoint. Both need three to five times as long per batch, because they first gather TensorDicts
+the rows and has no checkpoint. Both take three to five times as long per batch, because they first gather TensorDicts
 of views. This buffer is composed of two plain ``ReplayBuffer`` objects, and its ``sample`` gathers each entry once per
 stream, directly from the storage.
 """
@@ -45,10 +45,11 @@ class HybridReplayBuffer:
     restored generator state continues them.
 
     Args:
-        real: flat TED transitions of batch size [T], in memory or memory-mapped; copied only to another device.
-        sim_capacity: number of simulated transitions that are kept; then the oldest are overwritten.
+        real: flat TED transitions of batch size [T], in memory or memory-mapped; copied only if they are on another
+            device.
+        sim_capacity: largest number of simulated transitions; then the oldest are overwritten.
         batch_size: numbers of real and simulated rows in a batch.
-        keys: the entries of a batch, which both streams must have; their other entries are ignored.
+        keys: the entries of a batch. Both streams must have them; other entries of the streams are ignored.
         device: device of the data and the batches.
         scratch_dir: folder for memory-mapped simulated data, for capacities beyond the memory.
         sim_memory: tensors of batch size [sim_capacity] that hold the simulated data; their initial values are

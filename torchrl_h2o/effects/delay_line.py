@@ -1,4 +1,4 @@
-"""Delays a signal by any number of steps, fractions included: step by step, or a whole run at once."""
+"""Delays a signal by a number of steps that need not be whole: step by step, or a whole run at once."""
 
 from collections import deque
 from collections.abc import Callable
@@ -12,7 +12,7 @@ def delay_line(steps: float, before: Callable[[np.ndarray], np.ndarray]) -> Call
     Args:
         steps: the delay k + f, in steps; the fraction f mixes two neighbours, (1 - f) · v(t - k) +
             f · v(t - k - 1).
-        before: returns, from the first value, the value to assume before it.
+        before: returns the value to assume before the first one, given the first one.
 
     Returns:
         A function from a value (n,) to the delayed one, a new array.

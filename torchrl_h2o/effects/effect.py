@@ -18,7 +18,7 @@ from torchrl_h2o.effects.indices import Indices, checked_indices
 from torchrl_h2o.effects.parameter import Parameter
 from torchrl_h2o.effects.selection import Names, checked_names
 
-# keyed by the fields' types, both as types and as the strings of ``from __future__ import annotations``
+# by a field's type, which is a string in modules with ``from __future__ import annotations``
 _SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_indices, "Indices": checked_indices}
 
 EntryNames = Mapping[str, Sequence[str]]
@@ -130,7 +130,7 @@ class Effect(ABC):
 
 
 def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> str:
-    """Words for a selection: "all joints" for ``"*"``; "actuators 0, 2" for ``(0, 2)``, or the names of these."""
+    """Words for a selection: "all joints" for ``"*"``; "actuators 0, 2" for ``(0, 2)``, or their names."""
     if chosen is None or chosen == "*":
         return f"all {field}"
     selected: tuple[Any, ...] = (chosen,) if isinstance(chosen, str) else chosen
@@ -171,8 +171,8 @@ class ActionEffect(Effect):
             rng: the episode's random generator, shared by its random effects.
 
         Returns:
-            A function from the commanded to the executed action, both (..., nu), called once per control step. It
-            holds the state of the episode, because the effect itself is frozen.
+            A function from the commanded to the executed action, both (..., nu), called once per control step. The
+            function holds the state of the episode, because the effect itself is frozen.
         """
 
     def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
@@ -208,10 +208,10 @@ class ForceEffect(Effect):
             rng: the episode's random generator, shared by its random effects.
 
         Returns:
-            A function from the state before a physics step (``qpos``, ``qvel``, ``ctrl``, ``time``, with the bodies'
-            positions and velocities up to date; read only) to the forces in N and torques in N·m on every degree of
-            freedom, (nv,), which the caller does not write to. It holds the state of the episode, because the effect
-            itself is frozen.
+            A function from the state before a physics step to the force in N or torque in N·m on every degree of
+            freedom, (nv,). It reads ``qpos``, ``qvel``, ``ctrl`` and ``time``, and the bodies' positions and
+            velocities, which are up to date; it must not write to them. The caller must not write to the result. The
+            function holds the state of the episode, because the effect itself is frozen.
 
         Raises:
             ValueError: if the model has no element that the effect could act on.
@@ -226,7 +226,7 @@ class ForceEffect(Effect):
 
         Returns:
             A function from ``qpos`` (B, nq), ``qvel`` (B, nv), ``ctrl`` (B, nu) and ``time`` (B,) to the generalised
-            forces (B, nv), which the caller does not write to.
+            forces (B, nv). The caller must not write to the result.
 
         Raises:
             ValueError: if the model has no element that the effect could act on.

@@ -9,13 +9,13 @@ Indices = tuple[int, ...] | None
 
 
 def checked_indices(value: Any) -> Indices:
-    """Converts an index or several to a tuple, keeps None; raises ValueError for anything else."""
+    """Converts one index or several to a tuple and keeps None; raises ValueError for anything else."""
     if value is None:
         return None
     indices = tuple(value) if isinstance(value, Iterable) else (value,)
     if indices and all(isinstance(i, int | np.integer) and not isinstance(i, bool) and i >= 0 for i in indices):
         return tuple(int(index) for index in indices)
-    raise ValueError(f"{value!r} selects nothing by index; give an index from 0 on or several, None for all")
+    raise ValueError(f"{value!r} selects nothing by index; give one index or several, counted from 0, or None for all")
 
 
 def entry_mask(vector: np.ndarray, indices: Indices) -> np.ndarray:

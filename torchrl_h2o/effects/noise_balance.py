@@ -1,7 +1,7 @@
-"""Settles negative action noise against the noise of the effects before it.
+"""Subtracts negative action noise from the noise of the effects before it.
 
-Negative noise cannot be executed, because no process can undo the random numbers of another. The noise before it is
-reduced instead.
+Negative noise cannot be executed, because no effect can remove the random numbers that another effect has added.
+Instead, the standard deviations of the effects before it are reduced.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ def balanced(effects: Sequence[Effect], settings: EffectSettings = EFFECT_SETTIN
     """Returns the effects with negative noise made neutral and the noise before it reduced by the same variance.
 
     Only noise on exactly the same actuators is reduced; several such effects are reduced in proportion. Variances are
-    compared where the noise is added: later effects on the action, such as a gain, do not enter.
+    compared as if no other effect, such as a gain, stood between the two effects.
 
     Args:
         effects: all effects of a simulator, in their order.
         settings: the tolerance for negative noise that exceeds the noise before it.
 
     Returns:
-        The same number of effects in the same order; identical objects where there is no negative noise.
+        The same number of effects in the same order; the same objects if there is no negative noise.
 
     Raises:
         ValueError: if negative noise exceeds the noise before it by more than ``settings.noise_excess``. A smaller

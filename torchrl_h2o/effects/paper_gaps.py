@@ -21,7 +21,7 @@ class PaperGap:
     """One of the paper's gaps.
 
     Args:
-        effect: builds the effect from a strength, the value of the effect's first parameter.
+        effect: builds the effect from a strength, which becomes the value of the effect's first parameter.
         strength: the paper's strength.
         tasks: the tasks in which the paper uses the gap.
     """

@@ -39,7 +39,7 @@ class Episode(NamedTuple):
     Args:
         actions: functions from an action (..., nu) to the altered one, in order.
         observations: functions from an observation (..., n) to the altered one, in order.
-        forces: functions from the simulation's state to generalised forces (nv,), whose sum acts.
+        forces: functions from the simulation's state to generalised forces (nv,), which are summed.
     """
 
     actions: Sequence[Process] = ()
@@ -60,9 +60,9 @@ class Pipeline:
     """A list of effects and how it is applied.
 
     Effects compose in their order: model edits first to last before one compilation, action effects first to last,
-    observation effects first to last, forces summed. Neutral effects are skipped. Negative noise is settled against
-    the noise before it, see :func:`~torchrl_h2o.effects.balanced`; this raises ValueError where actions are altered,
-    not when the pipeline is made.
+    observation effects first to last, forces summed. Neutral effects are skipped. Negative noise is subtracted from
+    the noise before it, see :func:`~torchrl_h2o.effects.balanced`. If it exceeds that noise, ValueError is raised when
+    actions are altered, not when the pipeline is made.
 
     Args:
         effects: the effects, in their order.
@@ -84,7 +84,7 @@ class Pipeline:
 
     @classmethod
     def balanced_together(cls, groups: Mapping[Key, Sequence[Effect]]) -> dict[Key, Pipeline]:
-        """Returns one pipeline per group of effects, with negative noise settled across all groups in their order.
+        """Returns one pipeline per group of effects, with negative noise subtracted across all groups in their order.
 
         Args:
             groups: lists of effects by any key, the one nearest to the simulator first.
@@ -97,7 +97,7 @@ class Pipeline:
 
     @cached_property
     def settled(self) -> tuple[Effect, ...]:
-        """The effects with negative noise settled; raises ValueError where there is too little noise before it."""
+        """The effects with negative noise subtracted; raises ValueError if it exceeds the noise before it."""
         return balanced(self.effects)
 
     @property
@@ -106,14 +106,14 @@ class Pipeline:
         return any(effect.random and not effect.is_neutral for effect in self.settled)
 
     def of_kind(self, kind: type[Kind]) -> list[Kind]:
-        """Returns the effects of a class that are not neutral, with negative noise settled."""
+        """Returns the effects of a class that are not neutral, with negative noise subtracted."""
         only_actions = issubclass(cast("type[Effect]", kind), ActionEffect)  # the cast keeps the type of ``kind``
-        effects = self.settled if only_actions else self.effects  # only action noise is settled
+        effects = self.settled if only_actions else self.effects  # only action noise can be negative
         return [effect for effect in effects if isinstance(effect, kind) and not effect.is_neutral]
 
     # ---------------------------------------------------------------------------------------------- model
     def edit(self, spec: mujoco.MjSpec) -> None:
-        """Edits a specification in place by the model effects; see :func:`edit_spec`."""
+        """Edits a specification in place with the model effects; see :func:`edit_spec`."""
         edit_spec(spec, self.effects)
 
     def compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -130,7 +130,7 @@ class Pipeline:
 
         Args:
             dt: the control step, in s.
-            rng: the generator of the random effects; not needed without any.
+            rng: the generator of the random effects; not needed if there are none.
             model: the compiled model. Without it the episode holds no forces.
 
         Raises:
@@ -141,7 +141,7 @@ class Pipeline:
         def processes(kind: type[ActionEffect | ForceEffect | ObservationEffect], on: Any) -> list:
             return [effect.process(on, _generator_for(effect, rng)) for effect in self.of_kind(kind)]
 
-        # effects that draw at the start of an episode share the generator: this order is part of a seed's meaning
+        # effects share the generator, so this order decides which numbers they draw at the start of an episode
         observations = processes(ObservationEffect, dt)
         actions = processes(ActionEffect, dt)
         return Episode(actions, observations, [] if model is None else processes(ForceEffect, model))
@@ -150,7 +150,7 @@ class Pipeline:
     def executed_run(self, actions: np.ndarray, dt: float, rng: np.random.Generator | None = None) -> np.ndarray:
         """Returns the actions that the simulator executes in one recorded run.
 
-        A delay of the whole observation is applied to the actions instead: the recorded run is the same, shifted.
+        A delay of the whole observation is applied to the actions instead, which gives the same run, shifted in time.
 
         Args:
             actions: the recorded actions, (T, nu), from the start of the run.

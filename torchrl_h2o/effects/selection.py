@@ -22,7 +22,7 @@ def checked_names(value: Any) -> Names:
         patterns = tuple(value)
         if patterns and all(isinstance(pattern, str) and pattern for pattern in patterns):
             return patterns
-    raise ValueError(f"{value!r} selects nothing by name; give a name pattern or several, '*' for all")
+    raise ValueError(f"{value!r} selects nothing by name; give one name pattern or several, or '*' for all")
 
 
 def joints(spec: mujoco.MjSpec, patterns: Names) -> list[mujoco.MjsJoint]:

@@ -17,7 +17,7 @@ def effect_to_dict(effect: Effect) -> dict[str, Any]:
 
     Returns:
         ``effect``, the name of its class, and its fields by name. Infinity becomes the string ``"inf"``, because JSON
-        has none.
+        has no infinity.
 
     Examples:
         >>> from torchrl_h2o.effects import ActionSaturation, BodyMass

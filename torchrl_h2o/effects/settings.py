@@ -11,7 +11,7 @@ class EffectSettings:
         noise_excess: share of the variance by which negative noise may exceed the noise before it. A fitted standard
             deviation is rarely exact, so a slight excess removes all of the noise instead of raising an error.
         noise_rounding: share of the variance below which the remaining noise is set to zero.
-        lever: lever arm in m. The weight at this lever sizes the torques on a hinge that no actuator drives.
+        lever: lever arm in m. The weight times this lever is the typical torque on a hinge without an actuator.
         factors: scales that a trial multiplies a property of the model by.
         aligned: deviation of a direction cosine from 0 or 1 below which a joint's axis is perpendicular or parallel
             to the y axis.

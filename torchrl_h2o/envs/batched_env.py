@@ -29,15 +29,15 @@ from torchrl_h2o.envs.task_rules import rules_of
 class BatchedMujocoEnv(EnvBase):
     """N worlds of a Gymnasium MuJoCo task, stepped at once on all processors.
 
-    Observations, rewards, terminations, resets and the time limit are those of the task; from the same states and
-    actions they agree with Gymnasium's to rounding. Worlds are reset individually, through TorchRL's ``"_reset"``.
+    Observations, rewards, terminations, resets and the time limit are those of the task; for the same states and
+    actions they equal Gymnasium's up to rounding. Worlds are reset individually, through TorchRL's ``"_reset"``.
 
     The effects of the given env (its :class:`~torchrl_h2o.envs.DynamicsGap`) act in every world. Further effects are
-    common to all worlds or differ between them, which serves domain randomisation.
+    common to all worlds, or differ between worlds for domain randomisation.
 
     Args:
-        env: one env of the task, with or without dynamics gaps. The batched env keeps it, to draw initial states.
-            Other transforms go around the batched env.
+        env: one env of the task, with or without dynamics gaps. The batched env keeps it, to draw initial states. Put
+            other transforms around the batched env.
         num_worlds: number of worlds, N.
         effects: further effects for all worlds, or one list of effects per world.
 
@@ -46,8 +46,8 @@ class BatchedMujocoEnv(EnvBase):
             default.
 
     Attributes:
-        states: MuJoCo's full physics state of each world (time, positions, velocities, activations), (N, size). May
-            be written to.
+        states: MuJoCo's full physics state of each world (time, positions, velocities, activations), (N, size). The
+            caller may write to them.
         physics_steps: physics steps per control step.
 
     Raises:
@@ -197,12 +197,12 @@ class BatchedMujocoEnv(EnvBase):
     def _begin_episode(self, index: int) -> Episode:
         """Begins an episode of a world's action and observation effects."""
         pipeline, rng = self._pipelines[index], None
-        if pipeline.is_random:  # otherwise torch's generator stays untouched
+        if pipeline.is_random:  # without random effects torch's generator is not used
             rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
         return pipeline.begin(self._control_steps[index], rng)
 
     def _observe(self, mask: np.ndarray | slice = slice(None)) -> torch.Tensor:
-        """Returns observations (N, n). Sensor effects act only in the worlds of a mask; TorchRL ignores the others."""
+        """Returns observations (N, n), with sensor effects in the worlds of a mask; TorchRL ignores other worlds."""
         observed = self._rules.observe(*positions_and_velocities(self._models[0], self.states))
         if self._alters_observations:
             for index in np.arange(self.num_worlds)[mask]:
@@ -236,7 +236,7 @@ def _backend_in(env: EnvBase) -> GymnasiumBackend:
     """Returns the backend of an env that a batch can step; raises ValueError for other envs."""
     backend = find_backend(env)
     if not isinstance(backend, GymnasiumBackend):
-        raise ValueError(f"{env} is no Gymnasium task; build one world with GymEnv")
+        raise ValueError(f"{env} is not a Gymnasium task; build one world with GymEnv")
     others = [type(transform).__name__ for transform in transforms_of(env) if not isinstance(transform, DynamicsGap)]
     if others:
         raise ValueError(

@@ -26,8 +26,8 @@ class DynamicsGap(Transform):
     forces summed, observation effects first to last. With several gaps on one env, the model edits of the innermost
     gap come first; actions pass through the outermost gap first, as through all TorchRL transforms.
 
-    Negative :class:`~torchrl_h2o.effects.ActionNoise` removes noise that the effects before it add: those of the same
-    gap and of all gaps nearer to the simulator.
+    Negative :class:`~torchrl_h2o.effects.ActionNoise` removes noise that the effects before it add, in the same gap and
+    in all gaps nearer to the simulator.
 
     A gap belongs to one simulator permanently: removing the transform from the env does not restore the simulator, and
     another gap needs a new env. Put the gap directly on the env, before other transforms, and inside each worker of a
@@ -45,8 +45,8 @@ class DynamicsGap(Transform):
     Raises:
         TypeError: if an argument is not an effect.
         ValueError: when added to an env that is batched, does not run on MuJoCo or had another gap; if the model has
-            no element that one of the effects could act on, or less noise than negative noise removes; or, with
-            action or observation effects, when added after transforms of other kinds.
+            no element that one of the effects could act on; if negative noise exceeds the noise before it; or if
+            action or observation effects are added after transforms of other kinds.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -85,11 +85,11 @@ class DynamicsGap(Transform):
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
         env = _env_of(self)
-        if env is None:  # in a Compose that is not on an env yet
+        if env is None:  # the transform is in a Compose that has not been added to an env yet
             return
         self._check_place(env)
         backend = find_backend(env)
-        # a trial episode, so that an effect with nothing to act on raises before the model is changed
+        # a trial episode, so that an effect that does not fit the model raises before the model is changed
         trial = self._begin(backend, self._pipeline(backend), np.random.default_rng(0))
         example = backend.env.fake_tensordict()
         trial.execute(example)
@@ -129,7 +129,7 @@ class DynamicsGap(Transform):
         return cast("EnvBase", _env_of(self))
 
     def _episode(self) -> GapEpisode:
-        """The current episode, begun if there is none."""
+        """The current episode; begins one if there is none."""
         env = _env_of(self)
         if env is None:  # in a replay buffer there is no simulator to alter
             return GapEpisode()
@@ -137,7 +137,7 @@ class DynamicsGap(Transform):
         episodes = backend.episodes
         if self._identity not in episodes:
             rng, pipeline = None, self._pipeline(backend)
-            # Without random effects torch's generator stays untouched, so that runs with and without
+            # Without random effects torch's generator is not used, so that runs with and without
             # the gap sample the same actions.
             if pipeline.is_random:
                 rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
@@ -145,8 +145,8 @@ class DynamicsGap(Transform):
         return episodes[self._identity]
 
     def _pipeline(self, backend: MujocoBackend) -> Pipeline:
-        """The gap's effects, with negative noise settled across all gaps of the simulation."""
-        # backend.gaps also lists gaps on envs around this one, but not yet a gap that is being put on
+        """The gap's effects, with negative noise subtracted across all gaps of the simulation."""
+        # backend.gaps also lists gaps on envs around this one, but not yet a gap that is being added
         of_gap = {gap._identity: gap.effects for gap in self._gaps_on(self._own_env())} | dict(backend.gaps)
         return Pipeline.balanced_together(of_gap)[self._identity]
 
@@ -164,7 +164,7 @@ class DynamicsGap(Transform):
         transforms = _transforms_of(self, env)
         if any(isinstance(transform, FrameSkipTransform) for transform in transforms):
             raise ValueError(
-                f"FrameSkipTransform repeats actions that {self} has altered, which would alter them again; let the "
+                f"FrameSkipTransform repeats actions that {self} has altered, so it would alter them again; let the "
                 "env itself skip frames: GymEnv(..., frame_skip=...)"
             )
         for transform in transforms[: transforms.index(self)]:

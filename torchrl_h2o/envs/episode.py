@@ -34,14 +34,15 @@ class GapEpisode(NamedTuple):
         """Begins an episode.
 
         Args:
-            pipeline: the effects of the gap, with negative noise settled across all gaps.
+            pipeline: the effects of the gap, with negative noise subtracted across all gaps.
             env: the env without transforms.
             dt: the control step, in s.
             model: the compiled model.
             rng: the generator of the random effects; None if there are none.
 
         Raises:
-            ValueError: if an effect finds nothing to act on, or draws random numbers without being marked random.
+            ValueError: if the model or the observation has no element that an effect could act on, or if an effect that
+                is not marked random draws random numbers.
         """
         effects = pipeline.begin(dt, rng, model)
         observed = [key for key, spec in env.observation_spec.items(True, True) if spec.dtype.is_floating_point]
@@ -67,7 +68,7 @@ class GapEpisode(NamedTuple):
 
 
 class GapEpisodes(dict):
-    """The current episodes of a simulation's gaps, by gap. A copy of the simulation starts without any."""
+    """The current episodes of a simulation's gaps, by gap. A copy or a pickle of it is empty."""
 
     def __reduce__(self) -> tuple:
         return GapEpisodes, ()

@@ -29,8 +29,8 @@ def roll_out(
 ) -> np.ndarray:
     """Steps many states at once, each under its own actions.
 
-    Without state-dependent forces this is one rollout. With them it advances by one physics step at a time, each under
-    the forces of its initial state.
+    Without state-dependent forces this is one rollout. With such forces it takes one physics step at a time; each step
+    uses the forces at the state before it.
 
     Args:
         pool: the threads of ``mujoco.rollout``.

@@ -24,8 +24,9 @@ def record(
 ) -> TensorDict:
     """Records transitions in temporal order, over as many episodes as needed.
 
-    The last transition is marked as truncated. The policy explores; ``is_init`` marks the start of episodes for it.
-    The same seed gives the same data, and torch's global random state is restored.
+    The last transition is marked as truncated. The policy runs with ``ExplorationType.RANDOM``; ``is_init``
+    in its input marks the start of an episode. The same seed gives the same data. torch's global random state is
+    restored.
 
     Args:
         env: the env, not batched; it is reset first and stays open.

@@ -1,6 +1,6 @@
 """Observations, rewards and terminations of Gymnasium's MuJoCo tasks, for many worlds at once.
 
-These are Gymnasium's own formulas with the constants of the task object; the tests compare the two.
+These are Gymnasium's formulas with the constants of the task object; the tests compare them with Gymnasium.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TaskRules(ABC):
 
     @abstractmethod
     def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """Returns the observations (N, n) of states (N, nq), (N, nv) as a new array, because the env reuses those."""
+        """Returns the observations (N, n) of states (N, nq), (N, nv) in a new array; the env reuses the states."""
 
     @abstractmethod
     def reward(

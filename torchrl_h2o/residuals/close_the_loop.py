@@ -1,6 +1,6 @@
 """Closes the loop: finds what a simulator lacks from measured data, puts it in, and reports the held-out error.
 
-The stages stand alone: each takes the results of those before it and returns a new one.
+Each stage takes the results of earlier stages and returns a new one; no stage changes another's result.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def close_the_loop(
     progress: bool = True,
     settings: LoopSettings = DEFAULTS,
 ) -> Report:
-    """Finds what a simulator lacks from measured data, and judges it on data that no fit has seen.
+    """Finds what a simulator lacks from measured data, and judges it on data that no fit has used.
 
     Args:
         simulator: a TorchRL env of a Gymnasium MuJoCo task, with its gaps, or a :class:`Simulation`.
@@ -47,7 +47,7 @@ def close_the_loop(
         catalogue: effects to try; those of :meth:`Simulation.catalogue` by default.
         source: name of the data in the report.
         held_out: share of the transitions, taken from the end, that is reserved for the judgement.
-        seed: of the screened windows, the synthetic noise and the classifiers.
+        seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
         settings: thresholds and budgets of all stages.
 
@@ -87,7 +87,7 @@ def close_the_loop(
 def read_measured(
     data: TensorDictBase | Measured, simulation: Simulation, source: str, held_out: float, settings: LoopSettings
 ) -> Measured:
-    """Measured transitions, checked against the simulation and sampled as the settings demand."""
+    """Measured transitions, checked against the simulation, with the sampling of the settings."""
     if isinstance(data, Measured):
         return replace(data, settings=settings.measured)
     return Measured.from_ted(data, simulation, source=source, held_out=held_out, settings=settings.measured)

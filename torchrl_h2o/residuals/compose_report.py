@@ -1,4 +1,4 @@
-"""Composes the report from an explanation and its judgement: figures with words."""
+"""Composes the report from an explanation and its judgement: numbers and descriptions."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def compose_report(
     Args:
         evidence: the simulator and the data.
         explanation: the effects.
-        judgement: their held-out figures.
+        judgement: held-out errors and tests of these effects.
         wall_s: duration of the whole run, in s.
-        settings: for the description of the test.
+        settings: thresholds, for the description of the stop test.
     """
     simulation, measured = evidence.simulation, judgement.measured
     names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
@@ -71,7 +71,7 @@ def compose_report(
 
 
 def inconclusive_report(simulation: Simulation, measured: Measured, reason: str) -> Report:
-    """The report of data or a simulator that allow no conclusion."""
+    """The report if the data or the simulator allow no conclusion."""
     return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
 
 

@@ -20,7 +20,7 @@ class Evidence:
     Args:
         simulation: the simulator.
         measured: all transitions.
-        undisturbed: the same with suspected disturbances excluded, for fits.
+        undisturbed: the transitions without suspected disturbances, for fits.
         suspected: intervals that may have been disturbed from outside.
     """
 
@@ -31,7 +31,7 @@ class Evidence:
 
 
 def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
-    """Reason why data and simulator allow no conclusion; None if they do."""
+    """Reason why data and simulator allow no conclusion; None if a conclusion is possible."""
     if (reason := measured.why_no_conclusion()) is not None:
         return reason
     diverged = ~np.isfinite(residuals(simulation, measured, measured.fitted())).all((1, 2))

@@ -17,7 +17,7 @@ class Part:
         effect: the effect with its fitted values.
         declared: True if it is an entry of the catalogue.
         ci95: 95 % interval (low, high) of each fitted parameter, in its unit.
-        alike: alternatives that explain the data as well in its place.
+        alike: alternatives that explain the data equally well in place of this effect.
     """
 
     effect: Effect
@@ -31,7 +31,7 @@ class Explanation:
     """The effects that explain a residual.
 
     Args:
-        parts: the effects in the order of their composition; none if nothing is missing.
+        parts: the effects in the order of their composition; empty if nothing is missing.
         trace: the search over the catalogue.
     """
 
@@ -58,5 +58,5 @@ class Explanation:
 
 
 def adds_noise(effect: Effect) -> bool:
-    """Whether an effect adds random noise to the actions: a single draw of it brings no prediction closer."""
+    """Whether an effect adds random noise to the actions; a random draw of it does not improve a prediction."""
     return isinstance(effect, ActionNoise) and effect.std > 0.0

@@ -13,19 +13,19 @@ class MeasuredSettings:
     """How measured transitions are checked, sampled, and turned into states and noise levels."""
 
     min_transitions: int = 200
-    """Usable transitions below which no conclusion is drawn: held-out data could not tell an effect from chance."""
+    """Usable transitions below which no conclusion is drawn: no test could distinguish an effect from chance."""
     max_windows: int = 3500
-    """Windows that a fit or a judgement uses at most; more are slower and hardly more precise."""
+    """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
     max_diverged: float = 0.1
-    """Share of transitions at which the simulator may diverge within one step, such as falls and faulty rows."""
+    """Largest share of transitions at which the simulator may diverge in one step, for example at falls."""
     settling_steps: int = 12
-    """Control steps after which unobserved coordinates follow from the observed ones."""
+    """Control steps after which the observed coordinates determine the unobserved ones."""
     state_nudge: float = 1e-3
     """Step of the finite differences by the observation, in spreads."""
     noise_rows: int = 2000
     """Transitions from which the sensors' noise is estimated."""
     noiseless: float = 1e-4
-    """Sensor noise, in spreads, up to which a dimension counts as free of noise: it biases no fit visibly."""
+    """Sensor noise, in spreads, up to which a dimension counts as free of noise; the bias of a fit is negligible."""
     noise_clip: float = 4.0
     """Robust standard deviations at which residuals are clipped before the sensors' noise is estimated."""
     filter_surprise: float = 4.0
@@ -43,19 +43,19 @@ class OutsideSettings:
     threshold: float = 12.0
     """Residual, in multiples of the usual one, beyond which a window is surprising."""
     neighbours: int = 6
-    """Events with a similar start that a surprising window is compared with."""
+    """Number of events with a similar start that a surprising window is compared with."""
     events_apart: int = 5
-    """Windows between two events; windows closer in time belong to the same event."""
+    """Distance between two events, in window lengths; windows closer in time belong to the same event."""
     recurring_quantile: float = 0.8
-    """Quantile of the neighbours' residuals that is taken as recurring; one neighbour may be a push itself."""
+    """Quantile of the neighbours' residuals that is taken as recurring, because a neighbour may itself be a push."""
     recurring_factor: float = 2.0
-    """Multiple of the recurring residual that still counts as the same recurring cause."""
+    """Multiple of the recurring residual up to which a residual is attributed to the same recurring cause."""
     max_event_rate: float = 0.003
     """Events per window beyond which large residuals are a fault of the simulator, not disturbances."""
     max_share: float = 0.1
-    """Share of surprising windows beyond which the same holds."""
+    """Share of surprising windows beyond which large residuals are a fault of the simulator, not disturbances."""
     rounding: float = 1e-5
-    """Residual, in spreads, that counts as zero."""
+    """Residual, in spreads, up to which it counts as zero."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ResidualSettings:
     rounding: float = 2e-7
     """Relative rounding error of the data, which are single precision."""
     noise_draws: int = 4
-    """Draws of sensor noise from which its effect on each window is estimated."""
+    """Number of draws of sensor noise for the estimate of its effect on each window."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class SignificanceSettings:
     blocks: int = 30
     """Blocks of neighbouring windows that are treated as independent."""
     max_odds: float = 100.0
-    """Odds, to one, that a single block may contribute."""
+    """Largest factor that a single block may contribute to the payoff of the bet."""
     loss_floor: float = 1e-6
     """Smallest typical loss of a block, as a share of the mean loss."""
 
@@ -89,11 +89,11 @@ class FitSettings:
     """The bounded least-squares fit."""
 
     origin: float = 10.0
-    """Start of every scaled variable, so that relative steps are steps of the parameter's own size."""
+    """Start value of every scaled variable; it makes relative steps proportional to the parameter's typical size."""
     max_move: float = 50.0
-    """Steps of a parameter's own size that one fit may move it."""
+    """Largest change of a parameter in one fit, in multiples of its typical size."""
     difference_step: float = 1e-5
-    """Relative step of the finite differences: 1e-4 of a parameter's own size."""
+    """Relative step of the finite differences: 1e-4 of a parameter's typical size."""
     loss_tolerance: float = 1e-5
     """Relative change of the loss at which the optimiser stops."""
     variable_tolerance: float = 1e-7
@@ -109,13 +109,13 @@ class HorizonSettings:
     horizons: tuple[int, ...] = (1, 5, 20)
     """Window lengths to choose from, in control steps, ascending."""
     windows: int = 60
-    """Windows that are screened at each length; longer windows are considered only with at least as many."""
+    """Number of windows screened at each length; longer windows are considered only if there are as many."""
     entries_followed: int = 60
-    """Most promising entries that are screened again at the next length."""
+    """Number of most promising entries that are screened again at the next length."""
     clear_promise: float = 0.5
-    """Share of the loss that one entry promises to explain, beyond which no longer window is tried."""
+    """Promise of the best entry, as a share of the loss, beyond which windows of greater length are not tried."""
     longer_gain: float = 1.3
-    """Factor by which the promise must grow to justify a longer window, which costs more and amplifies contacts."""
+    """Factor by which the promise must grow to justify longer windows, which cost more and amplify contact errors."""
 
 
 @dataclass(frozen=True)
@@ -125,43 +125,43 @@ class TraceSettings:
     min_gain: float = 0.002
     """Share of the held-out loss that an addition must explain."""
     min_gain_under_noise: float = 0.02
-    """The same with noisy sensors, whose start states may imitate an effect."""
+    """The same share with noisy sensors, because noise in the start states may imitate an effect."""
     min_share: float = 0.003
-    """Share of all that the search has explained that each added effect must contribute."""
+    """Share of the whole reduction of the loss that each added effect must contribute."""
     beyond_noise: float = 4.0
-    """Multiple of what the same addition explains in data that differ from the simulator by sensor noise alone."""
+    """Required multiple of the gain of the same addition in synthetic data with sensor noise only."""
     max_effects: int = 6
-    """Effects in one explanation."""
+    """Largest number of effects in one explanation."""
     rounds: int = 3
-    """Rounds of growing and simplifying."""
+    """Largest number of rounds of growing and simplifying."""
     screened_steps: int = 400
-    """Control steps, over all windows, that entries are screened on."""
+    """Control steps, over all windows, on which entries are screened."""
     min_screened: int = 100
-    """Windows that entries are screened on at least."""
+    """Smallest number of windows on which entries are screened."""
     fitted_steps: int = 1200
-    """Control steps, over all windows, that a fit during the search sees."""
+    """Control steps, over all windows, in a fit during the search."""
     min_fitted: int = 200
-    """Windows that a fit during the search sees at least."""
+    """Smallest number of windows in a fit during the search."""
     leads_combined: int = 60
-    """Most promising leads that sets are formed of."""
+    """Number of most promising leads from which sets are formed."""
     set_sizes: tuple[tuple[int, int], ...] = ((1, 12), (2, 4), (3, 4))
     """Pairs (size of a set, number of sets of this size that are sketched)."""
     finalists: int = 3
-    """Sketched sets of one size that are fitted on all windows of the search."""
+    """Number of sketched sets of one size that are fitted on all windows of the search."""
     sketch_evaluations: int = 6
-    """Evaluations of the residual in a sketch of an addition."""
+    """Evaluations of the residual in a sketch (quick fit) of an addition."""
     rival_evaluations: int = 20
-    """Evaluations of the residual in a sketch of an alternative, whose partners may have far to move."""
+    """Evaluations of the residual in a sketch of an alternative; the other parameters may change much."""
     nearest_rivals: int = 12
-    """Alternatives tried in an effect's place whose promise was closest to its own."""
+    """Number of alternatives tried in an effect's place because their promise was closest to its own."""
     top_rivals: int = 6
-    """Alternatives tried in an effect's place whose promise was highest."""
+    """Number of alternatives tried in an effect's place because their promise was highest."""
     rival_min_sketch: float = 0.5
     """Share of an effect's gain that an alternative must reach in its sketch to be fitted."""
     same_loss: float = 1e-6
-    """Difference between alternatives, as a share of the effect's gain, that counts as rounding."""
+    """Loss difference between alternatives, as a share of the effect's gain, that counts as rounding."""
     alike_loss: float = 0.1
-    """Difference, as a share of the effect's gain, beyond which an alternative is ruled out."""
+    """Loss difference, as a share of the effect's gain, beyond which an alternative is ruled out."""
 
 
 @dataclass(frozen=True)
@@ -171,21 +171,21 @@ class UndeclaredSettings:
     min_gain: float = 0.01
     """Share of the held-out loss that all terms of the force must explain."""
     min_term_gain: float = 0.002
-    """Share of the loss that a round must explain, and that removing a term may cost."""
+    """Share of the loss that a round must explain, and by which removing a term may raise the loss."""
     rounds: int = 6
-    """Rounds of adding terms."""
+    """Largest number of rounds of adding terms."""
     further_steps: int = 5
-    """Control steps ahead at which the force must also pay; a bias from sensor noise pays one step ahead only."""
+    """Control steps ahead at which the force must also lower the loss; a fit to sensor noise does not."""
     max_terms: int = 6
-    """Terms of the whole force."""
+    """Largest number of terms of the whole force."""
     negligible: float = 1e-6
     """Residual, in spreads, that counts as rounding."""
     min_gain_over_catalogue: float = 0.05
     """Share of the held-out loss that a force must explain beside or instead of the catalogue's effects."""
     min_share: float = 0.01
-    """Share of all that is explained that the force must contribute."""
+    """Share of the whole reduction of the loss that the force must contribute."""
     beyond_noise: float = 2.0
-    """Multiple of what a force explains in data that differ from the simulator by sensor noise alone."""
+    """Required multiple of the gain of a force found in synthetic data with sensor noise only."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class RegressionSettings:
     force_nudge: float = 0.1
     """Step of the finite differences by the force, as a share of the typical force."""
     max_terms: int = 3
-    """Terms on one degree of freedom per round."""
+    """Largest number of terms on one degree of freedom per round."""
     blocks: int = 10
     """Blocks of neighbouring rows that are held back together."""
     folds: int = 5
@@ -213,19 +213,19 @@ class RegressionSettings:
     negligible: float = 1e-9
     """Relative spread or norm at which a coordinate or column counts as constant."""
     max_waves: float = 15.0
-    """Periods of a wave over the range of a position; more cannot be told from noise."""
+    """Largest number of periods over the range of a position; faster waves cannot be distinguished from noise."""
     max_harmonic: float = 30.0
-    """Largest harmonic of a hinge's turn, such as the torque ripple of a motor with many poles."""
+    """Largest number of periods per turn of a hinge, such as the torque ripple of a motor with many poles."""
     scan_spacing: float = 0.8
     """Spacing of scanned frequencies, in rad over the range."""
     max_scanned: int = 1500
-    """Scanned frequencies."""
+    """Largest number of scanned frequencies."""
     scanned_values: int = 5000
-    """Positions that frequencies are scanned on before the best one is refined on all."""
+    """Number of positions on which frequencies are scanned; the best one is then refined on all positions."""
     min_periods: float = 1.5
-    """Periods of a wave in time that the data must hold; less cannot be told from a trend."""
+    """Smallest number of periods of a wave in time; fewer cannot be distinguished from a trend."""
     min_step_share: float = 0.03
-    """Share of the rows on either side of a step in time."""
+    """Smallest share of the rows on either side of a step in time."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ class NoiseSettings:
     nudge: float = 1e-4
     """Step of the finite differences, in spreads or in shares of the largest action."""
     variance_floor: float = 1e-3
-    """Variance added to every dimension, as a share of the mean residual's square: the derivatives' own precision."""
+    """Variance added to every dimension, as a share of the squared mean residual; allows for inexact derivatives."""
     usual: float = 0.995
     """Quantile of normal residuals beyond which a residual is clipped; contacts cause outliers."""
     tails: float = 4.0
@@ -247,11 +247,11 @@ class NoiseSettings:
     min_share: float = 1e-3
     """Smallest reported standard deviation, as a share of the control range."""
     max_share: float = 2.0
-    """Largest plausible standard deviation, in root mean squares of the actions; more comes from filtered sensors."""
+    """Largest plausible standard deviation, in RMS of the actions; larger estimates come from filtered sensors."""
     min_half_widths: float = 3.0
-    """Half-widths of its interval that the estimate must exceed; blocks share their systematic errors."""
+    """Number of half-widths that the estimate must exceed, because the interval omits errors that blocks share."""
     beyond_sensors: float = 3.0
-    """Multiple of the estimate from data whose only noise is the sensors'."""
+    """Required multiple of the estimate from synthetic data with sensor noise only."""
     min_change: float = 0.1
     """Smallest reported change, as a share of the variance of the simulator's own action noise."""
 
@@ -263,7 +263,7 @@ class JudgeSettings:
     horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     """Control steps ahead at which errors are reported."""
     max_rejected: int = 30
-    """Rejected effects that the report lists."""
+    """Largest number of rejected effects in the report."""
     rounding: float = 1e-5
     """Residual, in spreads of the one-step change, below which no autocorrelation is computed."""
     classifier_updates: int = 600
@@ -275,21 +275,21 @@ class JudgeSettings:
     floor_width: int = 64
     """Width of the two hidden layers of the network that estimates the floor."""
     floor_batch: int = 128
-    """Batch size of its updates."""
+    """Batch size of the floor network's updates."""
     floor_epochs: int = 60
-    """Epochs of its training."""
+    """Epochs of the floor network's training."""
     floor_patience: int = 12
-    """Epochs without a new best after which its training stops."""
+    """Epochs without a new lowest loss after which the floor network's training stops."""
     floor_blocks: int = 20
-    """Blocks of neighbouring rows; every fifth stops the training."""
+    """Blocks of neighbouring rows; every fifth block is used for early stopping of the floor network."""
     floor_clip: float = 5.0
-    """Standard deviations at which its inputs and targets are clipped."""
+    """Standard deviations at which the floor network's inputs and targets are clipped."""
     separation_share: float = 0.05
-    """Share of the transitions, those where the predictions differ most, that describe how to tell effects apart."""
+    """Share of the transitions, those with the largest differences of the predictions, that are described."""
     separation_negligible: float = 1e-6
-    """Difference of predictions, in spreads, that no data would show."""
+    """Difference of predictions, in spreads, below which they count as equal."""
     separation_factor: float = 1.5
-    """Factor by which a coordinate must differ from its usual size to be named as the place to record."""
+    """Factor by which a coordinate must differ from its usual size to be named in the description."""
 
 
 @dataclass(frozen=True)

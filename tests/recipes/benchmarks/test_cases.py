@@ -1,4 +1,4 @@
-"""The benchmark that judges close_the_loop: are its truths what they claim, and its scores fair?"""
+"""The benchmark of close_the_loop: correctness of its cases' ground truth and of its scores."""
 
 import json
 from dataclasses import replace
@@ -199,7 +199,7 @@ def test_a_recording_is_the_simulator_s_own_when_nothing_is_missing(system):
     starts = measured.windows(1)
     change = (measured.following - measured.observation)[starts].std(0)
     assert measured.usable.mean() > 0.4
-    # the wheels' slip, which nobody observes, moves a little
+    # small, but not zero, because the unobserved slip of the wheels changes
     assert (np.median(np.abs(residuals(simulation, measured, starts)[:, 0]), axis=0) < 1e-2 * change).all()
 
 
@@ -262,7 +262,7 @@ def test_undeclared_nothing_and_group_are_read_off_the_report():
 
 
 def perfect(simulation, data, **options):
-    """What tracing would have to return for the first of the decoys."""
+    """The report that would be correct for the first decoy case."""
     return report(Gravity(2.0), groups=[(BodyMass(2.0, bodies="arm"), ActionGain(0.5))])
 
 

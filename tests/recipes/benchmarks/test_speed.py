@@ -1,4 +1,4 @@
-"""The benchmarks of speed leave a table and a file, with what they compare to measured in the same run."""
+"""The speed benchmarks write a table and a file, and measure their references in the same run."""
 
 import json
 import subprocess
@@ -22,7 +22,7 @@ def run(script, folder, *overrides):
 def test_updates_are_set_beside_a_textbook_s_and_beside_the_limit(tmp_path):
     out = run("update.py", tmp_path, "seconds=0.1", "turns=1", "compiled=false", "transitions=1000", "threads=1")
     result = json.loads((tmp_path / "update.json").read_text())
-    assert result["flop"] / 1e9 == pytest.approx(1.21, rel=0.05)  # of the authors' update, on HalfCheetah
+    assert result["flop"] / 1e9 == pytest.approx(1.21, rel=0.05)  # with the authors' sizes, HalfCheetah
     assert result["limit"] == result["gflop_per_second"] * 1e9 / result["flop"]
     assert {"textbook", "ours, not compiled", "SAC, TorchRL's loss", "SAC of our parts"} == set(
         result["updates_per_second"]
@@ -68,9 +68,11 @@ def test_costs_are_told_for_all_that_grows_and_mapped_buffers_leave_nothing(tmp_
     assert others == [("batch", 8), ("batch", 16), ("width", 8), ("width", 512), ("population", 1), ("population", 4)]
     assert all(0.0 < cost["seconds_per_sample"] < cost["seconds_per_update"] for cost in costs)
     narrow, wide = (cost["memory"] for cost in costs if cost["grows"] == "width")
-    assert wide > narrow + 10_000_000  # five networks of 0.28 million weights: gradients, and Adam's two moments
+    # gradients and Adam's two moments of five networks with 0.28 million weights each, in bytes
+    assert wide > narrow + 10_000_000
     alone, stacked = (cost for cost in costs if cost["grows"] == "population")
-    assert stacked["memory"] > alone["memory"] + 10_000_000  # three members' gradients, moments and activations more
+    # gradients, moments and activations of three more members, in bytes
+    assert stacked["memory"] > alone["memory"] + 10_000_000
     assert stacked["seconds_per_update"] > alone["seconds_per_update"]
     assert "ms a sample" in out
     assert (tmp_path / "scaling.png").stat().st_size > 10_000

@@ -32,17 +32,17 @@ def test_other_effects_stay_in_beside_each_alternative(measured):
     free = separated_by(SIMULATION, measured, alternatives, [])
     dead = separated_by(SIMULATION, measured, alternatives, [ActionGain(0.0)])
     assert "differ" in free
-    assert dead.startswith("no data of these sensors")
+    assert dead.startswith("a direct measurement")
 
 
 def test_other_effects_keep_their_places(measured):
     """A bias before a motor without torque has no effect; one after it has."""
     alternatives, dead = (ActionBias(0.1), ActionBias(0.2)), [ActionGain(0.0)]
-    assert separated_by(SIMULATION, measured, alternatives, after=dead).startswith("no data of these sensors")
+    assert separated_by(SIMULATION, measured, alternatives, after=dead).startswith("a direct measurement")
     assert "differ" in separated_by(SIMULATION, measured, alternatives, before=dead)
 
 
 def test_effects_that_predict_the_same_are_told_apart_by_nothing_that_is_read(measured):
     alternatives = (ActionDelay(0.02), ObservationDelay(0.02))
-    assert separated_by(SIMULATION, measured, alternatives, []).startswith("no data of these sensors")
+    assert separated_by(SIMULATION, measured, alternatives, []).startswith("a direct measurement")
     assert "differ" in separated_by(SIMULATION, measured, (*alternatives, JointFrictionLoss(0.1)), [])

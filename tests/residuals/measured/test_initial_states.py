@@ -1,4 +1,4 @@
-"""State estimates: closer to the truth than noisy readings, causal, and equal to readings without noise."""
+"""State estimates: closer to the truth than noisy readings, causal, and equal to readings that have no noise."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def test_an_estimate_knows_nothing_of_the_rows_behind_it(simulation, recorded):
     other.observation[401:] += 1.0
     other.following[400:] += 1.0
     first, second = (estimate_states(simulation, data, levels)[:401] for data in (noisy, other))
-    # the state map scales by the whole run's spread, which is rounding here
+    # differences in rounding, because the filter divides by the spread of the whole run
     np.testing.assert_allclose(first, second, atol=1e-5)
 
 

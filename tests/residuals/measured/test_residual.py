@@ -27,7 +27,7 @@ CONTROL_STEP = {"HalfCheetah-v5": 0.05, "Hopper-v5": 0.008}
 
 
 def of_every_kind(task, steps_late=2.0):
-    """A delay carries actions over rows, and Hopper falls often: actions of one run may not enter the next."""
+    """Effects of every kind. Hopper falls often, so a delay must not carry actions of one run into the next."""
     return (
         Gravity(1.3),
         BodyMass(1.5, bodies="torso"),
@@ -57,9 +57,9 @@ def test_data_of_the_very_same_simulator_leave_no_residual(task, steps_late, hor
     measured = Measured.from_ted(rollout(env), simulation)
     assert len(measured.runs) > 2 or task != "Hopper-v5"
     missed = np.abs(residuals(simulation, measured, measured.windows(horizon), horizon)).max((1, 2))
-    # the env's actions are single precision, which is visible where they are interpolated
+    # the env's actions are single precision, which causes rounding where they are interpolated
     assert np.median(missed) < (1e-6 if steps_late == 1.4 else 1e-9)
-    # the env's solver starts from its last solution, which is visible in some contacts
+    # the env's solver starts from its last solution, which causes small differences in some contacts
     assert missed.max() < 1e-4
 
 

@@ -26,7 +26,7 @@ def test_the_sensors_noise_is_found(lacking):
 
 @pytest.mark.parametrize("horizon", [1, 5])
 def test_nothing_is_missing_from_a_stand_in(horizon):
-    """The measured data, from which the stand-in is made, have another gravity."""
+    """The stand-in is made from data measured under another gravity, but is simulated without this gap."""
     measured = recorded(SIMULATION.with_effects(Gravity(1.5)), 600)
     data = stand_in(SIMULATION, measured, np.zeros(2), np.random.default_rng(0), horizon)
     for part in (False, True):

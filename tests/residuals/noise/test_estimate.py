@@ -79,7 +79,7 @@ def test_derivatives_are_those_of_one_step():
 
 
 def test_noise_is_that_before_the_control_range_cuts_it_off():
-    """A third of the actions are at the end of their range, where the model clamps part of the noise."""
+    """A third of the actions are at a limit of their range, so the model clamps part of the noise."""
     real = pendulum().with_effects(ActionGain(1.3), ActionNoise(0.5))
     simulation = pendulum().with_effects(ActionGain(1.3))
     found = estimate_noise(simulation, recorded(real, 4000))

@@ -53,7 +53,7 @@ def full():
 
 def test_the_page_opens_with_the_sentence(full):
     assert full.count("h1") == 1
-    assert full.text.index(full_report().sentence()) < full.text.index("What the simulator lacks")
+    assert full.text.index(full_report().sentence()) < full.text.index("Effects that the simulator lacks")
 
 
 def test_the_page_names_every_effect_that_was_tried(full):
@@ -122,14 +122,14 @@ def test_a_page_without_effects_says_why_and_leaves_out_what_is_not_known(make):
     parsed = Page(report_page(make()))
     assert make().sentence() in parsed.text
     assert parsed.count("svg") == 0
-    for heading in ("What the simulator lacks", "What was tried", "Excluded intervals", "The residual"):
+    for heading in ("Effects that the simulator lacks", "Effects tried", "Excluded intervals", "The residual"):
         assert heading not in parsed.text
 
 
 def test_a_report_without_a_trace_has_no_residual_pictures():
     parsed = Page(report_page(dataclasses.replace(full_report(), trace=None)))
-    assert "The residual in time" not in parsed.text
-    assert "The error further ahead" in parsed.text
+    assert "The residual over time" not in parsed.text
+    assert "The error several steps ahead" in parsed.text
 
 
 def test_numbers_that_are_not_known_are_dashes_on_the_page():
@@ -143,7 +143,7 @@ def test_numbers_that_are_not_known_are_dashes_on_the_page():
     )
     text = Page(report_page(report)).text
     assert "scale 2 not known" in text
-    assert "Traced in" not in text
+    assert "Computed in" not in text
     assert not re.search(r"\b(nan|inf|None)\b", text)
 
 

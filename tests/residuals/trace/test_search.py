@@ -98,7 +98,7 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
 
 
 def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_reality():
-    """Delay and backlash do not commute; alone, backlash explains more than the delay."""
+    """Delay and backlash do not commute; alone, backlash explains more of the residual than the delay."""
     play, late = ActionBacklash(0.4), ActionDelay(0.013)
     catalogue = [
         CatalogueEntry(ActionBacklash(), ({"width": 0.1}, {"width": 0.5})),

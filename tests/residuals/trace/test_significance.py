@@ -78,7 +78,7 @@ def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_b
 
 
 def test_what_vanishes_now_and_then_is_seen():
-    """The loss vanishes in three blocks of thirty, too few for tests on means."""
+    """The loss becomes zero in three blocks of thirty, which are too few for tests on means."""
     before, after = np.full(300, 1e-9), np.full(300, 1e-9)
     before[[5, 6, 7, 105, 106, 205]] = 5.0
     assert p_value(before - after) > 0.01

@@ -53,7 +53,7 @@ def test_perfect_simulator_lacks_nothing():
 
 
 def test_force_that_ceases_before_the_held_out_data_is_not_kept():
-    """It explains the fitted rows and increases the error of the held-out ones."""
+    """The force explains the fitted rows but increases the error of the held-out rows."""
     simulation = pendulum()
     burst = UnknownForce(0.2, lambda q, v, t: (t < 21.0) * np.sin(5.0 * q))
     assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None

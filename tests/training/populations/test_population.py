@@ -1,4 +1,4 @@
-"""A population's members learn what they would learn alone."""
+"""Members of a population get the same losses and parameters as single runs."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ LR, TAU = 3e-3, 0.05
 
 
 class Run(nn.Module):
-    """One run as a user's script has it: H2O+'s loss, and the discriminators' on a batch of their own."""
+    """One run as in a user's script: H2O+'s loss, and the discriminators' loss on a separate batch."""
 
     def __init__(self, seed, value_loss=ExpectileValueLoss):
         super().__init__()
@@ -62,7 +62,7 @@ def train_alone(run, member, updates):
 
 
 def train_together(runs, updates, spoil=lambda update, stacked: None):
-    """The terms of every update, and the members that stopped."""
+    """Trains runs as a population; returns the terms of every update, the stopped members, and the population."""
     population, stopped, history = Population(runs), set(), []
     optimiser = torch.optim.Adam(population.parameters(), lr=LR, fused=True)
     generators = [torch.Generator().manual_seed(member) for member in range(len(runs))]
@@ -98,7 +98,7 @@ def test_members_learn_what_single_runs_learn(value_loss):
         for name, tensor in numbers(alone[member]).items():
             torch.testing.assert_close(numbers(together[member])[name], tensor, rtol=1e-5, atol=1e-5)
             if name.endswith("weight"):
-                assert (tensor - before[name]).abs().max() > 1e-3, name  # everything has moved far beyond rounding
+                assert (tensor - before[name]).abs().max() > 1e-3, name  # far beyond rounding
 
 
 def test_a_member_keeps_a_lambda_of_its_own():

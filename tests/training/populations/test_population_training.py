@@ -1,4 +1,4 @@
-"""A population as its user runs it: one command line, a folder a member, and each member what a single run is."""
+"""A population as a command: one folder per member, and each member equals a single run."""
 
 import json
 
@@ -81,7 +81,7 @@ def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path,
     with pytest.raises(KeyboardInterrupt):
         train_all(cfg, real, tmp_path / "parts")
     monkeypatch.undo()
-    assert sorted(closed) == [0, 1]  # nobody's workers stay behind
+    assert sorted(closed) == [0, 1]  # the workers of all members are closed
     assert trained(tmp_path / "parts") != trained(tmp_path / "whole")
     train_all(cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
@@ -90,7 +90,7 @@ def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path,
 
 
 def break_seed_1(monkeypatch, at_epoch):
-    """From some epoch on, what seed 1 simulates is no finite number."""
+    """Makes the simulated rewards of seed 1 NaN from an epoch on; returns the list of simulated (seed, epoch)."""
     begin_epoch, simulated = Trainee.begin_epoch, []
 
     def broken(self, epoch):
@@ -118,7 +118,7 @@ def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(c
     for name in ("seed_0", "seed_2"):
         assert outcomes[name].failure is None
         assert outcomes[name].rows == healthy[name].rows
-    again = train_all(cfg, real, tmp_path / "broken")  # from the last checkpoint, which remembers
+    again = train_all(cfg, real, tmp_path / "broken")  # resumes from the last checkpoint, which stores the failure
     assert again["seed_1"].failure == failed.failure
     assert again["seed_0"].rows == healthy["seed_0"].rows
 
@@ -130,7 +130,7 @@ def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(com
 
     def spoiling(self):
         terms = update(self)
-        if self.updates == 10:  # its losses were fine up to here
+        if self.updates == 10:  # its losses are finite up to this update
             next(self.population.parameters()).data[1] = float("inf")
         return terms
 

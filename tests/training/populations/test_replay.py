@@ -1,4 +1,4 @@
-"""The buffers of many runs, sampled together, give what each gives alone."""
+"""Buffers of many runs, sampled together, return the same batches as each buffer alone."""
 
 import pytest
 import torch

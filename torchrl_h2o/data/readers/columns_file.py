@@ -1,6 +1,7 @@
 """Read a log's layout from a YAML file, with errors that name the wrong entry.
 
-Three rules of YAML 1.1 need checks: ``on`` is true, ``5e-3`` is a string, and the last of two equal keys wins.
+Three rules of YAML 1.1 need checks: ``on`` means true, ``5e-3`` is a string, and of two equal keys only the last one
+counts.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Layout = TypeVar("Layout")
 def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layout:
     """Read a YAML file into a dataclass whose field ``columns`` is a tuple of another dataclass.
 
-    Both classes are arguments, so that :class:`LogColumns` can call this function without an import circle.
+    Both classes are arguments, so that :class:`LogColumns` can call this function without a circular import.
 
     Args:
         source: a YAML file, or the name of a layout in the package.

@@ -21,10 +21,10 @@ def read_d4rl(path: str | Path) -> TensorDict:
     In a file with ``next_observations`` every row is a transition. A row whose next observation differs from the
     following row, although neither flag is set, is marked truncated; the number of these rows is logged.
 
-    In a file without ``next_observations`` the next observation is the following row. The last row of an episode then
-    has none and is dropped, and the row before it becomes the truncated end; the number of dropped rows is logged. A
-    dropped terminal row loses its reward, so prefer files with ``next_observations`` (D4RL's MuJoCo files from v1 on)
-    for tasks that terminate.
+    In a file without ``next_observations`` the next observation is the observation of the following row. The last row
+    of an episode then has no next observation and is dropped; the row before it becomes the end of the episode, marked
+    truncated. The number of dropped rows is logged. The reward of a dropped terminal row is lost, so prefer files with
+    ``next_observations`` (D4RL's MuJoCo files from v1 on) for tasks that terminate.
 
     Args:
         path: an HDF5 file with observations, actions, rewards, terminals and timeouts, the last three of shape (N,)
@@ -35,7 +35,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
 
     Raises:
         DataError: for a file that is missing, empty, truncated or a pickle; a missing array, arrays of different
-            lengths, NaN or infinity, or a flag other than 0 and 1. Rows are counted from 1.
+            lengths, NaN or infinity, or a flag other than 0 and 1. Rows in the message are counted from 1.
 
     Example:
         >>> import h5py, numpy as np, tempfile

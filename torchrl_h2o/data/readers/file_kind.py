@@ -10,7 +10,7 @@ from pathlib import Path
 from torchrl_h2o.data.readers.error import DataError
 
 _PICKLE_SUFFIXES = {".pkl", ".pickle", ".pt", ".pth", ".npy", ".npz", ".joblib", ".ckpt"}
-# pickle protocols from 2 on start with PROTO; torch.save and .npz are zip files; .npy may contain objects
+# pickles from protocol 2 on start with the opcode PROTO; torch.save and .npz are zip files; .npy may contain objects
 _PICKLE_STARTS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05", b"PK\x03\x04", b"\x93NUMPY")
 _GZIP_START = b"\x1f\x8b"
 
@@ -36,7 +36,7 @@ def is_pickle(path: str | Path) -> bool:
 
 
 def require_file(path: str | Path) -> Path:
-    """Return the path of a file after checking that it exists, is not empty and is no pickle.
+    """Return the path of a file after checking that it exists, is not empty and is not a pickle.
 
     Args:
         path: a file.

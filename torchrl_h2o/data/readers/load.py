@@ -89,7 +89,7 @@ def _read_folder(path: Path, task: str | None) -> TensorDict:
         return read_minari(path, task=task)
     raise DataError(
         "the folder holds neither a Minari dataset (data/metadata.json) nor a memory-mapped TensorDict (meta.json)",
-        "give the folder that does",
+        "give a folder that holds one of them",
         source=path,
     )
 
@@ -117,5 +117,5 @@ def _read_file(
 
 
 def _looks_like_a_path(source: str | Path) -> bool:
-    """Whether a source is a path rather than a Minari name, which has no suffix and no root and ends in a version."""
+    """Whether a source is a path; a Minari name has no file suffix, does not start with / and ends in a version."""
     return isinstance(source, Path) or not re.fullmatch(r"[-\w]+(/[-\w]+)*-v\d+", source)

@@ -22,7 +22,7 @@ class Column:
         role: one of observation, action, reward, done, time, ignore. ``done`` is 1 in rows in which the task has
             ended. The ``reward`` of a row is the reward of that row's action.
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
-        scale: a further factor, such as a gear ratio or a sign.
+        scale: a factor in addition to the unit's, such as a gear ratio or a sign.
         bounds: lowest and highest value in SI, for actions only.
 
     Example:
@@ -78,10 +78,10 @@ class LogColumns:
         action: names in the order of the action vector; the file's order by default.
         outside_bounds: treatment of actions outside their bounds: ``"error"`` or ``"clip"``.
         time_tolerance: largest deviation of a time step from dt, as a share of dt.
-        on_time_jump: treatment of larger deviations: ``"error"``, or ``"split"`` the run there. Decreasing time is
-            always an error.
-        after_done: treatment of rows with done = 0 after a row with done = 1: ``"error"``, ``"drop"`` the rest of the
-            file, or start a ``"new_episode"``.
+        on_time_jump: treatment of larger deviations: ``"error"``, or ``"split"``, which starts a new run there.
+            Decreasing time is always an error.
+        after_done: treatment of rows with done = 0 after a row with done = 1: ``"error"``, ``"drop"``, which drops the
+            rest of the file, or ``"new_episode"``.
         drop_trailing_zero_rows: whether to drop rows at the end of the file that are all zero.
 
     Raises:

@@ -23,7 +23,7 @@ class LogTable:
         names: names of the columns that are not ignored, in the file's order.
         values: values in SI, float64, (rows, columns).
         rows: line number of each row, counted from 1, (rows,).
-        zero_rows: number of rows of zeros that were dropped at the end.
+        zero_rows: number of rows of zeros that were dropped at the end of the file.
     """
 
     source: str
@@ -177,7 +177,7 @@ def _numbers(
 
 
 def _number(cell: str, decimal: str) -> float:
-    # float() accepts 1_5 as 15; and with a decimal comma, a point would separate thousands
+    # float() would read 1_5 as 15; in a file with decimal commas, a point may separate thousands
     if "_" in cell or (decimal == "," and "." in cell):
         raise ValueError
     return float(cell.replace(",", ".") if decimal == "," else cell)

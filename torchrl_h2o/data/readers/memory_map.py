@@ -1,6 +1,6 @@
 """Write and read TED TensorDicts as memory maps, with checks of the files before they are opened.
 
-The checks are needed because torch silently extends a file that is too short with zeros, and because tensordict
+The checks are needed for two reasons: torch fills a file that is too short with zeros without an error, and tensordict
 stores entries that are not tensors as pickles.
 """
 

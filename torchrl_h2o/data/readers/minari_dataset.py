@@ -17,7 +17,7 @@ from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.readers.ted import episodes, require_continuous, require_ted, to_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 
-if TYPE_CHECKING:  # minari and gymnasium are imported where they are used, because the buffer needs neither
+if TYPE_CHECKING:  # imported where they are used, because the replay buffer does not need them
     from gymnasium.envs.registration import EnvSpec
     from minari import MinariDataset
     from torchrl.envs import EnvBase
@@ -29,7 +29,7 @@ def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
     """Read a Minari dataset by its folder or by its name.
 
     A name such as ``"halfcheetah/medium-v0"`` is looked up in ``MINARI_DATASETS_PATH`` and downloaded if missing. A
-    folder is only read.
+    folder is never downloaded.
 
     Args:
         source: a dataset's folder, which contains ``data/``, or its name.
@@ -110,8 +110,8 @@ def write_minari(
         The dataset's folder.
 
     Raises:
-        DataError: if the dataset exists, the name is not valid, or an observation within an episode is not the next
-            observation of the step before.
+        DataError: if the dataset exists, the name is not valid, or an observation within an episode differs from
+            the next observation of the row before.
 
     Example:
         See :func:`read_minari`.
@@ -124,7 +124,7 @@ def write_minari(
 
     try:
         parse_dataset_id(dataset_id)
-    except (ValueError, TypeError) as error:  # minari calls int(None) for a name without a version
+    except (ValueError, TypeError) as error:  # TypeError, because minari calls int(None) for a name without a version
         raise DataError(
             "this is not a valid Minari name",
             "use name-v0 or namespace/name-v0, each of at least two letters, digits, _ or -",

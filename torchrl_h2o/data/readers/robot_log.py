@@ -1,6 +1,6 @@
 """Read a robot's log, text or CSV, into TED: parse, convert to SI, and link rows into transitions.
 
-Rows t and t + 1 form a transition, so the last row of a run serves only as a next observation.
+Rows t and t + 1 form a transition, so the last row of a run is used only as a next observation.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class _Links:
     Args:
         start: index of the first row of each transition, (T,).
         terminated: whether the second row has done = 1, (T,).
-        truncated: whether the run ends after the transition without done, (T,).
+        truncated: whether the run ends after the transition although done is 0, (T,).
         dropped: number of rows that belong to no transition.
     """
 
@@ -145,7 +145,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndar
     if column is not None and len(restarts) and layout.after_done == "error":
         raise DataError(
             "done falls back to 0 after the run has ended",
-            "declare what these rows are: after_done: drop, or after_done: new_episode",
+            "state how to treat these rows: after_done: drop, or after_done: new_episode",
             source=table.source,
             column=column.name,
             row=int(table.rows[restarts[0] + 1]),
@@ -153,7 +153,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndar
 
 
 def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings) -> np.ndarray:
-    """Return where the time between two linked rows is not dt; raises DataError unless on_time_jump is split."""
+    """Return a mask of the linked pairs of rows whose time step is not dt; raise DataError unless these are split."""
     column = layout.named("time")
     if column is None:
         return np.zeros(len(linked), bool)
@@ -184,11 +184,11 @@ def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: Re
 
 
 def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any], settings: ReaderSettings) -> float:
-    """Return the layout's dt after comparing it with the steps between linked rows, or else their median."""
+    """Return the layout's dt after comparing it with the steps between linked rows; without it, their median."""
     if layout.dt is None or not len(steps):
         return float(np.median(steps)) if len(steps) else 0.0
     median = float(np.median(steps))
-    # a clock with a resolution of 1 ms gives 3, 3, 4 at 300 Hz, where the mean without gaps is accurate
+    # at 300 Hz a clock with a resolution of 1 ms gives steps of 3, 3, 4 ms; then the mean without gaps is accurate
     mean = float(np.mean(steps[steps <= settings.longest_regular_step * median]))
     # time_tolerance is for single late rows and would accept a dt that is wrong throughout
     if min(abs(median - layout.dt), abs(mean - layout.dt)) > settings.clock_tolerance * layout.dt:

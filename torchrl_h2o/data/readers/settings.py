@@ -10,9 +10,9 @@ class ReaderSettings:
     The tolerance for single irregular time steps is :attr:`LogColumns.time_tolerance`, because it depends on the log.
 
     Args:
-        clock_tolerance: share of dt by which the typical time step of a log may differ from the declared dt. Clocks
-            drift by less; logs from which every n-th row was removed differ by more.
-        longest_regular_step: multiple of the median time step; longer steps are gaps and do not enter the mean.
+        clock_tolerance: share of dt by which the typical time step of a log may differ from the declared dt. Clock
+            drift is smaller; the difference is larger in logs from which every n-th row was removed.
+        longest_regular_step: multiple of the median time step; longer steps are gaps and are excluded from the mean.
         bound_rounding: share of an action bound by which an action may exceed it. A recording in float64 that is
             rounded to float32 exceeds it by about 1e-7.
     """

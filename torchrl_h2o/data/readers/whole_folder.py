@@ -1,4 +1,4 @@
-"""Write a folder atomically: under a temporary name, renamed once it is complete."""
+"""Write a folder atomically: under a temporary name first, then rename it when it is complete."""
 
 from __future__ import annotations
 

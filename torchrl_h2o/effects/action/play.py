@@ -70,10 +70,10 @@ class ActionSaturation(ActionEffect):
 
 @dataclass(frozen=True)
 class ActionBacklash(ActionEffect):
-    """Backlash between command and actuator, as in worn gears: after a reversal the actuator rests at first.
+    """Backlash between command and actuator, as in worn gears: after a reversal the actuator stays still at first.
 
-    The executed action changes only while the command is half a width ahead of it (the play operator). It starts at
-    zero.
+    The executed action starts at zero. It follows the command at a distance of half a width, and stays constant while
+    the command is nearer than that (play operator).
 
     Args:
         width: full width of the backlash, in units of the action.

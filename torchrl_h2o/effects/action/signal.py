@@ -16,13 +16,13 @@ class ActionNoise(ActionEffect):
 
     The noisy action may exceed the bounds of the action; MuJoCo clamps the controls that have limits.
 
-    A negative ``std`` removes noise from a simulator that is noisier than reality. It cannot be executed by itself:
-    :func:`balanced` reduces the noise of the effects before it instead, as :class:`~torchrl_h2o.envs.DynamicsGap`
-    does for all gaps on an env.
+    A negative ``std`` removes noise from a simulator that is noisier than reality. It cannot be executed by itself.
+    Instead, :func:`balanced` reduces the noise of the effects before it. :class:`~torchrl_h2o.envs.DynamicsGap` calls
+    this function for all gaps on an env.
 
     Args:
         std: standard deviation, in units of the action. A negative value removes noise that the effects before it
-            add. Variances add: 1 followed by -0.6 leaves 0.8.
+            add. Variances are added, so 1 followed by -0.6 leaves sqrt(1 - 0.36) = 0.8.
         actuators: indices of the noisy entries of the action; all by default.
 
     Examples:

@@ -14,7 +14,7 @@ from torchrl_h2o.effects.parameter import parameter
 
 @dataclass(frozen=True)
 class ActionDelay(ActionEffect):
-    """Delayed actuation, by any time, including fractions of a control step.
+    """A delay of the actuation; the time need not be a whole number of control steps.
 
     With a delay of k + f control steps, the drive follows a(t - k - 1) for the first fraction f of a step and a(t - k)
     for the rest. A control step executes one action, so it executes the mean, (1 - f) · a(t - k) + f · a(t - k - 1),
@@ -81,7 +81,7 @@ class ActionLag(ActionEffect):
     def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
         left, mean_left = self._left_after(dt)
         drive = (1.0 - left) * actions
-        steps, weight = 1, left  # y(t) = Σ (1 - left) · leftⁱ · a(t - i), of 1, 2, 4, ... terms
+        steps, weight = 1, left  # y(t) = Σ (1 - left) · leftⁱ · a(t - i), with 1, 2, 4, ... terms
         while steps < len(actions) and weight > 0.0:
             drive[steps:] = drive[steps:] + weight * drive[:-steps]
             steps, weight = 2 * steps, weight * weight
@@ -89,7 +89,7 @@ class ActionLag(ActionEffect):
         return np.where(entry_mask(actions, self.actuators), actions + mean_left * behind, actions)
 
     def _left_after(self, dt: float) -> tuple[float, float]:
-        """Returns the shares of the initial error that remain at the end of a control step and in its mean."""
+        """Returns the shares of the initial error y - a that remain: at the end of a control step, and on average."""
         if self.time_constant == 0.0:
             return 0.0, 0.0
         ratio = dt / self.time_constant

@@ -1,8 +1,8 @@
 """Generates the catalogue of a model: candidate effects that its simulator may lack, with trial values.
 
 An effect is tried on single elements, on groups of elements whose names share a word, and on all elements, wherever
-it changes the model. The trial values are sized by the model's own masses, torques and control step. They belong to
-the definition of an entry and are written there, except the common factors, which are settings.
+it changes the model. The trial values are proportional to the model's own masses, torques and control step. They are
+written where their entry is defined; only the factors that several entries share are settings.
 """
 
 from collections.abc import Callable, Iterator

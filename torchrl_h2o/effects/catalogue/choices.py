@@ -15,7 +15,7 @@ def named_choices(
     passed_over: Collection[int] = (),
     groups: bool = True,
 ) -> dict[Names, tuple[int, ...]]:
-    """Returns selections by name patterns, no two of which select the same elements.
+    """Returns selections by name patterns; no two of them select the same elements.
 
     Args:
         paths: the names (body, element) of all elements of the kind. Unnamed elements are selected by their body.
@@ -54,7 +54,7 @@ def named_choices(
 def indexed_choices(
     names: Sequence[str], *, groups: bool = False, singles: bool = True
 ) -> dict[Indices, tuple[int, ...]]:
-    """Returns selections by indices, no two of which select the same entries.
+    """Returns selections by indices; no two of them select the same entries.
 
     Args:
         names: the names of all entries, ``""`` for an entry without a name.

@@ -65,7 +65,7 @@ def entries_of(
     choices: Mapping[Names, tuple[int, ...]] | Mapping[Indices, tuple[int, ...]],
     trials: Callable[[tuple[int, ...]], Trials],
 ) -> Iterator[CatalogueEntry]:
-    """Yields one entry per selection of what an effect acts on.
+    """Yields one entry per selection of elements that an effect acts on.
 
     Args:
         effect: the class of the effect.

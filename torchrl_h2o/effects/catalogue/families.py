@@ -9,8 +9,8 @@ _SIDES = "bflr"  # prefixes back, front, left and right of MuJoCo's models: bthi
 def families(names: Sequence[str]) -> dict[str, tuple[int, ...]]:
     """Returns groups of at least two names that share a word.
 
-    Words are separated by digits, underscores and other marks. A leading letter for the side is also removed from a
-    word where that forms a group. A group that several words form is listed once, under the first of them.
+    Words are separated by digits, underscores and other marks. A word also counts without its leading letter for the
+    side (b, f, l, r). If several words form the same group, the group is listed once, under the first word.
 
     Args:
         names: the names; a name without letters belongs to no group.

@@ -1,4 +1,4 @@
-"""Structural facts about a compiled model that size and select the entries of a catalogue.
+"""Properties of a compiled model from which the entries of a catalogue and their trial values are derived.
 
 These are floating roots, planar motion, possible contacts, and the magnitudes of torques and inertias.
 """
@@ -42,10 +42,10 @@ class Mechanism:
         return name or (self.model.joint(joint).name if joint is not None else "")
 
     def floating(self, joint: int) -> bool:
-        """Whether a joint lets the whole mechanism float. Such a joint is no bearing and has no friction or spring.
+        """Whether a joint lets the whole mechanism float. Such a joint is not a bearing and has no friction or spring.
 
-        These are free joints, and groups of at least two undriven joints, one of them sliding, between the world and
-        one body.
+        Floating joints are free joints, and groups of at least two undriven joints between the world and one body, if
+        the group contains a sliding joint.
         """
         model, body = self.model, self.model.jnt_bodyid[joint]
         if model.jnt_type[joint] == _FREE:
@@ -56,7 +56,7 @@ class Mechanism:
         return any(self.slides(mate) for mate in mates)
 
     def planar(self, body: int) -> bool:
-        """Whether a body moves only in the x-z plane: all joints up to the world slide in it or turn about y."""
+        """Whether a body moves only in the x-z plane: all joints up to the world slide in it or rotate about y."""
         while body:
             first = self.model.body_jntadr[body]
             for joint in range(first, first + self.model.body_jntnum[body]):
@@ -84,7 +84,10 @@ class Mechanism:
         return turning and model.geom_type[geom] in _ROUND and not any(self.floating(j) for j in joints)
 
     def torque(self, joint: int) -> float:
-        """Returns the largest torque (force) on a joint: that of its actuator, else the weight (times the lever)."""
+        """Returns the largest torque in N·m (force in N) that is typical of a joint.
+
+        It is the limit of the joint's actuators; without one, the weight times the lever (the weight).
+        """
         largest = 0.0
         for actuator, target in enumerate(self._joint_of_actuators()):
             if target == joint:
@@ -93,7 +96,7 @@ class Mechanism:
         return largest or self.weight * lever or 1.0
 
     def control(self, actuator: int) -> float:
-        """Returns the largest magnitude of an actuator's control, 1 if it has no limit."""
+        """Returns the largest magnitude of an actuator's control; 1 if the control has no limit."""
         if not self.model.actuator_ctrllimited[actuator]:
             return 1.0
         return float(np.abs(self.model.actuator_ctrlrange[actuator]).max())

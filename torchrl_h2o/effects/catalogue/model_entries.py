@@ -1,6 +1,6 @@
 """Catalogue entries for the bodies, joints and geoms of a model, and for forces on them.
 
-The trial values are sized by the model's inertias and torques at the joints and by the masses of the bodies.
+The trial values are proportional to the inertias and torques at the joints and to the masses of the bodies.
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -68,7 +68,7 @@ def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
 
 
 def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
-    """Yields entries for size, length, friction, softness and rolling of geoms that have mass or contacts."""
+    """Yields entries for size, length, friction, softness and rolling of the geoms that have mass or contacts."""
     model, pairs = mechanism.model, mechanism.touching()
     everything, touching = set(range(model.ngeom)), sorted({geom for pair in pairs for geom in pair})
     moving = [g for g in everything if model.body_weldid[model.geom_bodyid[g]]]
@@ -145,7 +145,7 @@ def _loads(mechanism: Mechanism, body: int) -> Trials:
 def _added(
     size: Callable[[int], float], parameter: str, shares: Sequence[float], own: Callable[[int], float] | None = None
 ) -> Callable[[tuple[int, ...]], Trials]:
-    """Returns trials that add shares of the joints' median size, and one that removes half of the smallest own value.
+    """Returns trials that add shares of the joints' median size, and a trial that halves the smallest present value.
 
     Args:
         size: returns the size for a joint, in units of the parameter.
@@ -186,7 +186,7 @@ def _weighing(mechanism: Mechanism, spec: mujoco.MjSpec, geoms: Sequence[int]) -
 def _rubs_otherwise(
     model: mujoco.MjModel, pairs: Sequence[tuple[int, int]], geoms: Sequence[int], factor: float
 ) -> bool:
-    """Whether scaling the friction of geoms changes any contact, which uses the larger of its two frictions."""
+    """Whether scaling the friction of geoms changes a contact; a contact uses the larger friction of its two geoms."""
     before = model.geom_friction[:, 0]
     after = before.copy()
     after[list(geoms)] *= factor

@@ -44,7 +44,7 @@ class ResidualForce(ForceEffect):
         terms: the terms.
 
     Raises:
-        ValueError: for a string that is no term; when put into a model that has no such joint, control or coordinate.
+        ValueError: for a string that is not a term; when put into a model without the joint, control or coordinate.
 
     Examples:
         >>> ripple = ResidualForce(("torque on elbow: 0.41 · sin(7 q)",))
@@ -163,9 +163,9 @@ def _require(term: ForceTerm, known: Mapping[str, DegreeOfFreedom], model: mujoc
         raise ValueError(f"this model has no joint named '{term.joint}'; it has {', '.join(known)}")
     if freedom.sliding != term.sliding:
         kinds = ("torque", "force") if term.sliding else ("force", "torque")
-        raise ValueError(f"on joint '{term.joint}' acts a {kinds[0]}, not a {kinds[1]}: write '{kinds[0]} on ...'")
+        raise ValueError(f"joint '{term.joint}' takes a {kinds[0]}, not a {kinds[1]}: write '{kinds[0]} on ...'")
     for factor in term.factors:
         if factor.coordinate == "q" and freedom.position is None:
-            raise ValueError(f"joint '{term.joint}' has no position q that is one number; use its velocity v")
+            raise ValueError(f"joint '{term.joint}' has no position q that is a single number; use its velocity v")
         if factor.coordinate.startswith("a") and int(factor.coordinate[1:]) >= model.nu:
-            raise ValueError(f"{factor} names no control of this model, which has {model.nu}, counted from 0")
+            raise ValueError(f"{factor} refers to a control that this model lacks; it has {model.nu}, counted from 0")

@@ -24,7 +24,7 @@ _FACTORS = {
     "step": re.compile(rf"step\(t - ({_NUMBER})\)"),
 }
 _RAISED = str.maketrans({"2": "²", "3": "³", "4": "⁴", "5": "⁵", "6": "⁶", "7": "⁷", "8": "⁸", "9": "⁹"})
-_LARGEST = 1e9  # nominal bound: every Parameter has bounds, and a number in a term has no physical limit
+_LARGEST = 1e9  # nominal bound: a Parameter requires bounds, but a number in a term has no physical limit
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Factor:
 
     @classmethod
     def parse(cls, text: str) -> "Factor":
-        """Parses a factor; raises ValueError for a string that is none."""
+        """Parses a factor; raises ValueError for a string that is not a factor."""
         for function, pattern in _FACTORS.items():
             if match := pattern.fullmatch(text):
                 return cls._read(function, match.groups())
@@ -99,7 +99,7 @@ class Factor:
         return np.abs(values) if self.function == "size" else np.sign(values)
 
     def parameters(self, sliding: bool) -> dict[str, Parameter]:
-        """Returns the numbers by name, with units. They have no neutral value (NaN).
+        """Returns the numbers by name, with units. Their neutral value is NaN, because they have none.
 
         Args:
             sliding: whether the degree of freedom is a translation in m rather than a rotation in rad.
@@ -136,7 +136,7 @@ class ForceTerm:
 
     @classmethod
     def parse(cls, text: str) -> "ForceTerm":
-        """Parses a term; raises ValueError for a string that is none."""
+        """Parses a term; raises ValueError for a string that is not a term."""
         match = _TERM.fullmatch(text)
         if match is None:
             raise ValueError(f"{text!r} is no term of a force; write it like 'torque on elbow: 0.41 · sin(7 q)'")

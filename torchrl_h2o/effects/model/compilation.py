@@ -9,7 +9,7 @@ from torchrl_h2o.effects.effect import Effect, ModelEffect
 
 
 def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco.MjModel:
-    """Edits a specification by the model effects in their order, then compiles it once.
+    """Edits a specification with the model effects in their order, then compiles it once.
 
     Args:
         spec: the specification, edited in place.
@@ -29,13 +29,13 @@ def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco
     """
     edit_spec(spec, effects)
     with warnings.catch_warnings():
-        # HalfCheetah's own file uses this attribute, and its user cannot change that file
+        # Gymnasium's HalfCheetah file uses this attribute, and the user cannot change that file
         warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")
         return spec.compile()
 
 
 def edit_spec(spec: mujoco.MjSpec, effects: Iterable[Effect]) -> None:
-    """Edits a specification in place by the model effects in their order, without compiling it.
+    """Edits a specification in place with the model effects in their order, without compiling it.
 
     Args:
         spec: the specification.

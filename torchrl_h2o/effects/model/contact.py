@@ -47,11 +47,11 @@ class ContactSoftness(ModelEffect):
 class RollingResistance(ModelEffect):
     """Rolling resistance, as of a soft wheel or a carpet: a torque of ``coefficient`` · load.
 
-    The geoms' contacts use MuJoCo's rolling friction (``condim`` 6). Where it was inactive before, the geom's torsional
-    friction becomes active as well.
+    The geoms' contacts use MuJoCo's rolling friction (``condim`` 6). This also activates the geoms' torsional friction,
+    unless it was active before.
 
     Args:
-        coefficient: addition to the active rolling friction, in m.
+        coefficient: addition to the rolling friction, in m; the model's own value counts only if it was active.
         geoms: name patterns of the geoms.
 
     Raises:

@@ -1,7 +1,7 @@
 """Reads and rewrites the inertial of a body: its mass, centre of mass and inertia.
 
-A model gives the inertial explicitly or lets the compiler derive it from the body's geoms. Here it is read from a
-compiled copy and written back as an explicit one, for the selected bodies only.
+A model gives the inertial explicitly or lets the compiler derive it from the body's geoms. This module reads it from a
+compiled copy and writes it back as an explicit inertial, for the selected bodies only.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,12 +40,12 @@ def edit_inertials(
 ) -> None:
     """Rewrites the inertials of bodies, which afterwards no longer follow from their geoms.
 
-    All other bodies keep theirs, even in a model with a fixed total mass (``settotalmass``).
+    All other bodies keep their inertials, even in a model with a fixed total mass (``settotalmass``).
 
     Args:
         spec: the specification, edited in place.
         bodies: bodies of the specification.
-        change: returns the new inertial of a body for its present one.
+        change: returns the new inertial of a body, given its present one.
     """
     model = compile_unscaled(spec)
     total = spec.compiler.settotalmass

@@ -118,7 +118,7 @@ class Armature(ModelEffect):
 
 
 def those_with(attribute: str, joints: list) -> list:
-    """Returns the joints whose attribute is not zero; raises ValueError if there are none to scale."""
+    """Returns the joints whose attribute is not zero; raises ValueError if it is zero for all of them."""
     chosen = [joint for joint in joints if any(getattr(joint, attribute))]
     if not chosen:
         names = ", ".join(joint.name for joint in joints)
@@ -129,5 +129,5 @@ def those_with(attribute: str, joints: list) -> list:
 def added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
     """Returns the sum of value and addend; raises ValueError if it is negative."""
     if value + addend < 0.0:
-        raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, {-addend:g} cannot be removed")
+        raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, so {-addend:g} cannot be removed")
     return value + addend

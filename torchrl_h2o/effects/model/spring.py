@@ -47,7 +47,7 @@ class JointStiffness(ModelEffect):
 class JointSpring(ModelEffect):
     """A spring on joints, as of a cable or a hose: a torque proportional to the deflection.
 
-    The rest position is that of the joint (``springref``), which is zero unless the model sets it.
+    The rest position is the joint's ``springref``, which is zero unless the model sets it.
 
     Args:
         stiffness: addition to the joints' own stiffness, in N·m/rad; a negative value reduces it.

@@ -101,7 +101,7 @@ class ObservationGain(ObservationEffect):
 
 @dataclass(frozen=True)
 class ObservationDelay(ObservationEffect):
-    """Delayed sensors, by any time, including fractions of a control step.
+    """A delay of the sensors; the time need not be a whole number of control steps.
 
     The observation is interpolated linearly between two readings. Until a delayed reading is available, the first one
     is reported.

@@ -1,6 +1,6 @@
 """The interface to the MuJoCo simulation inside a TorchRL env, common to Gymnasium and dm_control.
 
-It has what :class:`~torchrl_h2o.envs.DynamicsGap` and :class:`~torchrl_h2o.envs.BatchedMujocoEnv` need.
+It provides the operations for :class:`~torchrl_h2o.envs.DynamicsGap` and :class:`~torchrl_h2o.envs.BatchedMujocoEnv`.
 """
 
 from abc import ABC, abstractmethod
@@ -22,11 +22,11 @@ _SIZES = ("nq", "nv", "nu", "na", "nbody", "njnt", "ngeom", "nsite", "nsensor")
 class MujocoBackend(ABC):
     """The simulation inside one env: access to its model, and replacement of it.
 
-    The applied gaps and their episodes are stored on the object that owns the model. A copy that is rebuilt from the
-    original model therefore lists no gaps, and all clones that TorchRL makes of a gap on one env share an episode.
+    The applied gaps and their episodes are stored on the object that owns the model. Therefore a copy that is rebuilt
+    from the original model lists no gaps, and all clones of a gap on one env, which TorchRL makes, share an episode.
 
     Args:
-        owner: the object that owns model and data and has the same lifetime.
+        owner: the object that owns model and data; it exists as long as they do.
         env: the TorchRL env around it, without transforms.
     """
 
@@ -82,7 +82,7 @@ class MujocoBackend(ABC):
         return self.owner.__dict__.setdefault("_dynamics_gap_episodes", GapEpisodes())
 
     def apply(self, gap: object, on_env: Mapping[object, Sequence[Effect]]) -> None:
-        """Applies a gap to the model, after the gaps applied before; does nothing if it is one of them.
+        """Applies a gap to the model, after the gaps applied before; does nothing if it was applied before.
 
         Args:
             gap: the gap's identity; the same object denotes the same gap.
@@ -91,7 +91,7 @@ class MujocoBackend(ABC):
 
         Raises:
             ValueError: if the model has no element that an effect could act on, or if a gap was applied that is not
-                among those of the env. The simulation is then unchanged.
+                among the gaps of the env. The simulation is unchanged after the error.
         """
         applied = self.gaps
         if gap in applied:
@@ -117,7 +117,7 @@ class MujocoBackend(ABC):
 
     def _check_source(self, effects: Sequence[Effect]) -> None:
         self.check_sizes(compile_model(self.spec()))
-        # a copy by dm_control contains the effects of the gaps, but not the list of gaps
+        # dm_control's copies contain the effects of the gaps, but not the list of gaps
         if not self._came_from([]) and not self._came_from(effects):
             raise ValueError(
                 f"the model of {self.env} differs from {self.source}: it was changed after loading or built with "
@@ -149,7 +149,7 @@ class MujocoBackend(ABC):
                 )
 
     def _pushed_steps(self, step: Callable[[], None], n_steps: int) -> None:
-        """Takes physics steps one by one, each under the forces of its initial state."""
+        """Takes physics steps one by one; each uses the forces at the state before the step."""
         model, data, forces = self.model, self.data, self._forces()
         for _ in range(n_steps):
             # a step of MuJoCo leaves the body positions and velocities at their values before the step

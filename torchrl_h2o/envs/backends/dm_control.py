@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dm_control.mujoco import Physics
 
 
-# by the task's module; dm_control's source assigns these fields in initialize_episode
+# fields by the task's module; dm_control assigns them in initialize_episode
 _WRITTEN_AT_RESET = {
     "finger": ("site_rgba", "site_pos", "site_size", "dof_damping"),
     "fish": ("geom_rgba", "geom_pos"),

@@ -1,6 +1,6 @@
 """A hand-tuned balancing controller for the wheel-legged robot, used to record data in place of a human operator.
 
-It keeps the robot upright but lets it wander.
+It keeps the robot upright, but position and velocity vary as in the real robot's log.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class BalanceController(TensorDictModule):
 
     All gains are positive, because a forward torque both moves the wheels under a body that leans forward and makes a
     moving robot lean back before it slows down. The default gains are below those of a linear-quadratic regulator in
-    the angle and close to them in the velocity. With the default noise of :func:`noisy_balance_controller` the robot
-    wanders about as widely as in the real log.
+    the angle and close to them in the velocity. With the default noise of :func:`noisy_balance_controller` pitch, pitch
+    rate and velocity vary about as much as in the real log.
 
     Args:
         task: ``"standing_still"``, about x = 0, or ``"moving_forward"``, at 0.2 m/s.

@@ -43,8 +43,8 @@ def reward(task: str, observation: Array, action: Array, next_observation: Array
     * ``standing_still``: :math:`30 - x^2 - v^2 - \theta^2 - \dot\theta^2 - \tau^2`
     * ``moving_forward``: :math:`15 - (v - 0.2)^2 - \tau^2`
 
-    The state is the next state, and :math:`\tau` is the torque of ``action``. The env uses the executed torque, which
-    differs from the commanded one under an effect that alters actions.
+    The state variables are those of the next state; :math:`\tau` is the torque of ``action``. The env uses the executed
+    torque, which differs from the commanded one under an effect that alters actions.
 
     Args:
         task: a key of :data:`OBSERVATIONS`.
@@ -116,7 +116,7 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
         "render_fps": 200,
     }
-    #: unobserved velocities as linear functions of observed ones: the wheels roll without slip relative to the body
+    #: unobserved velocities as linear functions of observed ones, for wheels that roll without slip
     hidden_state: Mapping[str, Mapping[str, float]] = MappingProxyType(
         {"axle_velocity": {"x_velocity": 1.0 / WHEEL_RADIUS, "pitch_velocity": -1.0}}
     )

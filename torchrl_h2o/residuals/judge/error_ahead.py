@@ -11,7 +11,7 @@ from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-_RIDGE = 1e-9  # share of each regressor's variance; makes constant regressors harmless
+_RIDGE = 1e-9  # share of each regressor's variance; keeps the equations solvable with constant regressors
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,12 @@ def horizon_errors(
         simulation: the simulator.
         measured: the data.
         horizons: control steps ahead.
-        held_out: True for windows of held-out rows only, False for windows without any, None for all.
+        held_out: True for windows of held-out rows only, False for windows without held-out rows, None for all.
         states: (T, nq + nv), start states; the measured ones by default.
         stride: rows from the start of one window to the next.
 
     Returns:
-        One per horizon; its errors are NaN if there is no window.
+        One :class:`ErrorAhead` per horizon; its errors are NaN if there is no window.
     """
     errors = []
     for horizon in horizons:
@@ -69,13 +69,13 @@ def linear_floor(measured: Measured, horizon: int, *, recent: int = 0, stride: i
     """Computes the held-out error of a linear predictor that is fitted to the other rows.
 
     It predicts from the observation and the actions up to the horizon. If a controller reacts to the sensors, these
-    actions carry information about later disturbances, which a simulation does not have. Its error may therefore be
-    lower than that of any simulation.
+    actions carry information about later disturbances, and a simulation does not have this information. The linear
+    predictor's error may therefore be lower than that of any simulation.
 
     Args:
         measured: the data.
         horizon: control steps ahead.
-        recent: number of actions before the observation that are regressors as well.
+        recent: number of actions before the observation that are additional regressors.
         stride: rows from the start of one window to the next.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Floor of the error: the residual that remains after a small network has explained what it can."""
+"""Floor of the error: the part of the residual that a small network cannot predict."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def explainable_floor(
 ) -> np.ndarray:
     """Estimates the held-out one-step error that the best possible model would leave.
 
-    A network with two hidden layers predicts the residual from the observation, the action and the action before. It is
-    trained on the rows that are not held out, with early stopping on blocks of them. Its prediction is ignored in
-    dimensions in which it does not help on these blocks. The observation before is not an input, because the network
-    would then learn to smooth the sensors' noise, which no effect in the simulator can do.
+    A network with two hidden layers predicts the residual from the observation, the action and the previous action. It
+    is trained on the rows that are not held out, with early stopping on blocks of them. Its prediction is ignored in
+    dimensions in which it does not lower the error on these blocks. The previous observation is not an input, because
+    the network would then learn to smooth the sensors' noise, which no effect in the simulator can do.
 
     Args:
         simulation: the simulator.
         measured: the data.
         states: (T, nq + nv), start states; the measured ones by default.
-        seed: of the network's weights and batches; torch's global generator is not changed.
+        seed: seed of the network's weights and batches; torch's global generator is not changed.
         settings: size and training of the network.
 
     Returns:
@@ -58,7 +58,7 @@ def explainable_floor(
 
 
 def _inputs(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """Observation, sine and cosine of its angles, action, and action before in the same run, (T, inputs)."""
+    """Observation, sine and cosine of its angles, action, and previous action in the same run, (T, inputs)."""
     angles = measured.observation[:, [unit == "rad" for unit in simulation.state_map.units]]
     actions = executed_actions(simulation, measured)
     before = np.concatenate([np.vstack([actions[run][:1], actions[run][:-1]]) for run in measured.runs])
@@ -66,7 +66,7 @@ def _inputs(simulation: Simulation, measured: Measured) -> np.ndarray:
 
 
 def _standard(values: np.ndarray, rows: np.ndarray, clip: float) -> np.ndarray:
-    """Values standardised by some rows and clipped, in standard deviations."""
+    """Values standardised with the mean and spread of some rows, and clipped; in standard deviations."""
     spread = values[rows].std(0)
     return np.clip((values - values[rows].mean(0)) / np.where(spread > 0.0, spread, 1.0), -clip, clip)
 
@@ -78,7 +78,7 @@ def _trained(
     stopping: np.ndarray | torch.Tensor,
     settings: JudgeSettings,
 ) -> nn.Module:
-    """A network trained on some rows, with the weights of its best epoch on others."""
+    """Trains a network on some rows; keeps the weights of the epoch with the lowest loss on the stopping rows."""
     width = settings.floor_width
     network = nn.Sequential(
         nn.Linear(x.shape[1], width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, y.shape[1])

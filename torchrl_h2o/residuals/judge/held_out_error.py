@@ -24,7 +24,7 @@ def error_summary(
         simulation: the simulator before the effects are put in.
         mended: the simulator with them.
         measured: the data.
-        settings: horizons, and the network of the floor.
+        settings: horizons, and the network that estimates the floor.
     """
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
@@ -71,6 +71,6 @@ def _horizons(
 def _rmse(simulation: Simulation, measured: Measured, horizon: int) -> np.ndarray:
     """Held-out RMSE at the end of windows, (n), in units of the observations."""
     starts = measured.judged(horizon)
-    # the simulator's own action noise is drawn, because it is part of its error
+    # the simulator's own action noise is drawn, because it is part of the simulator's error
     missed = residuals(simulation, measured, starts, horizon, rng=np.random.default_rng(0))[:, -1]
     return np.sqrt(np.nanmean(missed**2, axis=0))

@@ -23,7 +23,7 @@ from torchrl_h2o.residuals.trace.outcome import Attempt
 
 @dataclass(frozen=True, eq=False)
 class Alternatives:
-    """An effect and those that explain the data as well in its place.
+    """An effect and the alternatives that explain the data equally well in its place.
 
     Args:
         effects: the effects; the first is the one put in.
@@ -41,12 +41,12 @@ class Judgement:
     """Held-out figures of an explanation.
 
     Args:
-        measured: the data without the remaining disturbances.
+        measured: the data, without the intervals of remaining disturbances.
         disturbed: the remaining disturbances.
         error: errors before and after.
         errors_after: for each part, the error with the effects up to and including it.
         rejected: attempts that are not part of the explanation, and the error with each of them alone.
-        alternatives: for each part that has any.
+        alternatives: an entry for each part that has alternatives.
         two_sample: AUC of a classifier before and after.
         trace: the residual over time.
     """
@@ -64,13 +64,13 @@ class Judgement:
 def judge(
     evidence: Evidence, explanation: Explanation, *, seed: int = 0, settings: LoopSettings = DEFAULTS
 ) -> Judgement:
-    """Judges an explanation on data that no fit has seen.
+    """Judges an explanation on data that no fit has used.
 
     Args:
         evidence: the simulator without the effects, and the data.
         explanation: the effects.
-        seed: of the classifiers.
-        settings: horizons, networks and list lengths.
+        seed: seed of the classifiers.
+        settings: horizons, networks and lengths of the lists.
     """
     simulation, effects = evidence.simulation, explanation.effects
     disturbed = _remaining_disturbances(evidence, explanation, settings)

@@ -1,4 +1,4 @@
-"""Describes which data would tell equivalent effects apart: those where their predictions differ most."""
+"""Describes which data would distinguish equivalent effects: data where their predictions differ most."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def separated_by(
     *,
     settings: JudgeSettings = DEFAULTS.judge,
 ) -> str:
-    """Describes which data would tell the first of some effects from the others.
+    """Describes which data would distinguish the first of some effects from the others.
 
     Args:
         simulation: the simulator without any of them.
@@ -36,7 +36,7 @@ def separated_by(
 
     Returns:
         A clause with the dimension in which the predictions differ most, the difference per step, and the states or
-        actions at which they do.
+        actions at which they differ.
     """
     rows = measured.windows(1)
     of_first, *of_others = (
@@ -47,14 +47,14 @@ def separated_by(
     size = difference.max(1)
     most = np.argsort(size)[-max(1, round(settings.separation_share * len(size))) :]
     if size[most].mean() < settings.separation_negligible:
-        return "no data of these sensors: the predictions are the same; measure one of the quantities directly"
+        return "a direct measurement of one of the quantities, because the predictions for these sensors are equal"
     dimension = int(difference[most].mean(0).argmax())
     name, unit = simulation.state_map.names[dimension], simulation.state_map.units[dimension]
     by = difference[most, dimension].mean() * spread[dimension]
     where = _where(simulation, measured, rows, size, most, settings.separation_factor)
     return (
-        f"more data{where}, as the predictions differ most in {name}, by {quantity(by, unit, 2)} per step; or a direct "
-        "measurement of one of the quantities"
+        f"more data{where}, because the predictions differ most in {name}, by {quantity(by, unit, 2)} per step; or a "
+        "direct measurement of one of the quantities"
     )
 
 
@@ -66,7 +66,7 @@ def _where(
     most: np.ndarray,
     factor: float,
 ) -> str:
-    """Clause that names the state or action at which the predictions differ; empty if no single one is typical.
+    """Clause that names the state or action at which the predictions differ; empty if no coordinate is unusual there.
 
     Args:
         simulation: the simulator, for names and units.

@@ -24,7 +24,7 @@ def two_sample_auc(
     seed: int = 0,
     settings: JudgeSettings = DEFAULTS.judge,
 ) -> float:
-    """Measures how well a classifier separates measured from simulated outcomes of the same state and action.
+    """Measures how well a classifier separates measured from simulated next observations of the same state and action.
 
     The discriminators of Eq. (9) are trained on the fitted part, and their log dynamics ratio is evaluated on the
     held-out part. Their input is the change of the observation, each dimension in units of its spread.
@@ -34,11 +34,11 @@ def two_sample_auc(
         measured: the data.
         sensor_std: (n), standard deviation of the readings' noise, which is then added to the simulated outcomes and
             their start states.
-        seed: of the networks and the batches.
+        seed: seed of the networks and the batches.
         settings: size and training of the networks.
 
     Returns:
-        Area under the ROC curve: 0.5 if the gap is undetectable, 1 if every outcome is classified correctly.
+        Area under the ROC curve: 0.5 if the gap is undetectable, 1 if every transition is classified correctly.
 
     Source: H2O+ (Niu et al., 2023, arXiv 2309.12716), Eq. (9).
     """

@@ -1,4 +1,4 @@
-"""Autocorrelation of the held-out residual: about zero if white, positive where the simulator lacks something."""
+"""Autocorrelation of the held-out residual: about zero if white, positive if the simulator lacks an effect."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def autocorrelation(simulation: Simulation, measured: Measured, settings: JudgeS
         settings: size below which a residual counts as rounding.
 
     Returns:
-        Spearman's correlation, which single contacts do not dominate; NaN where the residual is within rounding.
+        Spearman's correlation, because single contacts do not dominate ranks; NaN if the residual is within rounding.
     """
     rows = measured.windows(2, held_out=True)
     first, second = (residuals(simulation, measured, rows + later)[:, 0] for later in (0, 1))

@@ -1,7 +1,7 @@
 """Start states estimated from noisy sensors: an extended Kalman filter and smoother over the simulator.
 
-Noise levels are estimated from the data. The filter uses past rows only, so its states may start a prediction; the
-smoother also uses later rows and serves fits only.
+Noise levels are estimated from the data. The filter uses past rows only, so a prediction may start from its states;
+the smoother also uses later rows, so its states are for fits only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevels:
-    """Shares of sensors and simulator in the one-step residual.
+    """Contributions of sensor noise and simulator error to the one-step residual.
 
     Args:
         sensor: (n), standard deviation of each sensor's noise, in its unit.
@@ -31,7 +31,7 @@ class NoiseLevels:
 
 @dataclass(frozen=True, eq=False)
 class _Filtered:
-    """Result of the filter in spreads: filtered and predicted means (T, n) and covariances (T, n, n)."""
+    """Result of the filter, in spreads: filtered and predicted means (T, n) and covariances (T, n, n)."""
 
     mean: np.ndarray
     covariance: np.ndarray
@@ -42,13 +42,13 @@ class _Filtered:
 def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None = None) -> np.ndarray:
     """Estimates the state of each row from the rows up to and including it.
 
-    An extended Kalman filter, linearised about the measured rows. Where the innovation is far larger than expected
-    (a push), the filter follows the measurement. Without sensor noise the result is the measured states.
+    Uses an extended Kalman filter, linearised about the measured rows. Where the innovation is far larger than expected
+    (a push), the filter follows the measurement. Without sensor noise the result equals the measured states.
 
     Args:
         simulation: simulator with its sensors, delays and unobserved coordinates.
         measured: the data.
-        noise: noise levels; estimated from the rows that are not held out by default.
+        noise: noise levels; by default estimated from the rows that are not held out.
 
     Returns:
         (T, nq + nv).
@@ -69,8 +69,8 @@ def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
 def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None = None) -> np.ndarray:
     """Estimates the state of each row from all rows of its run, with a Rauch-Tung-Striebel smoother.
 
-    The states depend on later rows, so they must not start a prediction that is judged. Arguments and result are those
-    of :func:`estimate_states`.
+    The states depend on later rows, so a prediction that is judged must not start from them. Arguments and
+    result are those of :func:`estimate_states`.
     """
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
@@ -82,9 +82,9 @@ def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
 def noise_levels(simulation: Simulation, measured: Measured) -> NoiseLevels:
     """Estimates the noise of sensors and simulator from one-step residuals at the measured states.
 
-    Noise of a measured row enters the residual of the step to it and, with the opposite sign, that of the step from it.
-    Errors of the simulator do not, or enter with the same sign. The product of successive residuals therefore gives the
-    sensors' share. Held-out rows are not used.
+    Sensor noise of a row enters two successive residuals with opposite signs: the step that ends at this row and the
+    step that starts there. An error of the simulator enters one residual only, or successive ones with the same sign.
+    The product of successive residuals therefore gives the variance of the sensor noise. Held-out rows are not used.
     """
     return _noise_levels(Linearised.about(simulation, measured), measured)
 

@@ -56,7 +56,7 @@ class Linearised:
         )
 
     def states_at(self, estimate: np.ndarray, state_map) -> np.ndarray:
-        """States, (T, nq + nv), that belong to estimated observations (T, n), in spreads.
+        """States, (T, nq + nv), for estimated observations (T, n) in spreads.
 
         Rows without a finite estimate keep their measured state.
         """
@@ -67,17 +67,17 @@ class Linearised:
 def one_step(
     simulation: Simulation, states: np.ndarray, actions: np.ndarray, time: np.ndarray, nudge: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Simulates one control step and differentiates it by the observation before, with finite differences.
+    """Simulates one control step and differentiates it by the previous observation, with finite differences.
 
     Args:
         simulation: the simulator.
         states: (B, nq + nv), start states.
-        actions: (B, nu), as executed.
-        time: (B), of the start, in s.
+        actions: (B, nu), executed actions.
+        time: (B), start times in s.
         nudge: (n), steps of the differences, in the units of the observations.
 
     Returns:
-        Observations (B, n) and their derivatives by the observations before (B, n, n); NaN where the simulation
+        Observations (B, n) and their derivatives by the previous observations (B, n, n); NaN where the simulation
         diverges.
     """
     steps = nudge * simulation.state_map.restore

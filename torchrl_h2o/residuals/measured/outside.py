@@ -1,7 +1,7 @@
 """Finds intervals disturbed from outside, such as pushes: their residuals are far larger than elsewhere.
 
 A wrong joint limit or contact in the simulator also causes large residuals, but they recur at the same states under the
-same actions. Recurring residuals are left to the effects.
+same actions. Recurring residuals are not treated as disturbances, because an effect may explain them.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ def outside_intervals(
     """Finds intervals disturbed from outside.
 
     The residual at the end of short windows is compared with the usual one, and with the residuals of windows that
-    began in similar states under similar actions at other times. The test is more sensitive the better the simulator
-    is, so it is worth repeating with the mended simulator.
+    began in similar states under similar actions at other times. A better simulator makes the test more
+    sensitive, so repeat it with the mended simulator.
 
     Args:
         simulation: the simulator, with all effects known so far.
@@ -55,7 +55,7 @@ def outside_intervals(
         states: (T, nq + nv), start states; the measured ones by default.
 
     Returns:
-        The intervals in order, each with a margin of one window on either side; none where large residuals are
+        The intervals in order, each with a margin of one window on either side; none if large residuals are
         frequent.
     """
     starts, size = _window_sizes(simulation, measured, settings, states)
@@ -79,7 +79,7 @@ def still_outside(
     *,
     settings: OutsideSettings = DEFAULTS.outside,
 ) -> list[OutsideInterval]:
-    """Selects the intervals that the mended simulator does not explain either.
+    """Selects the intervals that remain disturbed when compared with the mended simulator.
 
     Args:
         intervals: result of :func:`outside_intervals` with the simulator before it was mended.
@@ -137,13 +137,13 @@ def _window_sizes(
     usual = np.nanmedian(np.abs(residual), axis=0) / 0.6745
     usual = np.maximum(usual, settings.rounding * measured.observation.std(0) + 1e-12)
     size = (np.abs(residual) / usual).max(1)
-    return starts, np.where(np.isfinite(size), size, 0.0)  # a divergence is no evidence of a push
+    return starts, np.where(np.isfinite(size), size, 0.0)  # a diverged simulation does not indicate a push
 
 
 def _beginnings(
     simulation: Simulation, measured: Measured, starts: np.ndarray, settings: OutsideSettings
 ) -> np.ndarray:
-    """Start of each window, (W, k): observation, mean action and previous action, each in its own spread."""
+    """Features of each window's start, (W, k): observation, mean action and previous action, in their spreads."""
     action = executed_actions(simulation, measured)
     mean = action[starts[:, None] + np.arange(settings.horizon)].mean(1)
     features = np.hstack([measured.observation[starts], mean, action[np.maximum(starts - 1, 0)]])
@@ -154,7 +154,7 @@ def _beginnings(
 def _recurring_sizes(
     beginnings: np.ndarray, starts: np.ndarray, size: np.ndarray, chosen: np.ndarray, settings: OutsideSettings
 ) -> np.ndarray:
-    """Residual, for each chosen window, of the events at other times whose start was most similar, (chosen)."""
+    """Quantile of the residuals of other events with the most similar starts, for each chosen window, (chosen)."""
     horizon, apart = settings.horizon, settings.events_apart
     tree = cKDTree(beginnings)
     asked = min(len(starts), settings.neighbours * (apart + 1) * horizon)

@@ -27,7 +27,7 @@ def residuals(
         horizon: control steps per window.
         states: (T, nq + nv), start states; the measured ones by default.
         applied: (W, H, nv), generalised forces in N or N·m in addition to those of the effects.
-        rng: generator for random action effects, which are left out without it.
+        rng: generator for random action effects; without it they are left out.
 
     Returns:
         (W, H, n), in the units of the observations; NaN where the simulation diverges.

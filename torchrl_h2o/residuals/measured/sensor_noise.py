@@ -1,7 +1,8 @@
 """Sensor noise of measured data, and synthetic data in which this noise is the only difference from a simulator.
 
-Start states read from noisy sensors bias every fit: noise imitates damping, and contacts, which respond in one
-direction only, turn it into a force. An explanation must therefore do better on the data than on such synthetic data.
+Start states read from noisy sensors bias every fit: noise imitates damping, and contacts, which push in one direction
+only, turn zero-mean noise into a mean force. An explanation must therefore reduce the loss more on the measured data
+than on such synthetic data.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
 def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
-    """Standard deviation of each sensor's noise, (n), in its unit; None where all of them are negligible."""
+    """Standard deviation of each sensor's noise, (n), in its unit; None if all of them are negligible."""
     std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
     return std if (std > measured.settings.noiseless * measured.observation.std(0)).any() else None
 
@@ -30,7 +31,7 @@ def stand_in(
     horizon: int = 1,
     states: np.ndarray | None = None,
 ) -> Measured:
-    """Data that the simulation itself produced in the measured windows, read through noisy sensors.
+    """Simulates the measured windows and adds sensor noise to the observations.
 
     Args:
         simulation: the simulator with the effects found so far.

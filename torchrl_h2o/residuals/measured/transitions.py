@@ -21,11 +21,11 @@ class Measured:
     """Measured transitions in the order of their recording.
 
     Args:
-        observation: (T, n), before the action.
+        observation: (T, n), observation before the action.
         action: (T, nu), as commanded.
         following: (T, n), observation after the action.
         run: (T), index of the unbroken run that each transition belongs to.
-        time: (T), of the observation, in s from the start of the data.
+        time: (T), time of the observation, in s from the start of the data.
         usable: (T), True for transitions that may be fitted and judged.
         held_out: (T), True for transitions that are reserved for the judgement.
         left_out: number of excluded rows by reason.
@@ -106,7 +106,7 @@ class Measured:
         Args:
             horizon: transitions per window.
             stride: rows from the start of one window to the next.
-            held_out: True for windows of held-out transitions only, False for windows without any, None for all.
+            held_out: True for windows of held-out transitions only, False for windows without them, None for all.
         """
         good = self.usable.copy()
         if held_out is not None:
@@ -136,7 +136,7 @@ class Measured:
         return replace(self, usable=self.usable & ~rows, left_out=left_out)
 
     def why_no_conclusion(self) -> str | None:
-        """Reason why these data allow no conclusion about a simulator; None if they do."""
+        """Reason why these data allow no conclusion about a simulator; None if a conclusion is possible."""
         if self.usable.sum() < self.settings.min_transitions:
             return (
                 f"{int(self.usable.sum())} usable transitions are too few to tell an effect from chance; record at "

@@ -1,4 +1,4 @@
-"""Adds action noise to an explanation, where the data scatter more or less than the simulator."""
+"""Adds action noise to an explanation if the data scatter more or less than the simulator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def add_action_noise(
     explanation: Explanation,
     settings: LoopSettings = DEFAULTS,
 ) -> Explanation:
-    """Adds the action noise that the simulator lacks, or removes the excess of its own.
+    """Adds the action noise that the simulator lacks, or removes the noise that it has in excess.
 
     Args:
         simulation: the simulator without the effects found.

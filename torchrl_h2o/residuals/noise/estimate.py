@@ -46,7 +46,7 @@ def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSet
     limits and with it the noise; :math:`\mathrm{E}[\nu\nu^\top]` is the second moment after clamping.
 
     Args:
-        simulation: the simulator with all effects found so far, and without action noise of its own.
+        simulation: the simulator with all effects found so far, and without its own action noise.
         measured: the data.
         settings: thresholds and numerics.
 
@@ -56,7 +56,7 @@ def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSet
     rules = settings.noise
     fitted = Scatter.of(simulation, measured, measured.fitted(), settings=rules)
     judged = Scatter.of(simulation, measured, measured.judged(), fitted.scale, settings=rules)
-    # noise that enters successive residuals with opposite signs is the sensors', even if the action could explain it
+    # noise with opposite signs in successive residuals is attributed to the sensors, even if action noise could fit it
     sensor_std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
     estimate, left_out = fitted_variances(fitted, sensor_std, rules)
     silent, _ = fitted_variances(fitted.without_action(), sensor_std, rules)
@@ -76,7 +76,7 @@ def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSet
 def _plausible(
     simulation: Simulation, measured: Measured, std: float, half_width: float, settings: NoiseSettings
 ) -> bool:
-    """Whether an estimate is neither negligible, nor uncertain, nor larger than the actions themselves."""
+    """Whether an estimate exceeds its uncertainty and a minimum, and is not larger than the actions."""
     low, high = simulation.model.actuator_ctrlrange.T
     reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
     asked = float(np.sqrt((measured.action**2).mean()))

@@ -22,10 +22,10 @@ class Scatter:
     Args:
         residual: (W, n).
         by_action: (W, n, nu), derivative of the observation by the executed action.
-        by_sensor: (W, n, n), derivative of the observation by the observation before.
+        by_sensor: (W, n, n), derivative of the observation by the previous observation.
         executed: (W, nu), executed actions, in their units.
-        limits: (nu, 2), control range, infinite where there is none.
-        scale: (n), of the residual, in units of the observations.
+        limits: (nu, 2), control range; infinite for an actuator without limits.
+        scale: (n), scale of the residual, in units of the observations.
     """
 
     residual: np.ndarray
@@ -50,7 +50,7 @@ class Scatter:
         residual = residuals(simulation, measured, rows, states=states)[:, 0]
         by_action, by_sensor = derivatives(simulation, measured, rows, states, settings.nudge)
         whole = np.isfinite(residual).all(1) & np.isfinite(by_action).all((1, 2)) & np.isfinite(by_sensor).all((1, 2))
-        # the half of the transitions in which noise grows least: near contacts no derivative is valid
+        # keeps the half of the transitions in which noise grows least, because derivatives are invalid near contacts
         growth = np.where(whole, (by_sensor**2).sum((1, 2)), np.inf)
         calm = whole & (growth <= np.median(growth[whole]))
         residual, by_action, by_sensor = residual[calm], by_action[calm], by_sensor[calm]
@@ -96,13 +96,13 @@ def derivatives(
         nudge: step, in spreads of the observation and shares of the largest action.
 
     Returns:
-        Derivatives by the executed action, (W, n, nu), and by the observation before, (W, n, n), in their units.
+        Derivatives by the executed action, (W, n, nu), and by the previous observation, (W, n, n), in their units.
     """
     start, actions, time = states[rows], executed_actions(simulation, measured)[rows], measured.time[rows]
     base, by_sensor = one_step(simulation, start, actions, time, nudge * (measured.observation.std(0) + 1e-9))
     by_action = []
     for index in range(actions.shape[1]):
-        # towards zero: outwards the control range would clamp the step
+        # a step towards zero, because the control range may clamp a step outwards
         step = np.zeros_like(actions)
         size = nudge * (np.abs(actions[:, index]).max() + 1e-6)
         step[:, index] = np.where(actions[:, index] > 0.0, -size, size)

@@ -15,7 +15,7 @@ def fitted_variances(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fits the variances of action and sensor noise to squared residuals, by Fisher scoring.
 
-    The covariance of a residual is linear in the variances and weighted by its own inverse.
+    The covariance of a residual is linear in the variances; squared residuals are weighted by its inverse.
 
     Args:
         scatter: the residuals and their derivatives.
@@ -23,8 +23,9 @@ def fitted_variances(
         settings: blocks, iterations and robustness.
 
     Returns:
-        Variances (1 + n), of the action (one for all actuators; 0 without derivatives by it) and of each sensor, in
-        scales; and the action's variance with each block of the data left out in turn, (blocks).
+        Variances (1 + n): first of the action, in squared units of the action (one for all actuators; 0 without
+        derivatives by it), then of each sensor, in squared scales. And the action's variance with each block of the
+        data left out in turn, (blocks).
     """
     found, least = np.zeros((2, 1 + scatter.residual.shape[1]))
     least[1:] = (sensor_std / scatter.scale) ** 2

@@ -17,8 +17,8 @@ class FoundEffect:
         declared: True if it is an entry of the catalogue, False if it was derived from the residual.
         ci95: 95 % interval of each parameter by name, (low, high) in the parameter's unit.
         error_after: held-out error with the effects up to and including this one, in the summary's unit.
-        words: description with units; by default that of the effect, without the simulator's names of sensors and
-            actuators, and with a mark if it is undeclared.
+        words: description with units; by default the effect's own, without the simulator's names of sensors and
+            actuators; an undeclared effect is marked.
     """
 
     effect: Effect
@@ -44,10 +44,10 @@ class RejectedEffect:
 
     Args:
         effect: the effect at its best fit.
-        error_after: held-out error with this effect alone, in the summary's unit; not finite if it diverged.
+        error_after: held-out error with this effect alone, in the summary's unit; not finite if it diverges.
         p_value: p-value of its gain on held-out data; None if no test was made.
         reason: reason why it was not put in, such as "explains no more than chance".
-        words: description with units; by default that of the effect.
+        words: description with units; by default the effect's own.
     """
 
     effect: Effect
@@ -102,8 +102,8 @@ class DimensionError:
         before: error without the effects.
         after: error with all of them.
         floor: estimated error of the best possible model; None if there is no estimate.
-        autocorrelation: of the remaining residual, from one transition to the next: about 0 for white residuals, down
-            to -0.5 for sensor noise alone, above 0 where the simulator still lacks something; None if not computed.
+        autocorrelation: rank correlation of successive remaining residuals: about 0 for white residuals, down to
+            -0.5 for sensor noise alone, above 0 if the simulator still lacks an effect; None if not computed.
     """
 
     name: str
@@ -186,7 +186,7 @@ class DataSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportContents:
-    """What closing the loop found, as plain data.
+    """Result of closing the loop, as plain data.
 
     Args:
         simulator: name of the simulator.
@@ -199,8 +199,8 @@ class ReportContents:
         unexplained_intervals: intervals that were excluded as disturbed.
         stop_test: description of the test by which the search stopped.
         wall_s: duration in s; None if not timed.
-        conclusion: reason why there is no conclusion; None where effects were found or nothing is missing.
-        trace: residual over time, for the pictures; None for a report without them. It is ignored by ``==``.
+        conclusion: reason why there is no conclusion; None if effects were found or nothing is missing.
+        trace: residual over time, for the pictures; None for a report without pictures. It is ignored by ``==``.
 
     Raises:
         ValueError: if effects are given together with a reason for no conclusion.

@@ -15,7 +15,7 @@ from torchrl_h2o.residuals.report.sentence import sentence
 
 @dataclass(frozen=True, kw_only=True)
 class Report(ReportContents):
-    """What closing the loop found; ``DynamicsGap(*report.effects)`` mends the simulator.
+    """Result of closing the loop; ``DynamicsGap(*report.effects)`` mends the simulator.
 
     The fields are those of :class:`ReportContents`.
 

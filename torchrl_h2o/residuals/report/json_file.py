@@ -95,7 +95,7 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
 
 
 def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of the report from which :func:`report_to_json` made some entries, by name.
+    """The fields of a report by name, from the entries that :func:`report_to_json` returned.
 
     Raises:
         KeyError, TypeError, ValueError, AttributeError, IndexError: if the entries are not those of a report.
@@ -119,7 +119,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict[str, Any]:
-    """An effect with its description, its parameters, its other figures, and the entry that rebuilds it."""
+    """An effect with its description, its parameters, its errors, and the entry that rebuilds it."""
     rest = {field.name: getattr(tried, field.name) for field in dataclasses.fields(tried)}
     ci95 = rest.pop("ci95", {})
     return {
@@ -134,7 +134,7 @@ def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict
 
 
 def _trace_to_json(trace: ResidualTrace) -> dict[str, Any]:
-    """The trace, thinned and rounded to six digits, as it serves pictures only."""
+    """The trace, thinned and rounded to six digits, because it is used for pictures only."""
     trace = trace.thinned()
     arrays = {name: [_rounded(row) for row in getattr(trace, name)] for name in _ARRAYS}
     return {
@@ -151,7 +151,7 @@ def _rounded(row: np.ndarray) -> list[float]:
 
 
 def _plain(value: Any) -> Any:
-    """A value in JSON's types: arrays become lists, NumPy's numbers Python's, numbers that are not finite None."""
+    """A value in JSON's types: arrays become lists, NumPy numbers Python numbers, and non-finite numbers None."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -170,7 +170,7 @@ def _floats(entries: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
-    """An instance of a dataclass from the fields read already and, for the others, the entry's values.
+    """Builds a dataclass instance from converted fields and, for the other fields, from the entry's values.
 
     Fields with a default may be missing, as in files of earlier versions.
     """

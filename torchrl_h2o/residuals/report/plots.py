@@ -1,6 +1,6 @@
 """Pictures of a report as SVG whose colours are variables of the page.
 
-They are small, so that they fit a grid on a phone as well.
+They are small, so that a grid of them also fits on a phone.
 """
 
 import html
@@ -22,7 +22,7 @@ from torchrl_h2o.residuals.report.words import number
 # placeholder colours, and the page variables that replace them
 _INK, _MUTED, _SHADE, _FLOOR, _ASIDE = "#010101", "#020202", "#030303", "#040404", "#050505"
 _VARIABLES = {_INK: "--ink", _MUTED: "--muted", _SHADE: "--shade", _FLOOR: "--floor", _ASIDE: "--aside"}
-# points are an image, so their colours are fixed: legible on light and dark pages
+# points are drawn as an image with fixed colours, which are legible on light and dark pages
 BEFORE, AFTER = "#d9730d", "#2a7de1"
 
 _STYLE: dict[Any, Any] = {
@@ -138,7 +138,7 @@ def _fitted(trace: ResidualTrace, aside: Sequence[Interval]) -> np.ndarray:
 
 
 def _points(axes: Axes, x: np.ndarray, trace: ResidualTrace, dimension: int, framed: np.ndarray) -> None:
-    """Draws points as an image, to keep the file small; the frame covers the framed rows without outliers."""
+    """Draws points as an image, to keep the file small; the axis range covers the framed rows without outliers."""
     for residual, colour in ((trace.before, BEFORE), (trace.after, AFTER)):
         axes.plot(x, residual[:, dimension], ".", color=colour, alpha=0.6, markersize=3, mew=0, rasterized=True)
     sizes = np.abs([trace.before[framed, dimension], trace.after[framed, dimension]])

@@ -16,7 +16,7 @@ class ResidualTrace:
         before: (T, n), residual without the effects; NaN where it is not defined.
         after: (T, n), residual with the effects.
         states: (T, n), measured state before each step.
-        held_out: (T,), True for rows that no fit has seen.
+        held_out: (T,), True for rows that no fit has used.
 
     Raises:
         ValueError: if the shapes do not agree or time decreases.

@@ -109,7 +109,7 @@ def _selected(effect: Effect) -> list[str | int]:
 
 
 def effect_words(effect: Effect, names: EntryNames = NO_NAMES) -> str:
-    """Describes an effect with values rounded to three digits, or more where three would round to neutral.
+    """Describes an effect with values rounded to three digits, or to more if three would give the neutral value.
 
     Args:
         effect: the effect.

@@ -25,14 +25,14 @@ def source_of_mjcf(
 
     Args:
         path: the file.
-        state_map: a map; or the observed coordinates, in the order of the data; or, for data whose columns have
-            names of their own, the coordinate of each column: ``{"theta": "pitch", "theta_dot": "pitch_velocity"}``.
+        state_map: a map; or the observed coordinates, in the order of the data; or, for data with other
+            column names, the coordinate of each column: ``{"theta": "pitch", "theta_dot": "pitch_velocity"}``.
         control_step: the time between two rows of the data, in s.
         effects: effects to put into the simulator.
         settings: the tolerance of the control step.
 
     Raises:
-        ValueError: for a file that is no model, names that the model does not have, or a control step that is no
+        ValueError: for a file that is not a model, names that the model does not have, or a control step that is not a
             multiple of its timestep.
     """
     path = Path(path)

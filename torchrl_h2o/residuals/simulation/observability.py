@@ -18,8 +18,8 @@ def hidden_coordinates(
 ) -> tuple[int, ...]:
     """Returns the indices of the unobserved coordinates that change the next observation when they are moved.
 
-    HalfCheetah does not observe how far it has run, which changes no later observation. A wheeled robot does not
-    observe how deep its wheels sink into the floor, which does.
+    For example, the distance that HalfCheetah has run is not observed, and it changes no later observation. The depth
+    to which the wheels of a robot sink into the floor is not observed either, but it changes later observations.
 
     Args:
         state_map: the map between observations and states.

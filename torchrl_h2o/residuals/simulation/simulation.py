@@ -81,8 +81,8 @@ class Simulation:
         Args:
             path: the file.
             state_map: a map; or the names of the observed coordinates, in the order of the data, where a joint's name
-                is its position and the name with ``_velocity`` appended its velocity; or a mapping from the columns
-                of a log to these names.
+                stands for its position and the name with ``_velocity`` appended for its velocity; or a mapping
+                from the columns of a log to these names.
             control_step: the time between two rows of the data, in s; a multiple of the model's timestep.
             effects: effects to put into the simulator.
 
@@ -133,7 +133,7 @@ class Simulation:
         """Returns the simulation with more effects, appended to the present ones."""
         more = replace(self, effects=(*self.effects, *effects))
         if not any(isinstance(effect, ModelEffect) for effect in effects):
-            # the model is unchanged, and compiling it for every value of an actuator's delay would be slow
+            # the model is unchanged, so it is not compiled again, for example for each trial value of a delay
             more.__dict__.update(model=self.model, _data=self._data)
         return more
 
@@ -147,7 +147,7 @@ class Simulation:
         return self.pipeline.executed_run(actions, self.control_step, rng)
 
     def true_observations(self, observations: np.ndarray) -> np.ndarray:
-        """Undoes the sensors in one recorded run, (T, n); NaN where that fails. See :meth:`Pipeline.restore_run`."""
+        """Undoes the sensor effects of a recorded run, (T, n); NaN if impossible; see :meth:`Pipeline.restore_run`."""
         return self.pipeline.restore_run(observations, self.control_step)
 
     def undelayed(self, observations: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ class Simulation:
         return self.pipeline.undelay_run(observations, self.control_step)
 
     def observed(self, states: np.ndarray) -> np.ndarray:
-        """Returns the observations (..., n) of states (..., nq + nv) after the sensors without memory or noise."""
+        """Returns the observations (..., n) of states (..., nq + nv) with memoryless, non-random effects."""
         return self.pipeline.observe_memoryless(self.state_map.observations(states), self.control_step)
 
     def rollout(
@@ -201,7 +201,7 @@ class Simulation:
                     )
                 )
         reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
-        # MuJoCo resets a simulation and its clock when its state is not finite or far too large
+        # MuJoCo resets a simulation and its clock if the state is not finite or too large
         expected = full[:, :1] + self.control_step * np.arange(1, horizon + 1)
         allowed = self.settings.clock_jump * self.control_step
         diverged = np.maximum.accumulate(np.abs(reached[:, :, 0] - expected) > allowed, axis=1)

@@ -15,7 +15,7 @@ class SimulatorSource(NamedTuple):
     Args:
         spec: returns the model's specification, parsed anew at each call.
         frame_skip: physics steps per control step.
-        state_map: the map between observations and states, hidden state not yet marked.
+        state_map: the map between observations and states, hidden coordinates not yet marked.
         effects: the effects in the simulator, in their order.
         name: the name for reports.
     """

@@ -27,7 +27,7 @@ class StateMap:
         offset: values of the unobserved coordinates, (nq + nv,); zero for observed ones.
         clip: smallest and largest reported value of each observation, (n, 2).
         hidden: indices of the unobserved coordinates that affect later observations. They are estimated by simulating
-            the steps before.
+            the preceding steps.
 
     Examples:
         >>> import numpy as np

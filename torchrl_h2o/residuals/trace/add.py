@@ -1,4 +1,4 @@
-"""Finds the set of entries whose addition explains most of the held-out windows."""
+"""Finds the set of entries whose addition lowers the held-out loss most."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class _Candidate:
         entries: the entries found, then the added ones.
         fit: joint fit.
         added: number of added entries.
-        losses: (W), of the held-out windows.
-        first_loss: mean held-out loss, with residuals scaled as before the first effect.
+        losses: (W), losses of the held-out windows.
+        first_loss: mean held-out loss, with the scales of the residuals before the first effect was added.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -38,9 +38,9 @@ class _Candidate:
 
 
 def best_addition(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> SearchState:
-    """Adds the set of one to three entries that explains most of the held-out windows.
+    """Adds the set of one to three entries that lowers the held-out loss most.
 
-    A larger set is preferred only where it explains significantly more than the best smaller one.
+    A larger set is preferred only if its loss is significantly lower than that of the best smaller set.
 
     Args:
         state: effects found so far.
@@ -48,7 +48,7 @@ def best_addition(state: SearchState, leads: Sequence[Lead], rng: np.random.Gene
         rng: generator of synthetic noise.
 
     Returns:
-        The state with the set added, or without it if none pays; the sketched entries are among its attempts.
+        The state with the set added, or without it if no set passes the tests; its attempts include the sketches.
     """
     rules, effects = state.settings.trace, state.fit.effects
     before = state.held_out_losses(effects)
@@ -97,14 +97,14 @@ def _remember(state: SearchState, sketches: Sequence[Sketch]) -> SearchState:
 
 
 def _best_of(state: SearchState, sketches: Sequence[Sketch], present: _Candidate, best: _Candidate) -> _Candidate:
-    """The best candidate so far or, if it pays, one of the sketched sets after a full fit."""
+    """The best candidate so far or, if it passes the tests, one of the sketched sets after a full fit."""
     rules, nothing = state.settings.trace, state.first_loss
     finalists = 0
     for chosen, start in sketches:
         entries = (*state.entries, *(lead.entry for lead in chosen))
         fitted = state.refitted(entries, start.effects)
         first_loss = state.first.held_out_loss(fitted.effects)
-        # each added effect must contribute its share; sets that do not leave their place to the next one
+        # each added effect must contribute its share; a set that fails this does not count as a finalist
         if not matters(nothing, present.first_loss, first_loss, len(chosen) * rules.min_share):
             continue
         candidate = _Candidate(entries, fitted, len(chosen), state.held_out_losses(fitted.effects), first_loss)
@@ -117,7 +117,7 @@ def _best_of(state: SearchState, sketches: Sequence[Sketch], present: _Candidate
 
 
 def _pays(state: SearchState, best: _Candidate, candidate: _Candidate) -> bool:
-    """Whether a candidate explains enough more than the best one so far, and significantly so."""
+    """Whether a candidate's loss is lower than the best one's by a minimum share, and significantly."""
     rules = state.settings.trace
     least = rules.min_gain if state.problem.sensor_std is None else rules.min_gain_under_noise
     level = state.settings.significance.level / len(state.catalogue)
@@ -137,7 +137,7 @@ def _explained_by_noise(state: SearchState, best: _Candidate, rng: np.random.Gen
     mended = problem.simulation.with_effects(*state.fit.effects)
     data = stand_in(mended, problem.measured, problem.sensor_std, rng, problem.horizon, problem.states)
     posed = Problem.pose(mended, data, problem.horizon, sensor_std=problem.sensor_std, settings=problem.settings)
-    # the fit starts from the values found in the data, because noise may reach the same minimum
+    # the fit starts from the values found in the data, because noise alone may have a minimum near them
     free = [free_parameters(entry) for entry in best.entries[-best.added :]]
     effects = best.fit.effects[-best.added :]
     refitted = fit(posed, effects, free, state.windows.fitted, settings=state.settings.fit)

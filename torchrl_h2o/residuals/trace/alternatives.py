@@ -1,4 +1,4 @@
-"""Finds alternatives: other entries that explain the data as well in the place of an effect."""
+"""Finds alternatives: other entries that explain the data equally well in the place of an effect."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from torchrl_h2o.residuals.trace.state import SearchState
 
 
 def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
-    """Finds the entries that explain the held-out data as well as one of the effects found, in its place.
+    """Finds entries that explain the held-out data equally well in the place of one of the effects found.
 
-    An alternative with fewer parameters gets the benefit of the doubt: it is tested with residuals scaled by their size
-    with the effect instead of without it, and counts as equivalent if the difference is small as well.
+    An alternative with fewer parameters that is significantly worse gets a second test, with residuals scaled by their
+    size with the effect instead of without it. It counts as equivalent if this test is not significant and the
+    difference is small.
 
     Args:
         state: effects found.
@@ -32,7 +33,7 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     with_it = state.held_out_losses(state.fit.effects)
     explained = state.held_out_losses(kept).mean() - with_it.mean()
     if explained <= 0.0:
-        return state, ()  # any entry would be as good as an effect without a gain
+        return state, ()  # an effect without a gain has no meaningful alternatives
     attempts = [_attempt(state, index, rival, with_it) for rival in _sketched_rivals(state, index)]
     as_good = [attempt for attempt in attempts if _is_equivalent(state, attempt, with_it.mean(), explained)]
     return state, tuple(sorted(as_good, key=lambda attempt: attempt.loss))
@@ -57,7 +58,7 @@ def _rivals(state: SearchState, index: int) -> list[Lead]:
 
 
 def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
-    """Rivals that come near the effect in a quick fit of all parameters, with the effects of that fit."""
+    """Rivals that reach a minimum share of the effect's gain in a quick fit of all parameters, with this fit."""
     rules, effects, screened = state.settings.trace, state.fit.effects, state.windows.screened
     kept = [effect for i, effect in enumerate(effects) if i != index]
     few_with_it, few_without = (losses(state.problem.residual(e, screened)).mean() for e in (effects, kept))

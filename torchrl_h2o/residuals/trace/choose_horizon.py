@@ -24,8 +24,8 @@ def choose_horizon(
 ) -> int:
     """Chooses how many control steps each window of the search has.
 
-    One step suffices with good sensors. With noisy ones a longer window helps: the effect of a missing cause
-    accumulates over it, while the noise of the start state does not.
+    With good sensors one step is enough. With noisy sensors a longer window helps: the error from a missing effect
+    accumulates over the window, but the noise of the start state does not.
 
     Args:
         simulation: the simulator.

@@ -1,4 +1,4 @@
-"""Backward elimination: removes effects that the others make up for."""
+"""Backward elimination: removes effects without which the held-out loss is not significantly higher."""
 
 from __future__ import annotations
 

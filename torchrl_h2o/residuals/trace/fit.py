@@ -61,7 +61,7 @@ def fit(
         effects: effects in the order of their composition.
         free: names of the parameters to move, for each effect.
         starts: (W), first rows of the windows to fit.
-        max_evaluations: evaluations of the residual, not counting finite differences; those of the settings by default.
+        max_evaluations: evaluations of the residual, not counting finite differences; by default that of the settings.
         settings: scaling of the variables and tolerances.
 
     Returns:
@@ -76,7 +76,7 @@ def fit(
     def residual(z: np.ndarray, _: sysid.ParameterDict) -> tuple:
         try:
             scaled = problem.residual(_with_values(effects, variables, z), starts).ravel()
-        except ValueError:  # values that the model rejects, such as negative damping
+        except ValueError:  # the model rejects these values, for example negative damping
             scaled = np.full(len(starts) * problem.horizon * problem.scale.shape[-1], problem.settings.worst)
         return [scaled], None, None
 

@@ -16,7 +16,7 @@ from torchrl_h2o.residuals.trace.state import SearchState
 
 
 def grow(state: SearchState, rng: np.random.Generator, progress: tqdm) -> SearchState:
-    """Adds effects until none pays, the limit is reached, or the residual is within rounding.
+    """Adds effects until no addition passes the tests, the limit is reached, or the residual is within rounding.
 
     Args:
         state: effects found so far.
@@ -45,7 +45,7 @@ def _remember_leads(state: SearchState, leads: Sequence[Lead], added: Sequence) 
 
 
 def _rescale(state: SearchState) -> SearchState:
-    """Scales residuals by their present size; refits where the better simulator gives other start states."""
+    """Scales residuals by their present size; refits if the better simulator gives other start states."""
     posed = state.posed_at(state.fit.effects)
     rescaled = state.rescaled(posed)
     if state.entries and not np.array_equal(state.problem.states, posed.states):

@@ -9,7 +9,7 @@ from torchrl_h2o.residuals.trace.state import SearchState
 
 
 def reorder(state: SearchState) -> SearchState:
-    """Swaps pairs of action effects, and of observation effects, where that lowers the held-out loss significantly."""
+    """Swaps pairs of action effects, and of observation effects, if that lowers the held-out loss significantly."""
     lowest = state.held_out_losses(state.fit.effects)
     for kind in (ActionEffect, ObservationEffect):
         places = [index for index, entry in enumerate(state.entries) if isinstance(entry.effect, kind)]

@@ -1,4 +1,4 @@
-"""Result of the search for effects: the effects found, the others tried, and equivalent alternatives."""
+"""Result of the search for effects: the effects found, the other effects tried, and equivalent alternatives."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Attempt:
         fit: joint fit of this entry and the other effects.
         index: position of this entry's effect in the fit.
         loss: mean robust loss on held-out windows.
-        p_value: of its gain, or of its difference to the effect whose place it takes.
+        p_value: p-value of its gain, or of its loss difference from the effect that it replaces.
     """
 
     entry: CatalogueEntry

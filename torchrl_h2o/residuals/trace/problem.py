@@ -51,12 +51,12 @@ class Problem:
         sensor_std: np.ndarray | None = None,
         settings: ResidualSettings = DEFAULTS.residual,
     ) -> Problem:
-        """Poses the problem at a simulation: chooses start states and scales the residuals by their present size.
+        """Builds the problem of a simulation: chooses start states and scales the residuals by their present size.
 
         With noisy sensors, windows start from the measured or from the filtered states, whichever predict the fitted
         part of the data better: a filter helps where motion is smooth and harms near contacts. The effect of sensor
-        noise on the residual is estimated per window, because near a contact little noise in a position is a large
-        force.
+        noise on the residual is estimated per window, because near a contact a small error of a position causes
+        a large force.
 
         Args:
             simulation: the simulator.
@@ -113,7 +113,7 @@ class Problem:
         """Residuals in units of the observations, (W, H, n); NaN where the simulation diverges."""
         simulation, states = self.simulation.with_effects(*effects), self.states
         if _sensors(simulation) != _sensors(self.observer):
-            # other observation effects imply other states behind the same readings
+            # with other observation effects, the same readings correspond to other states
             run_by_run = [self.measured.observation[run] for run in self.measured.runs]
             before, after = (
                 np.concatenate([which.true_observations(run) for run in run_by_run])

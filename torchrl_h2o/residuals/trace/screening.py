@@ -1,4 +1,4 @@
-"""Screens a catalogue: estimates what each entry could explain of a residual from one simulation per trial."""
+"""Screens a catalogue: estimates how much of a residual each entry could explain, from one simulation per trial."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Lead:
     Args:
         entry: entry of the catalogue.
         effect: effect with the values at which a fit should start.
-        promise: share of the loss that the effect would explain if the residual were linear in it.
+        promise: estimated share of the loss that the effect explains, if the residual is linear in the effect.
         trial: the entry's trial with the highest promise.
         change: linear change of the scaled residual from neutral to the effect, (W · H · n).
     """
@@ -49,7 +49,7 @@ def screen(
     starts: np.ndarray,
     advance: Callable[[], object] = lambda: None,
 ) -> list[Lead]:
-    """Estimates what each entry explains in addition to known effects.
+    """Estimates the share of the loss that each entry explains in addition to known effects.
 
     Each trial of an entry is simulated once. The residual is then taken as linear between neutral and the trial, and
     the entry's promise is the reduction of the robust loss at the best point on that line, or at the trial itself.
@@ -124,10 +124,10 @@ def is_possible(problem: Problem, effects: Sequence[Effect]) -> bool:
 def promising_sets(
     problem: Problem, known: Sequence[Effect], leads: Sequence[Lead], size: int, starts: np.ndarray, keep: int
 ) -> list[tuple[Lead, ...]]:
-    """Ranks all sets of leads of one size by what they promise together, in a linear least-squares model.
+    """Ranks all sets of leads of one size by their joint gain in a linear least-squares model.
 
-    Sets are needed where one wrong effect imitates a mixture of two right ones: a search that adds one effect at a time
-    would take the wrong one.
+    Sets are needed if one wrong effect imitates a mixture of two right ones: a search that adds one effect at a time
+    would choose the wrong one.
 
     Args:
         problem: simulation, data and scales of the residuals.
@@ -138,7 +138,7 @@ def promising_sets(
         keep: number of sets to return.
 
     Returns:
-        The sets with the highest promise, in descending order.
+        The sets with the highest joint gain, in descending order.
     """
     before = problem.residual(known, starts).ravel()
     weight = 1.0 / np.sqrt(1.0 + before**2)
@@ -153,7 +153,7 @@ def promising_sets(
 
 
 def _towards(effect: Effect, trial: Mapping[str, float], share: float) -> Effect:
-    """The effect at a share of the way to a trial, at least 5 % so that a fit sees a gradient."""
+    """The effect at a share of the way to a trial, at least 5 %, so that a fit starts with a gradient."""
     share = np.copysign(max(abs(share), 0.05), share)
     values = {}
     for name, target in trial.items():

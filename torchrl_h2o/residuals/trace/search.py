@@ -1,4 +1,4 @@
-"""Traces a residual to effects of a catalogue: grow, simplify, repeat, then fit what was found to all windows."""
+"""Traces a residual to effects of a catalogue: grow, simplify, repeat, then fit the effects found to all windows."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def trace_effects(
         settings: thresholds and budgets.
 
     Returns:
-        The effects found, the others tried, and equivalent alternatives.
+        The effects found, the other effects tried, and equivalent alternatives.
     """
     horizon = choose_horizon(simulation, measured, catalogue, rng, settings)
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)

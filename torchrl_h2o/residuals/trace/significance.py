@@ -48,7 +48,7 @@ def p_value_of_losses(
     """Tests whether losses decrease from one explanation to another.
 
     An effect that acts rarely, such as a joint limit, may change three blocks of thirty, too few for a test on means.
-    A third test therefore bets on vanishing residuals: by chance a residual shrinks to the fraction 1/c with a
+    A third test is therefore a bet on vanishing residuals: by chance a residual shrinks to the fraction 1/c with a
     probability of about 1/c, so a bet that pays the square root of the ratio of the losses in each block has an
     expected return of at most one. By Ville's inequality the product of the payoffs exceeds c with a probability of at
     most 1/c.

@@ -39,9 +39,9 @@ def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
 
 
 def _with_better_alternative(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
-    """Takes significantly better alternatives until there is none, and returns the equivalent ones of the last.
+    """Takes significantly better alternatives until there is none; returns the alternatives of the last effect.
 
-    An effect may have been chosen before others were found, and no longer be the best in its place.
+    An effect may have been chosen before other effects were found, and may no longer be the best in its place.
     """
     level, seen = state.settings.significance.level, set()
     while True:
@@ -54,7 +54,7 @@ def _with_better_alternative(state: SearchState, index: int) -> tuple[SearchStat
 
 
 def _replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:
-    """The state with an attempt in an effect's place; it takes over the effect's rivals."""
+    """The state with an attempt in an effect's place; the new entry takes over the effect's rivals."""
     entries = tuple(attempt.entry if i == index else entry for i, entry in enumerate(state.entries))
     rivals = {**state.rivals, attempt.entry.name: state.rivals[state.entries[index].name]}
     return replace(state, entries=entries, fit=attempt.fit, rivals=rivals)

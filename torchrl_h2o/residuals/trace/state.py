@@ -48,19 +48,19 @@ class SearchWindows:
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """Effects that a search has found so far, and what its next steps need.
+    """Effects that a search has found so far, and the data for its next steps.
 
     Args:
         entries: entries of the effects found, in the order of their composition.
         fit: joint fit of these effects.
-        problem: residuals, scaled by the size that they have with these effects.
-        catalogue: all entries, each with the trials that are still worth screening.
+        problem: residuals, scaled by their size with these effects put in.
+        catalogue: all entries, each with the trials that later screenings use.
         first: the problem before the first effect was found.
         first_loss: mean held-out loss of ``first`` without any effects.
         windows: the windows of the search.
         settings: thresholds and budgets.
         attempts: entries that were sketched in addition to the effects found, by name.
-        rivals: leads at the time when an entry was added, by the entry's name.
+        rivals: all leads of the screening after which an entry was added, by the entry's name.
         groups: for each effect found, alternatives with an equivalent loss.
         exact: True if the residual is within the rounding of single-precision data.
     """

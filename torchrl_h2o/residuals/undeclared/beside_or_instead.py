@@ -46,10 +46,10 @@ def add_undeclared_force(
     rng: np.random.Generator,
     settings: LoopSettings = DEFAULTS,
 ) -> Explanation:
-    """Adds a force outside the catalogue where it improves the explanation.
+    """Adds a force outside the catalogue if it improves the explanation.
 
-    The force is searched for beside the effects found, and instead of them: if a force alone fits the data better than
-    the catalogue's effects, these are not named. Both are judged on held-out data against the present explanation.
+    The force is searched for beside the effects found, and instead of them, because a force alone may fit the data
+    better than the catalogue's effects. Both candidates are judged on held-out data against the present explanation.
 
     Args:
         simulation: the simulator without the effects found.
@@ -59,7 +59,7 @@ def add_undeclared_force(
         settings: thresholds and budgets.
 
     Returns:
-        The explanation, unchanged if no force pays or nothing is left to explain.
+        The explanation, unchanged if no force passes the tests or nothing is left to explain.
     """
     if explanation.trace.exact:
         return explanation
@@ -83,13 +83,13 @@ def add_undeclared_force(
 def _candidates(
     simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
 ) -> list[_Candidate]:
-    """A force beside the effects found, and a force instead of them, where there are such forces."""
+    """A force beside the effects found, and a force instead of them; only those that were found."""
     parts, candidates = explanation.parts, []
     mended = simulation.with_effects(*explanation.effects)
     if (beside := find_undeclared(mended, measured, settings=settings)) is not None:
         together = _beside(simulation, measured, explanation.trace, parts, beside, settings)
         candidates.append(_Candidate(together, beside, mended))
-    # also without a force beside: effects that imitate a force may leave a residual that looks like noise
+    # tried even if there is no force beside, because effects that imitate a force may leave a residual like noise
     if parts and (alone := find_undeclared(simulation, measured, settings=settings)) is not None:
         candidates.append(_Candidate((Part(alone.effect, False, alone.ci95),), alone, simulation))
     return candidates
@@ -98,7 +98,7 @@ def _candidates(
 def _beside(
     simulation: Simulation, measured: Measured, trace: Trace, parts: Parts, force: Undeclared, settings: LoopSettings
 ) -> Parts:
-    """The effects that are needed beside a force, and the force, found again beside them."""
+    """The effects that are needed beside a force, and the force from a new search beside these effects."""
     candidate = (*parts, Part(force.effect, False, force.ci95))
     if not parts:
         return candidate
@@ -108,16 +108,17 @@ def _beside(
     known = needed[:-1]
     again = find_undeclared(
         simulation.with_effects(*(part.effect for part in known)), measured, settings=settings
-    )  # without the terms that have become redundant
+    )  # the new search omits terms that have become redundant
     return needed if again is None else (*known, Part(again.effect, False, again.ci95))
 
 
 def _with_least_noise(
     simulation: Simulation, measured: Measured, explanations: Sequence[Parts], settings: LoopSettings
 ) -> Problem:
-    """The problem in which explanations are compared: posed with the one that leaves the least sensor noise.
+    """The problem in which explanations are compared, posed with the explanation that leaves the least sensor noise.
 
-    Noise of one explanation may be explained by another. States filtered with the first would favour it.
+    Sensor noise under one explanation may be a force under another. Start states that are filtered with the first
+    explanation would favour it.
     """
     mended = [simulation.with_effects(*(part.effect for part in parts)) for parts in explanations]
     spread = np.maximum(measured.observation.std(0), 1e-12)
@@ -164,7 +165,7 @@ def _explained(force: Undeclared) -> float:
 
 
 def _shortest(paying: Sequence[tuple[Parts, float]], settings: LoopSettings) -> Parts:
-    """The shortest of the explanations whose loss is close to the least; with the catalogue's effects on a tie."""
+    """The shortest explanation whose loss is close to the lowest; on a tie, the one with the catalogue's effects."""
     least = min(loss for _, loss in paying)
     limit = least / (1.0 - settings.undeclared.min_gain_over_catalogue)
     return min((parts for parts, loss in paying if loss <= limit), key=_description_length)

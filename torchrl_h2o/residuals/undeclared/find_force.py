@@ -30,7 +30,7 @@ class Undeclared:
         ci95: 95 % interval (low, high) of each fitted parameter, in its unit.
         error_before: (n), held-out one-step RMSE of each dimension without the force, in the dimension's unit.
         error_after: (n), the same with the force.
-        p_value: of the decrease of the held-out loss.
+        p_value: p-value of the decrease of the held-out loss.
     """
 
     effect: ResidualForce
@@ -51,8 +51,8 @@ def find_undeclared(
 
     The residual is converted to a force on each degree of freedom and regressed, sparsely, on a library of terms. The
     terms are then fitted in the simulation to the residual itself, and redundant ones are removed. The force must lower
-    the held-out loss by a minimum share and significantly, one step ahead and several steps ahead: a bias that sensor
-    noise causes one step ahead can be imitated by terms, but these increase the error further ahead.
+    the held-out loss by a minimum share and significantly, one step ahead and several steps ahead: terms can
+    imitate a bias that sensor noise causes one step ahead, but such terms increase the error further ahead.
 
     Args:
         simulation: the simulator with all effects found so far.
@@ -126,10 +126,10 @@ def _nothing_to_explain(problem: Problem, starts: np.ndarray, settings: LoopSett
 
 
 def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | None:
-    """Adds terms while they pay; refits all terms and removes redundant ones after each addition."""
+    """Adds terms while they lower the loss enough; after each addition, refits all terms and removes redundant ones."""
     rules, level = regression.settings.undeclared, regression.settings.significance.level
     best, left = None, regression.before
-    barred = set()  # degrees of freedom on which a term did not pay
+    barred = set()  # degrees of freedom on which a new term did not lower the loss enough
     for _ in range(rules.rounds):
         effect = _force_of(best) if best else ResidualForce()
         added = _best_terms(regression, effect, barred)
@@ -157,7 +157,7 @@ def _p_value_further(
 
 
 def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]) -> SparseForce:
-    """The terms on one degree of freedom that explain most of the residual that a force leaves."""
+    """The terms on one degree of freedom that explain most of the residual that remains with a force."""
     problem, starts, settings = regression.problem, regression.starts, regression.settings.regression
     simulation = problem.simulation
     residual = (problem.residual((effect,), starts) * problem.scale_of(starts))[:, 0]
@@ -183,13 +183,13 @@ def _force_of(fitted: Fit) -> ResidualForce:
 
 
 def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
-    """The force fitted in the simulation; starting times of steps are kept."""
+    """The force fitted in the simulation; start times of steps are not fitted."""
     free = tuple(name for name in effect.parameters if not name.startswith("start"))
     return fit(regression.problem, (effect,), (free,), regression.starts, settings=regression.settings.fit)
 
 
 def _pruned(regression: _Regression, best: Fit) -> Fit:
-    """Removes the term that explains least, as long as the others make up for it."""
+    """Removes the term that explains least, as long as the loss hardly increases."""
     problem, starts = regression.problem, regression.starts
     while len(terms := _force_of(best).terms) > 1:
         rest = [ResidualForce(terms[:i] + terms[i + 1 :]) for i in range(len(terms))]

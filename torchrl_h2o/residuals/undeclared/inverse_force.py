@@ -39,9 +39,9 @@ def residual_forces(
 ) -> ResidualForces:
     """Computes the force that makes the simulator reproduce the measured step, for each degree of freedom alone.
 
-    Solving for the forces on all degrees of freedom at once would be exact, but where one of them is hardly observed,
-    noise would become large forces on all. One at a time needs no such inversion. A regression of these forces with
-    these weights is a generalised least-squares regression of the residual.
+    Solving for the forces on all degrees of freedom at once would be exact, but if one of them is hardly observed,
+    noise would cause large forces on all of them. Solving for one force at a time avoids this inversion. A regression
+    of these forces with these weights is a generalised least-squares regression of the residual.
 
     Args:
         simulation: the simulator.

@@ -18,7 +18,7 @@ from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 def needed_parts(
     problem: Problem, trace: Trace, parts: Sequence[Part], settings: LoopSettings = DEFAULTS
 ) -> tuple[Part, ...]:
-    """Removes the effects without which the other parts, fitted again, explain the held-out data as well.
+    """Removes each effect without which the other parts, fitted again, explain the held-out data equally well.
 
     Args:
         problem: simulation without the parts, data and scales of the residuals.

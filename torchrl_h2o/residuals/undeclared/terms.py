@@ -1,6 +1,6 @@
 """Library of the terms that a force may consist of, evaluated on the measured transitions.
 
-Frequencies, phases and starting times of terms are scanned over a range and then refined.
+Frequencies, phases and start times of terms are scanned over a range and then refined.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class TermLibrary:
         return coordinate(name, self.freedom, path.qpos, path.qvel, path.ctrl, path.time)
 
     def column(self, factors: Factors) -> np.ndarray:
-        """Mean over each control step, (W), of a term with coefficient 1; the residual force is such a mean as well."""
+        """Mean over each control step, (W), of a term with coefficient 1; the residual force is also such a mean."""
         shape = ForceTerm(self.freedom.name, 1.0, factors).shape(self._values)
         return np.broadcast_to(shape, self.path.time.shape).mean(1)
 
