@@ -25,7 +25,7 @@ from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 
 
 def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
-    """Build the simulator under test from a task or an MJCF file, ``simulator.effects`` and, if given, a gap of the paper.
+    """Build the simulator under test: a task or MJCF file with ``simulator.effects`` and, if given, a gap of the paper.
 
     Args:
         cfg: the command's configuration.

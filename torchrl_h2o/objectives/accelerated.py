@@ -124,9 +124,8 @@ def _perceptron(
     batch_size = x.shape[:-1]
     x = x.reshape(-1, x.shape[-1])
     compiling = torch.compiler.is_compiling()
-    layer_by_layer = compiling or torch.is_autocast_enabled(
-        x.device.type
-    )  # compilation and autocast work layer by layer
+    # Compilation and autocast act on each layer separately.
+    layer_by_layer = compiling or torch.is_autocast_enabled(x.device.type)
     depth = 0 if layer_by_layer else _depth_with_relu(layers)
     if depth:
         linear = [_weight_and_bias(params, path, frozen) for path, _ in layers[: 2 * depth - 1 : 2]]
