@@ -1,4 +1,4 @@
-"""Finds what a simulator lacks from measured data: the console command ``close-the-loop`` as a script.
+"""Finds the effects that a simulator lacks from measured data: the console command ``close-the-loop`` as a script.
 
 python recipes/close_the_loop.py                                           # the wheel-legged robot, nothing downloaded
 python recipes/close_the_loop.py data=standing_still.txt                   # the same with the real robot's log

@@ -1,9 +1,9 @@
-"""Composes H2O+'s losses by hand: a new value backbone, a fixed temperature, the ratio only as a weight.
+"""Composes the losses of H2O+ by hand, with a new value backbone and a fixed temperature.
 
 python recipes/compose_losses.py               # a minute
-python recipes/compose_losses.py --mixing 0.5  # more of V(s'), less of the policy's Q
+python recipes/compose_losses.py --mixing 0.5  # a larger weight of V(s') in the target, a smaller one of the policy's Q
 
-`H2OPlusLoss` adds up the same parts; use them one by one to replace one, or to train some more often than others.
+`H2OPlusLoss` combines the same losses. Use them one by one to replace one, or to train some more often than others.
 Reality is Gymnasium's InvertedPendulum, recorded under a noisy controller; the simulator has twice its gravity.
 """
 
@@ -37,7 +37,7 @@ WIDTHS = (64, 64)  # hidden layers
 
 
 class HuberExpectileLoss(InSampleValueLoss):
-    """IQL's expectile loss, linear in large advantages, so that a few outliers do not dominate."""
+    """IQL's expectile loss, but linear for large advantages, so that a few outliers do not dominate."""
 
     def penalty(self, advantage: torch.Tensor) -> torch.Tensor:
         weight = torch.where(advantage > 0, 0.7, 0.3)
@@ -73,7 +73,7 @@ qvalues = [make_qvalue(4, 1, WIDTHS) for _ in range(2)]
 bellman = MixedBellmanLoss(actor, qvalues, value, mixing=args.mixing, alpha_init=0.05)  # holds policy and Q, reads V
 value_loss = HuberExpectileLoss(value)
 ratio_loss = DynamicsRatioLoss(make_dynamics_ratio_estimator(4, 1, WIDTHS))
-parts = torch.nn.ModuleList([bellman, value_loss, ratio_loss])  # V is in two of them; parameters() lists it once
+parts = torch.nn.ModuleList([bellman, value_loss, ratio_loss])  # V is in two modules; parameters() returns it once
 optimiser = torch.optim.Adam(parts.parameters(), lr=2e-3)
 targets = SoftUpdate(bellman, tau=0.02)
 
@@ -84,7 +84,7 @@ for steps in tqdm(Collector(simulator, actor, frames_per_batch=100, total_frames
         ratio = ratio_loss(batch)  # Eq. (9), the discriminators
         batch["dynamics_ratio"] = ratio_loss.dynamics_ratio(batch)
         loss = ratio["loss_ratio_sa"] + ratio["loss_ratio_sas"] + bellman(batch)["loss_qvalue"]  # Eqs. (7) and (8)
-        with torch.no_grad():  # V is fitted to the target Q at the data's own actions
+        with torch.no_grad():  # V is fitted to the target Q at the actions in the data
             batch["state_action_value"] = bellman.qvalues(batch, bellman.target_qvalue_network_params).amin(0)
         loss = loss + value_loss(batch)["loss_value"]  # Eq. (4)
         batch["action"], log_prob = bellman.sample_action(batch.copy())

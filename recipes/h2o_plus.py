@@ -1,9 +1,9 @@
-"""Trains H2O+ from real data and an imperfect simulator, and shows what its policy does in reality.
+"""Trains H2O+ from real data and an imperfect simulator, and evaluates the policy in reality.
 
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
-python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # with the simulator mended
+python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the corrected simulator
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
 
@@ -65,7 +65,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     task = Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.gap_fix)
     task.make_simulator()  # fails before the data are loaded if an effect does not fit the model
 
-    # Data: real transitions in TED, [T]; both streams show observations and rewards in the same way
+    # Data: real transitions in TED, [T]; both streams have the same preprocessing of observations and rewards
     real = task.read_real_data(cfg.data, cfg.columns)
     behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
     preprocessing = Preprocessing.fit(
@@ -114,7 +114,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         target_entropy=cfg.target_entropy,
     )
     loss.make_value_estimator(gamma=cfg.gamma)
-    accelerate(loss)  # optional: the same losses by fewer calls
+    accelerate(loss)  # optional: computes the same losses faster
     loss_fn = maybe_compiled(loss, cfg.compiled, cfg.updates)
 
     # Optimiser, target networks, and the collector of simulated transitions
@@ -125,7 +125,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
     rollouts = iter(collector)
 
-    # Checkpoints hold all of these; with keep=best_in_simulator also the policy that did best there
+    # Contents of a checkpoint; with keep=best_in_simulator also the policy with the highest return in the simulator
     parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "replay": replay, "schedule": schedule}
     best = None
     if keeps_best(cfg):
@@ -136,7 +136,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Training
     for epoch, evaluating in training.epochs():
-        # Every epoch has its own random stream, so that a resumed run draws the same numbers as an unbroken one
+        # Every epoch has its own random stream, so that a resumed run draws the same numbers as an uninterrupted one
         seed = epoch_seed(cfg.seed, epoch)
         torch.manual_seed(seed)
 

@@ -1,9 +1,9 @@
-"""Tables and pictures of the results in recipes/results/, ours beside the paper's.
+"""Makes tables and figures of the results in recipes/results/, with the paper's numbers for comparison.
 
-python recipes/report.py                              # all that is there
+python recipes/report.py                              # all groups with results
 python recipes/report.py groups=[returns] updates=50000
 python recipes/report.py groups=[wheel_legged] runs=outputs/paper    # with the robot's trajectories
-python recipes/report.py results=. groups=[mine] +references.Hopper-v5=[0,3200]    # mine.csv; what is 0 and 100
+python recipes/report.py results=. groups=[mine] +references.Hopper-v5=[0,3200]    # mine.csv; scores 0 and 100
 """
 
 import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps quiet)

@@ -50,7 +50,7 @@ def make_env(*effects: Effect) -> EnvBase:
 
 
 def noisy_controller(step: TensorDictBase) -> TensorDictBase:
-    """Balances for some 2 s; the noise makes the data cover more states than balancing would."""
+    """Balances for about 2 s per episode; the noise makes the data cover more states."""
     return step.set("action", (step["observation"] @ GAINS + 0.5 * torch.randn(1)).clamp(-3.0, 3.0))
 
 
@@ -83,7 +83,7 @@ loss = H2OPlusLoss(
 optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
 targets = SoftUpdate(loss, tau=0.02)
 
-# Training: a hundred simulated steps, then as many updates
+# Training: 100 simulated steps, then 100 updates, repeated
 collector = Collector(simulator, actor, frames_per_batch=100, total_frames=args.updates)
 with tqdm(total=args.updates, unit=" updates") as bar:
     for steps in collector:

@@ -1,4 +1,4 @@
-"""Weights TorchRL's TD3Loss with the dynamics ratio: simulated rows count as much as they resemble reality.
+"""Weights TorchRL's TD3Loss by the dynamics ratio: simulated rows that are unlikely in reality get a small weight.
 
 python recipes/weighted_td3.py               # a minute
 python recipes/weighted_td3.py --unweighted  # the same without the ratio
@@ -49,7 +49,7 @@ def mean_return(env: EnvBase, policy: torch.nn.Module, episodes: int = 5) -> flo
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--unweighted", action="store_true", help="every simulated row counts in full")
+parser.add_argument("--unweighted", action="store_true", help="give all simulated rows weight 1")
 parser.add_argument("--updates", type=int, default=3000, help="one simulated step each")
 parser.add_argument("--seed", type=int, default=0)
 args = parser.parse_args()
@@ -59,7 +59,7 @@ reality, simulator = make_env(), make_env(Gravity(2.0))
 real = record(reality, noisy_controller, 3000, args.seed, progress=False)
 replay = HybridReplayBuffer(real, sim_capacity=30_000, batch_size=(64, 64))
 
-actor = make_actor(4, simulator.action_spec, WIDTHS)  # TD3 trains its mean; its spread explores in the simulator
+actor = make_actor(4, simulator.action_spec, WIDTHS)  # TD3 trains the mean; the untrained std is for exploration
 qvalues = [make_qvalue(4, 1, WIDTHS) for _ in range(2)]
 estimator = make_dynamics_ratio_estimator(4, 1, WIDTHS)
 td3 = TD3Loss(actor, qvalues, action_spec=simulator.action_spec, loss_function="l2", reduction="none")

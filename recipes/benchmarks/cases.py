@@ -20,14 +20,14 @@ class Case:
     """One case. The code under test receives only the simulation and the data.
 
     Args:
-        name: of the case within its family.
+        name: name of the case within its family.
         system: a name of :data:`~systems.SYSTEMS`.
         judge: maps a report and the case to scores by name; ``ok`` is whether the case passed.
         truth: the effects that correct the simulator.
         in_simulator: effects of the simulator.
         in_reality: effects of the measured system.
-        noise: of the sensors, as a share of each signal's standard deviation.
-        seed: of the recording.
+        noise: standard deviation of the sensor noise, as a fraction of each signal's standard deviation.
+        seed: random seed of the recording.
         transitions: number of recorded transitions.
         episode: steps until a reset.
         held_out: fraction of the data excluded from fits.

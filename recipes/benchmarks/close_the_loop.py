@@ -5,7 +5,7 @@ python recipes/benchmarks/close_the_loop.py cases=[paper16,nothing] draws=3
 python recipes/benchmarks/close_the_loop.py cases=[several] numbers=[7]        # one case again
 python recipes/benchmarks/close_the_loop.py logs=path/to/logs                  # with the two real robots
 
-Writes results.json, results.csv (one row a case) and each case's report.html to the run's folder.
+Writes results.json, results.csv (one row per case) and each case's report.html to the run's folder.
 """
 
 from pathlib import Path

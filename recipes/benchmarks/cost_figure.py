@@ -1,4 +1,4 @@
-"""Draws the cost of an update: one column a factor, seconds above and memory below."""
+"""Draws the cost of an update: one column per factor, seconds above and memory below."""
 
 from pathlib import Path
 

@@ -36,8 +36,8 @@ def visibility(effect: Effect, simulation: Simulation, measured: Measured) -> fl
 
     Args:
         effect: the effect.
-        simulation: without it.
-        measured: of the system without it.
+        simulation: the simulation without the effect.
+        measured: data of the system without the effect.
     """
     starts = measured.windows(1)
     moved = residuals(simulation.with_effects(effect), measured, starts) - residuals(simulation, measured, starts)

@@ -1,10 +1,10 @@
-"""Measures a population's updates a second, times its members, and what the paper's main table would take.
+"""Measures a population's updates per second, summed over members, and estimates the time of the paper's main table.
 
 python recipes/benchmarks/population.py                                # on a CPU
 python recipes/benchmarks/population.py device=cuda compiled=[1,8,32,128]   # and with CUDA graphs, as there is CUDA
 
-Measures a single run, as `recipes/h2o_plus.py` makes it, in the same session. All figures include sampling and exclude
-the simulator. Writes population.json into the run's folder.
+In the same session it measures a single run with the losses of `recipes/h2o_plus.py`. All figures include sampling and
+exclude the simulator. Writes population.json to the run's folder.
 """
 
 import json

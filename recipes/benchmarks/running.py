@@ -87,7 +87,7 @@ def run_all(jobs: Sequence[Job], processes: int, trace: Callable[..., Report], *
         progress: whether to show a progress bar.
 
     Returns:
-        A row a case, in the order of the jobs.
+        One row per case, in the order of the jobs.
     """
     rows: dict[Job, dict] = {}
     with tqdm(total=len(jobs), unit=" cases", disable=not progress) as bar:

@@ -1,11 +1,11 @@
-"""Measures simulated steps a second: one world, many worlds at once, and ``mujoco.rollout`` alone.
+"""Measures simulated steps per second: one world, many worlds at once, and ``mujoco.rollout`` alone.
 
 python recipes/benchmarks/simulator.py                     # a minute or two
 python recipes/benchmarks/simulator.py task=wheel_legged worlds=[64]
 
-Actions are fixed, no policy is in the loop. ``mujoco.rollout`` goes the env's own way, as contacts take time: it starts
-from states that the env came by, under the same actions. Leaves simulator.json in the run's folder. Compare ratios from
-one machine to another, not steps a second.
+Actions are fixed; no policy is evaluated. ``mujoco.rollout`` starts from states on the env's trajectory, with the same
+actions, because the time of a step depends on its contacts. Writes simulator.json to the run's folder. Between machines
+compare ratios, not steps per second.
 """
 
 import json

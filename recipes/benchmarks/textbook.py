@@ -1,6 +1,6 @@
-"""H2O+ written directly from the formulas: one optimiser a network, one forward pass a term.
+"""H2O+ written directly from the formulas: one optimiser per network, one forward pass per term.
 
-What the library's update is compared to in speed. Nothing here is shared with the library.
+The speed of the library's update is compared with this code, which shares nothing with the library.
 """
 
 import copy

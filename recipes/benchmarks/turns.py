@@ -16,7 +16,7 @@ def calls_per_second(
     device: str = "cpu",
     least: int = WARM_UP,
 ) -> dict[str, float]:
-    """Calls a second of each function, the best of several turns.
+    """Calls per second of each function, the best of several turns.
 
     Args:
         functions: by name.

@@ -1,11 +1,11 @@
-"""Measures updates a second: ours beside a textbook's, and beside what matrix products alone would allow.
+"""Measures updates per second: of the library, of a textbook implementation, and of the matrix products alone.
 
 python recipes/benchmarks/update.py                        # two minutes; HalfCheetah's sizes, the authors' batches
 python recipes/benchmarks/update.py compiled=false seconds=1
 python recipes/benchmarks/update.py device=cuda
 
-Contenders take turns, so that other load on the machine affects all of them alike. Writes update.json into the run's
-folder. Between machines compare ratios, not updates a second.
+Contenders take turns, so that other load on the machine affects all of them alike. Writes update.json to the run's
+folder. Between machines compare ratios, not updates per second.
 """
 
 import json

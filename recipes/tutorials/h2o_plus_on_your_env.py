@@ -1,9 +1,9 @@
-"""Tutorial: H2O+ on an environment of your own, a minute or two.
+"""Tutorial: H2O+ on your own environment. Takes one to two minutes.
 
 python recipes/tutorials/h2o_plus_on_your_env.py
 
-H2O+ needs transitions measured on the real system, and a simulator of it. Here both are a cart on a rail; the simulator
-has the wrong mass and no friction.
+H2O+ needs transitions measured on the real system, and a simulator of that system. In this tutorial both are models of
+a cart on a rail; the simulator has a wrong mass and no friction.
 """
 
 # %% Your environment. Any environment with a continuous, bounded action works: one of Gymnasium as here, of dm_control,
@@ -38,7 +38,7 @@ UPDATES = int(sys.argv[1]) if len(sys.argv) > 1 else 2000
 
 
 class Cart(gymnasium.Env):
-    """A cart that a force of up to 2 N brings back to the middle of its rail; a step is 0.05 s, an episode 10 s."""
+    """Move a cart to the middle of its rail by a force of at most 2 N. A step takes 0.05 s, an episode 10 s."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)  # position (m), velocity (m/s)
     action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)  # force (N)
@@ -64,7 +64,7 @@ reality = TransformedEnv(GymWrapper(Cart(mass=2.0, friction=0.5)), DoubleToFloat
 simulator = TransformedEnv(GymWrapper(Cart(mass=1.0, friction=0.0)), DoubleToFloat())
 
 # %% The real data. Usually they come from a file: `torchrl_h2o.data.load("log.csv", columns="log.yaml")`. Here a noisy
-# operator drives the cart for 150 s. Real data need not be good, but they should not all be the same.
+# operator drives the cart for 150 s. The operator need not be good, but the data should cover different states.
 torch.manual_seed(0)
 
 
@@ -76,8 +76,8 @@ def operator(step):
 real = record(reality, operator, 3000, seed=0, progress=False)
 print(f"the operator's return in reality: {real['next', 'reward'].sum() / 15:.0f} of 200")
 
-# %% Networks and losses. V learns from real rows only; Q from both, simulated rows weighted by how much they resemble
-# reality; the policy maximises Q.
+# %% Networks and losses. V is trained on real rows only. Q is trained on both, with simulated rows weighted by the
+# dynamics ratio. The policy maximises Q.
 actor, value = make_actor(2, simulator.action_spec, (64, 64)), make_value(2, (64, 64))
 loss = H2OPlusLoss(
     MixedBellmanLoss(actor, [make_qvalue(2, 1, (64, 64)) for _ in range(2)], value, mixing=0.1),
@@ -99,7 +99,8 @@ for steps in tqdm(Collector(simulator, actor, frames_per_batch=200, total_frames
         optimiser.step()
         targets.step()
 
-# %% The result, in reality. `dynamics_ratio` is the mean weight of the simulated rows: 1 if they look real, 0 if not.
+# %% The result in reality. `dynamics_ratio` is the mean weight of the simulated rows: near 1 if they are likely in
+# reality, near 0 if they are not.
 with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
     returns = [reality.rollout(200, actor)["next", "reward"].sum().item() for _ in range(5)]
 print(f"the policy's return in reality:   {sum(returns) / 5:.0f} of 200")

@@ -1,4 +1,4 @@
-"""Tutorial: swapping the value backbone, also for one of your own, a minute or two.
+"""Tutorial: replace the value backbone, also by your own. Takes one to two minutes.
 
 python recipes/tutorials/swap_a_backbone.py
 
@@ -51,8 +51,8 @@ reality = make_env(gravity=1.0)
 real = record(reality, controller, 3000, seed=0, progress=False)
 
 
-# %% A backbone of your own is one method, `penalty`: what an advantage y = Q(s, a) - V(s) costs. This one fits V to the
-# mean, and counts advantages beyond 1 linearly.
+# %% To write your own backbone, define one method, `penalty`: the loss of an advantage y = Q(s, a) - V(s). The one
+# below fits V to the mean, but is linear for advantages with |y| > 1.
 class HuberValueLoss(InSampleValueLoss):
     def penalty(self, advantage):
         return torch.nn.functional.huber_loss(advantage, torch.zeros_like(advantage), reduction="none")
@@ -66,7 +66,7 @@ BACKBONES = {
 
 
 # %% One training run. The backbone is one argument of H2OPlusLoss; nothing else depends on it. `mixing` is the weight
-# of V(s') in the target of Q, so the backbone matters more where it is larger.
+# of V(s') in the target of Q, so the backbone has more influence with a larger `mixing`.
 def train(backbone):
     torch.manual_seed(0)
     simulator, widths = make_env(gravity=1.5), (64, 64)
@@ -87,7 +87,7 @@ def train(backbone):
     return actor
 
 
-# %% The result, in reality. So few updates do not rank backbones; they show that each one trains.
+# %% The result in reality. So few updates are not enough to rank the backbones; they only show that each one trains.
 for name, backbone in BACKBONES.items():
     policy = train(backbone)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

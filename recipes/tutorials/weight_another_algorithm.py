@@ -1,4 +1,4 @@
-"""Tutorial: the dynamics ratio in another algorithm, here TorchRL's SACLoss, a minute or two.
+"""Tutorial: the dynamics ratio in another algorithm, here TorchRL's SACLoss. Takes one to two minutes.
 
 python recipes/tutorials/weight_another_algorithm.py
 
@@ -47,7 +47,7 @@ reality, simulator = make_env(gravity=1.0), make_env(gravity=1.5)
 real = record(reality, controller, 3000, seed=0, progress=False)
 replay = HybridReplayBuffer(real, sim_capacity=30_000, batch_size=(64, 64))
 
-# %% The algorithm, as TorchRL has it. reduction="none" keeps its terms row by row, so that they can be weighted.
+# %% The algorithm: TorchRL's SACLoss. With reduction="none" it returns one term per row, so that rows can be weighted.
 actor = make_actor(4, simulator.action_spec, (64, 64))
 sac = SACLoss(actor, make_qvalue(4, 1, (64, 64)), reduction="none", scalar_output_mode="exclude")
 sac.make_value_estimator(gamma=0.99)
@@ -56,8 +56,8 @@ sac.make_value_estimator(gamma=0.99)
 # `real` keep weight 1.
 loss = ImportanceWeightedLoss(sac, terms=["loss_qvalue"])
 
-# %% The ratio. Two discriminators, trained beside the algorithm, tell real from simulated transitions. One sees (s, a),
-# the other (s, a, s'); their difference is log P(s'|s, a) / P̂(s'|s, a).
+# %% The ratio. Two discriminators, trained together with the algorithm, classify transitions as real or simulated. One
+# reads (s, a), the other (s, a, s'); the difference of their log-odds is log P(s'|s, a) / P̂(s'|s, a).
 estimator = make_dynamics_ratio_estimator(4, 1, (64, 64))
 ratio_loss = DynamicsRatioLoss(estimator)
 
@@ -74,8 +74,9 @@ for steps in tqdm(Collector(simulator, actor, frames_per_batch=100, total_frames
         optimiser.step()
         targets.step()
 
-# %% The result: what the simulated rows weighed at the end, and what the policy does in reality. A small weight means
-# that the discriminators hardly mistake the simulator for reality; then the algorithm learns mostly from the real data.
+# %% The result: the mean weight of the simulated rows in the last batch, and the policy's return in reality. A small
+# weight means that the discriminators distinguish simulated from real rows; then the real data dominate the Bellman
+# error.
 with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
     returns = [reality.rollout(1000, actor)["next", "reward"].sum().item() for _ in range(5)]
 print(f"mean weight of simulated rows {batch['dynamics_ratio'][~batch['real']].mean():.2f}")

@@ -1,8 +1,8 @@
-"""Tutorial: what does my simulator lack? From a CSV log to a corrected simulator, a minute or two.
+"""Tutorial: what does my simulator lack? From a CSV log to a corrected simulator. Takes one to two minutes.
 
 python recipes/tutorials/what_does_my_simulator_lack.py [folder]     # writes log.csv and report.html there
 
-A pendulum is measured; its MJCF model lacks an effect. We find it, with its value and interval.
+The MJCF model of a measured pendulum lacks an effect. The tutorial finds the effect with its value and interval.
 """
 
 import torchrl_h2o.quiet  # noqa: F401, I001  (must precede the packages that it silences)
@@ -33,18 +33,18 @@ folder.mkdir(parents=True, exist_ok=True)
 </mujoco>
 """)
 
-# %% The log. Yours comes from your robot; here a pendulum with more damping (0.1 N·m·s/rad) is driven by random torques
-# and sampled every 10 ms. Torques that vary, and motions that cover the range of interest, help to tell effects
-# apart.
-observed = ["pivot", "pivot_velocity"]  # a joint's name is its position; the suffix _velocity its velocity
+# %% The log. Yours comes from your robot. Here random torques drive a simulated pendulum with more damping (0.1
+# N·m·s/rad), sampled every 10 ms. Varying torques, and motions that cover the range of interest, make effects easier to
+# distinguish.
+observed = ["pivot", "pivot_velocity"]  # a joint's name means its position; the suffix _velocity means its velocity
 robot = Simulation.from_mjcf(folder / "pendulum.xml", observed, 0.01, [JointDamping(0.1, joints="pivot")])
 torque = np.repeat(np.random.default_rng(0).uniform(-2.0, 2.0, 80), 10)[:, None]
 states = robot.rollout(np.zeros((1, 2)), torque[None])[0]
-states = np.vstack([np.zeros((1, 2)), states[:-1]])  # a row has the state in which its torque is applied
+states = np.vstack([np.zeros((1, 2)), states[:-1]])  # each row has the state before its torque is applied
 rows = np.hstack([states, torque])
 np.savetxt(folder / "log.csv", rows, delimiter=",", header="pivot,pivot_velocity,torque", comments="")
 
-# %% What the columns mean. A log needs these lines of YAML; names of observations are coordinates of the model.
+# %% The description of the columns, in YAML. The names of the observations are coordinates of the model.
 (folder / "log.yaml").write_text("""
 dt: 0.01
 separator: ","
@@ -56,20 +56,23 @@ columns:
 """)
 data = load(folder / "log.csv", columns=LogColumns.load(folder / "log.yaml"))
 
-# %% The search. Every transition is simulated from its measured state; effects from a catalogue are fitted to what the
-# simulator gets wrong, and kept only if they predict rows that no fit has seen. Leave the filter out to try them all.
+# %% The search. Every transition is simulated from its measured state. Effects from a catalogue are fitted to the
+# difference between measurement and simulation, and kept only if they reduce the error on held-out rows. Here the
+# catalogue is restricted to four effects; without the third argument of close_the_loop all effects are tried.
 simulator = Simulation.from_mjcf(folder / "pendulum.xml", observed, 0.01)
 few = ("JointDamping", "JointFrictionLoss", "Gravity", "ActionDelay")
 candidates = [entry for entry in simulator.catalogue() if type(entry.effect).__name__ in few]
 report = close_the_loop(simulator, data, candidates)
 
-# %% The answer: a sentence, and a report with values, intervals, what was tried and what cannot be told apart.
+# %% The result: a sentence, and a report with values, intervals, the effects tried and those that cannot be
+# distinguished.
 print(report.sentence())
 report.save(folder)
 print(f"report: {folder / 'report.html'}")
 
-# %% The corrected simulator. The effects are the classes that make gaps, so they go straight back in; for training,
-# use TransformedEnv(env, DynamicsGap(*report.effects)), or gap_fix=report.json of recipes/h2o_plus.py.
+# %% The corrected simulator. The effects found are of the same classes as those of dynamics gaps, so they can be added
+# to the simulator directly. For training, use TransformedEnv(env, DynamicsGap(*report.effects)), or gap_fix=report.json
+# of recipes/h2o_plus.py.
 corrected = simulator.with_effects(*report.effects)
 for name, model in {"before": simulator, "after": corrected}.items():
     error = np.abs(model.rollout(states[:-1], torque[:-1, None])[:, 0] - states[1:]).max(0)

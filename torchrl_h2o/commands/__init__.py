@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 
-import torchrl_h2o.quiet  # noqa: F401  (the command modules below import the packages that it silences)
+import torchrl_h2o.quiet  # noqa: F401  (first, since the commands import packages whose warnings it silences)
 
 if find_spec("hydra") is None:
     raise ModuleNotFoundError("the console commands need Hydra: pip install 'torchrl_h2o[recipes]'")

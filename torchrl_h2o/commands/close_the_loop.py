@@ -25,7 +25,7 @@ from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 
 
 def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
-    """Build the simulator under test: a task or MJCF file with ``simulator.effects`` and the paper's gap, if named.
+    """Build the simulator under test: a task or MJCF file with ``simulator.effects`` and, if given, a gap of the paper.
 
     Args:
         cfg: the command's configuration.
@@ -39,7 +39,7 @@ def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
         effects.append(paper_gap(cfg.simulator.gap, cfg.simulator.gap_strength))
     elif cfg.simulator.gap_strength is not None:
         raise ValueError(
-            f"simulator.gap_strength={cfg.simulator.gap_strength} belongs to a gap: name one, such as "
+            f"simulator.gap_strength={cfg.simulator.gap_strength} belongs to a gap: choose one, such as "
             "simulator.gap=gravity"
         )
     if "path" in cfg.simulator:
@@ -51,7 +51,7 @@ def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
 
 
 def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEntry] | None:
-    """Select the catalogue entries whose class names match the patterns in ``catalogue``; None means all.
+    """Select the catalogue entries whose class names match a pattern in ``catalogue``; None means all entries.
 
     Raises:
         ValueError: for a pattern that matches no effect.
@@ -87,7 +87,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def print_report(report: Report, directory: Path) -> None:
-    """Print the report's sentence, tables of its effects and errors, and the paths of the files written."""
+    """Print the report's one-sentence result, tables of its effects and errors, and the paths of the files written."""
     print(f"\n{report.sentence()}\n\ndata       {report.data.source}")
     if report.found:
         print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
@@ -108,7 +108,7 @@ def print_report(report: Report, directory: Path) -> None:
 
 
 def expanded(argument: str) -> list[str]:
-    """Expand ``simulator=robot.xml`` and ``simulator=HalfCheetah-v5``, which name no configuration file."""
+    """Expand the short forms ``simulator=robot.xml`` and ``simulator=HalfCheetah-v5`` to options that Hydra accepts."""
     key, _, name = argument.partition("=")
     if key == "simulator" and name.endswith(".xml"):
         return ["simulator=mjcf", f"simulator.path={name}"]

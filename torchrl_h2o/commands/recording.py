@@ -21,8 +21,8 @@ class Recording:
 
     Args:
         transitions: TED, batch size (T,).
-        source: name of the data and of the selected rows.
-        columns: description of the log's columns; None for data that is not a log.
+        source: name of the data and the range of the selected rows.
+        columns: description of the log's columns; None if the data are not a log.
     """
 
     transitions: TensorDictBase
@@ -33,20 +33,20 @@ class Recording:
         """Maps each observed column, in the data's order, to a coordinate of the model.
 
         Args:
-            chosen: ``simulator.coordinates``: a list of coordinates, a mapping from columns whose name differs from
-                their coordinate, or None.
+            chosen: ``simulator.coordinates``: a list of coordinates; a mapping from column to coordinate, for the
+                columns whose name differs from the coordinate's; or None.
 
         Returns:
             The list itself, or a mapping from columns to coordinates.
 
         Raises:
-            ValueError: if the mapping names a column that the log does not observe, or the columns have no names.
+            ValueError: if the mapping contains a column that the log does not observe, or the columns have no names.
         """
         if isinstance(chosen, Sequence | ListConfig):
             return list(chosen)
         if self.columns is None:
             raise ValueError(
-                f"{self.source} does not name its columns; list the coordinates of the model that they are, such as "
+                f"{self.source} does not name its columns; list the model coordinate of each column, such as "
                 "simulator.coordinates=[hip,hip_velocity]"
             )
         names, other = self.columns.observation, dict(chosen or {})
@@ -56,10 +56,10 @@ class Recording:
         return {name: other.get(name, name) for name in names}
 
     def control_step(self) -> float:
-        """Time between two rows, in s, from the description of the columns or the time stamps.
+        """Time between two rows, in s, from the description of the columns or from the time stamps.
 
         Raises:
-            ValueError: if the data contain neither.
+            ValueError: if neither is available.
         """
         if self.columns is not None and self.columns.dt is not None:
             return self.columns.dt
@@ -68,10 +68,10 @@ class Recording:
         raise ValueError(f"{self.source} has no time stamps; give simulator.control_step, in s")
 
     def check_actuators(self, model: mujoco.MjModel) -> None:
-        """Checks that actions named after the model's actuators are in the model's order.
+        """Checks that the log's actions are in the order of the model's actuators, if both have the same names.
 
         Raises:
-            ValueError: if they are in another order.
+            ValueError: if the order differs.
         """
         actions = [] if self.columns is None else list(self.columns.action)
         actuators = [model.actuator(i).name for i in range(model.nu)]
@@ -83,7 +83,7 @@ class Recording:
 
 
 def read_recording(cfg: DictConfig) -> Recording:
-    """Reads the data that the configuration names and selects its rows.
+    """Reads the data given in the configuration and selects rows.
 
     Args:
         cfg: configuration with ``data``, ``columns``, ``simulator``, ``first_row`` and ``transitions``.

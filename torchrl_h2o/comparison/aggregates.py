@@ -33,8 +33,8 @@ class Scores:
     """Normalised scores of several methods on their common tasks and seeds.
 
     Args:
-        runs: scores by method, ``[num_seeds, num_runs]``. An offline method has one run for all gaps of its data.
-        columns: by method, the column of ``runs`` that belongs to each task, ``[num_tasks]``.
+        runs: scores by method, ``[num_seeds, num_runs]``. An offline method has one run for all gaps of a data set.
+        columns: by method, the column index in ``runs`` for each task, ``[num_tasks]``.
         tasks: the tasks compared.
         seeds: the seed of each row of ``runs``.
     """
@@ -45,18 +45,18 @@ class Scores:
     seeds: list[int]
 
     def by_task(self, name: str) -> Callable[[np.ndarray], np.ndarray]:
-        """A function that maps (resampled) runs of a method to scores by task, ``[num_seeds, num_tasks]``."""
+        """Return a function from (resampled) runs of a method to its scores by task, ``[num_seeds, num_tasks]``."""
         return lambda runs: runs[:, self.columns[name]]
 
 
 def common_scores(table: dict[Task, dict[str, Cell]], references: Mapping[str, Reference] = REFERENCES) -> Scores:
-    """Select the tasks and seeds that all present methods of the paper share.
+    """Select the tasks and seeds for which all of the paper's methods in the table have results.
 
-    Methods that the paper does not compare are included only if they have all of these tasks and seeds.
+    Methods that are not in the paper are included only if they have results for all of these tasks and seeds.
 
     Args:
         table: cells by task and method.
-        references: by environment, the returns that score 0 and 100.
+        references: by environment, the returns with score 0 and score 100.
     """
     present = {name for cells in table.values() for name in cells}
     methods = [name for name in SIX if name in present] or sorted(present)
@@ -75,18 +75,18 @@ def common_scores(table: dict[Task, dict[str, Cell]], references: Mapping[str, R
 
 
 def _run_of(name: str, task: Task) -> Task:
-    """The parts of a task that a method's run depends on; an offline method's run does not depend on the gap."""
+    """Return the task without the parts that a method's run does not depend on: the gap, for an offline method."""
     env, data, gap, *variant = task
     return (env, data, "" if name in OFFLINE else gap, *variant)
 
 
 def interquartile_means(scores: Scores, reps: int, seed: int = 0) -> dict[str, Interval]:
-    """Interquartile mean of each method, with an interval from resampling its seeds.
+    """Interquartile mean of each method, with a bootstrap interval over its seeds.
 
     Args:
         scores: normalised scores.
-        reps: bootstrap samples.
-        seed: of the bootstrap.
+        reps: number of bootstrap samples.
+        seed: random seed of the bootstrap.
     """
 
     def statistic(name: str) -> Callable:
@@ -101,8 +101,8 @@ def improvements(scores: Scores, reps: int, seed: int = 0, base: str = BASE) -> 
 
     Args:
         scores: normalised scores.
-        reps: bootstrap samples.
-        seed: of the bootstrap.
+        reps: number of bootstrap samples.
+        seed: random seed of the bootstrap.
         base: the method that the others are compared with.
     """
 

@@ -17,12 +17,12 @@ from torchrl_h2o.training.learning_curve import COLOURS
 
 
 def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> None:
-    """Draw return against updates, one panel a task: mean over seeds, and a band from the lowest to the highest seed.
+    """Draw return against updates, one panel per task: mean over seeds, and a band from the lowest to the highest seed.
 
     Args:
         path: PNG file to write.
-        rows: one evaluation each, as :func:`~torchrl_h2o.comparison.scores.placed` returns them.
-        titles: of the methods, in the order of the legend.
+        rows: one per evaluation, from :func:`~torchrl_h2o.comparison.scores.placed`.
+        titles: titles of the methods, in the order of the legend.
     """
     curves = _curves(rows)
     tasks = sorted({task for task, _ in curves})
@@ -51,7 +51,7 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
     labels = [title for title in titles.values() if title in handles]
     legend = {"frameon": False, "loc": "outside lower center", "ncols": len(labels), "fontsize": 8}
     figure.legend([handles[label] for label in labels], labels, **legend)
-    title = "The policy in training, at each evaluation;\nbands from the lowest seed to the highest"
+    title = "The policy at each evaluation during training;\nbands from the lowest seed to the highest"
     figure.suptitle(title, fontsize=8)
     _save(figure, path)
 
@@ -78,14 +78,14 @@ def draw_aggregates(
     titles: Mapping[str, str],
     note: str,
 ) -> None:
-    """Draw interquartile means and the probability that H2O+ does better, each with its 95 % interval.
+    """Draw interquartile means and the probability that H2O+ has the higher score, each with its 95 % interval.
 
     Args:
         path: PNG file to write.
         means: interquartile mean by method.
-        better: probability that H2O+ does better, by the method it is compared with.
-        titles: of the methods, from top to bottom.
-        note: title, naming tasks and seeds.
+        better: probability that H2O+ has the higher score, by the method it is compared with.
+        titles: titles of the methods, from top to bottom.
+        note: title of the figure, with its tasks and seeds.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 0.45 * len(means) + 1.6), layout="constrained")
     _draw_intervals(left, means, titles)

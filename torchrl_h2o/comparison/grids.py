@@ -14,22 +14,22 @@ from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.training.methods import METHODS
 
 SIX = ("sac", "cql", "iql", "darc", "h2o", "h2o_plus")
-OFFLINE = ("cql", "iql")  # without a simulator there is no gap, so one run counts for every gap
+OFFLINE = ("cql", "iql")  # they use no simulator, so the gap has no effect and one run counts for every gap
 MEDIUM, REPLAY = "halfcheetah/medium-v0", "halfcheetah/medium-replay-v0"
 ENVS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d"}
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The factors of a table or figure; its runs are all combinations.
+    """The factors of a table or figure. Its runs are all combinations of their values.
 
     Args:
         methods: names in :data:`torchrl_h2o.training.methods.METHODS`.
-        datasets: Minari names or files whose name contains that of the environment.
-        gaps: names of the paper's gaps; combinations that an environment does not support are skipped.
-        strengths: of the gap; None is the paper's.
+        datasets: Minari data sets or files; the name must contain the environment's name.
+        gaps: names of the paper's gaps; gaps that an environment does not support are skipped.
+        strengths: strengths of the gap; None is the paper's strength.
         tasks: environments with their own data, used instead of data sets and gaps.
-        variants: further overrides, one tuple a run.
+        variants: further overrides, one tuple per variant.
     """
 
     methods: tuple[str, ...] = ("h2o_plus",)
@@ -40,10 +40,10 @@ class Grid:
     variants: tuple[tuple[str, ...], ...] = field(default=((),))
 
     def runs(self, seeds: tuple[int, ...]) -> Iterator[list[str]]:
-        """Yield the overrides of each run, seed by seed, so that an interrupted grid has complete seeds.
+        """Yield the overrides of each run. The first seed's runs come first, so that they finish first.
 
         Args:
-            seeds: of the runs.
+            seeds: seeds of the runs.
         """
         for seed in seeds:
             worlds = [*product(self.datasets, self.gaps, self.strengths), *product(self.tasks, (None,), (None,))]
@@ -58,7 +58,7 @@ class Grid:
 
 
 def env_of(data: str) -> str | None:
-    """The environment whose name occurs in the data set's name, or None."""
+    """Return the environment whose name occurs in the data set's name, or None."""
     return next((env for env in ENVS if env in data), None)
 
 
@@ -96,7 +96,7 @@ FIGURES = {
 
 
 def group_name(cfg: DictConfig) -> str:
-    """The name of the requested table or figure.
+    """Return the name of the requested table or figure.
 
     Raises:
         ValueError: for an unknown name, or unless exactly one table or figure is named.
@@ -110,10 +110,10 @@ def group_name(cfg: DictConfig) -> str:
 
 
 def chosen_grid(cfg: DictConfig) -> Grid:
-    """The requested grid, with the command line's choices in place of the paper's.
+    """Build the requested grid. Options on the command line replace the paper's values.
 
     Raises:
-        ValueError: for an unknown choice, or one that has no effect on these runs.
+        ValueError: for an unknown value, or an option that has no effect on these runs.
     """
     name = group_name(cfg)
     lists = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
@@ -138,14 +138,14 @@ def chosen_grid(cfg: DictConfig) -> Grid:
 
 
 def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
-    """Reject overrides of settings that each run of the grid sets itself.
+    """Reject shared overrides of settings that differ between the runs of the grid.
 
     Args:
-        overrides: meant for all runs.
-        runs: own overrides of each run.
+        overrides: overrides for all runs.
+        runs: the individual overrides of each run.
 
     Raises:
-        ValueError: naming the option that selects runs instead.
+        ValueError: for such an override; the message gives the option to use instead.
     """
     selects = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
     selects["seed"] = "seeds"

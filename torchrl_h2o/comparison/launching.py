@@ -1,4 +1,4 @@
-"""Launches the unfinished runs of a grid with any of Hydra's launchers, and retries those that fail."""
+"""Launches the unfinished runs of a grid with any Hydra launcher, and retries failed runs."""
 
 from collections.abc import Iterable, Sequence
 from hashlib import sha256
@@ -16,21 +16,21 @@ from omegaconf import DictConfig
 from torchrl_h2o.comparison.results_file import GRID, adopt_runs, identity, recorded
 from torchrl_h2o.training.run_folder import resolve_paths
 
-Run = list[str]  # overrides of train.py that set this run apart from the others of its grid
+Run = list[str]  # overrides of train.py that distinguish this run from the others of its grid
 
 
 def shared_overrides(overrides: Iterable[str]) -> list[str]:
-    """Select the overrides that every run of a grid receives: all but those that choose runs or the results file."""
+    """Select the overrides for all runs of a grid: all except those that choose the runs or the results file."""
     return [override for override in overrides if override.partition("=")[0] not in GRID | {"results"}]
 
 
 class GridLauncher:
-    """Launches the unfinished runs of a grid. A run that fails leaves the others undisturbed and is retried.
+    """Launches the unfinished runs of a grid. A failed run does not stop the others and is retried.
 
     Args:
         config: complete configuration of the grid's job, including its ``hydra`` node.
-        results: CSV of the group, where finished runs append a row.
-        shared: overrides that every run receives in addition to its own.
+        results: CSV file of the group. Each finished run appends a row.
+        shared: overrides for all runs, in addition to the individual ones.
         task: function that Hydra calls with the configuration of each run.
     """
 
@@ -40,17 +40,17 @@ class GridLauncher:
 
     @classmethod
     def of_this_job(cls, results: Path, shared: Sequence[str], task: TaskFunction) -> "GridLauncher":
-        """A launcher with the ``hydra`` settings of the job that is calling, such as ``hydra/launcher=joblib``."""
+        """Build a launcher with the ``hydra`` settings of the calling job, such as ``hydra/launcher=joblib``."""
         config = HydraConfig.instance().cfg
         assert isinstance(config, DictConfig), "call this inside a function decorated with hydra.main"
         return cls(config, results, shared, task)
 
     def run(self, runs: Sequence[Run], retries: int) -> list[str]:
-        """Launch the runs that the results file lacks until none is left or the retries are used up.
+        """Launch the runs that are not in the results file, until all are finished or the retries are used up.
 
         Args:
-            runs: own overrides of each run.
-            retries: further attempts after the first.
+            runs: individual overrides of each run.
+            retries: number of further attempts after the first.
 
         Returns:
             One line for each run that still failed: its overrides, the error and its folder.
@@ -66,12 +66,12 @@ class GridLauncher:
         return [self._failure(run, errors) for run in remaining]
 
     def remaining(self, runs: Sequence[Run]) -> list[Run]:
-        """The runs whose results are not recorded yet."""
+        """Return the runs that are not in the results file yet."""
         done = recorded(self.results)
         return [run for run in runs if tuple(self.identity(run).values()) not in done]
 
     def identity(self, run: Run) -> dict[str, str]:
-        """The columns of the results file that identify a run."""
+        """Return the columns of the results file that identify a run."""
         cfg = self._env_config(next(override for override in run if override.startswith("env="))).copy()
         for override in OverridesParser.create().parse_overrides(run):
             if override.key_or_group != "env":
@@ -81,7 +81,7 @@ class GridLauncher:
         return identity(cfg)
 
     def _env_config(self, env: str) -> DictConfig:
-        """Configuration of an environment's runs, composed once because Hydra takes 0.25 s for it."""
+        """Return the configuration of an environment's runs; cached, because Hydra needs 0.25 s to compose it."""
         if env not in self._composed:
             load = GlobalHydra.instance().config_loader().load_sweep_config
             self._composed[env] = load(self.config, [env, *self.shared])
@@ -108,7 +108,7 @@ class GridLauncher:
         return {folder: error for folder, error in errors.items() if error is not None}
 
     def _folder(self, run: Run) -> str:
-        """The run's folder below the sweep's, determined by the run alone, so that an interrupted run is found."""
+        """Return the run's folder inside the sweep's. It depends on the run only, so an interrupted run is found."""
         who = self.identity(run)
         others = who.pop("others")
         names = [f"{key}_{value}" if key in ("seed", "updates") else value for key, value in who.items() if value]

@@ -12,10 +12,10 @@ from torchrl_h2o.training.run_folder import claimed, open_run
 
 
 def train_and_record(cfg: DictConfig, directory: Path) -> None:
-    """Train one method and append its results; a finished run only appends its results.
+    """Train one method and append its results. If the run is finished, only append its results.
 
     Args:
-        cfg: the run's configuration; ``results`` names the CSV, None for no record.
+        cfg: the run's configuration; ``results`` is the CSV file, or None to append nothing.
         directory: the run's folder.
     """
     if not (directory / "summary.json").exists():
@@ -27,13 +27,13 @@ def train_and_record(cfg: DictConfig, directory: Path) -> None:
 def train_grid_run(cfg: DictConfig) -> None:
     """Start or continue one run of a grid, called by a Hydra launcher.
 
-    It lives in the package because launchers import it by name in their worker processes.
+    The function is part of the package because launchers import it by name in their worker processes.
 
     Args:
         cfg: the run's configuration, composed from paper.yaml.
     """
     cfg.overrides = list(HydraConfig.get().overrides.task)
-    cfg.seeds = cfg.gaps = None  # these chose the grid's runs; in one run they would mean a population
+    cfg.seeds = cfg.gaps = None  # in the grid they select runs; in a single run they would start a population
     results = cfg.results
     cfg, directory = open_run(cfg, go_on=True)
     cfg.results = results  # an interrupted run may have been started for another results file

@@ -1,6 +1,6 @@
 """Reads and writes the results of a group of runs as CSV, such as recipes/results/returns.csv.
 
-Each row is one run, identified by the columns :data:`IDENTITY`. A second file, ``returns_curves.csv``, has one row an
+Each row is one run, identified by the columns :data:`IDENTITY`. A second file, ``returns_curves.csv``, has one row per
 evaluation, for learning curves.
 """
 
@@ -27,7 +27,7 @@ RESULT = (
     "versions",
     "command",
 )
-#: overrides not listed in the column ``others``: recorded in other columns, or without effect beyond rounding
+#: overrides not listed in the column ``others``: they have columns of their own, or affect results by rounding only
 TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
 #: overrides of paper.py that choose runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "seeds", "retries"}
@@ -36,7 +36,7 @@ CURVE = ("at", "return_mean", "return_std")
 
 
 def identity(cfg: DictConfig) -> dict[str, str]:
-    """The columns that identify a run within its group, as text."""
+    """Return the columns that identify a run within its group, as text."""
     h2o_plus = cfg.method == "h2o_plus"
     task = cfg.env.make.get("task")
     return {
@@ -55,12 +55,12 @@ def identity(cfg: DictConfig) -> dict[str, str]:
 
 
 def key_of(override: str) -> str:
-    """The key that an override sets."""
+    """Return the configuration key of an override."""
     return override.lstrip("+~").partition("=")[0]
 
 
 def repeating_command(cfg: DictConfig) -> str:
-    """The command that repeats a run, without the options for results and folders."""
+    """Return the command that repeats a run, without the options for results and folders."""
     chosen = [o for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
     return shlex.join(["python", "recipes/train.py", *chosen])
 
@@ -70,7 +70,7 @@ def _strength(cfg: DictConfig) -> float:
 
 
 def _short(data: str) -> str:
-    """The data set's name; for an absolute path its last two parts, as in a Minari name."""
+    """Return the data set's name; for an absolute path, its last two parts, which have the form of a Minari name."""
     path = Path(data)
     return "/".join(path.parts[-2:]) if path.is_absolute() else data
 
@@ -105,14 +105,14 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
 
 
 def _append(path: Path, result: Mapping, curve: Iterable[Mapping]) -> None:
-    """Append a run's curve, then its result: a run without a result counts as unfinished if the process is killed."""
+    """Append a run's curve, then its result, so that a run counts as unfinished if the process ends in between."""
     with uninterrupted():
         append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, result)
         append_rows(path, (*IDENTITY, *RESULT), [result], result)
 
 
 def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who: Mapping[str, str]) -> None:
-    """Append a run's rows to a CSV, unless it has rows of that run.
+    """Append a run's rows to a CSV file, unless the file already has rows of that run.
 
     Args:
         path: CSV file, created if missing.
@@ -133,11 +133,11 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
 
 
 def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
-    """Copy results and curves of the given runs from other groups' files in the same folder.
+    """Copy results and curves of the given runs from the files of other groups in the same folder.
 
     Args:
-        path: CSV to copy to.
-        runs: identities of the runs wanted.
+        path: CSV file to copy to.
+        runs: identities of the runs to copy.
     """
     missing = {_key(who) for who in runs} - recorded(path)
     for other in sorted(path.parent.glob("*.csv")):
@@ -150,7 +150,7 @@ def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
 
 
 def _is_group(path: Path) -> bool:
-    """Whether a CSV has the columns of a results file; the folder may hold other files."""
+    """Whether a CSV file has the columns of a results file; the folder may contain other CSV files."""
     with open(path, newline="", errors="replace") as file:
         return next(csv.reader(file), None) == [*IDENTITY, *RESULT]
 
@@ -161,7 +161,7 @@ def curves_of(path: Path) -> Path:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV; an empty list if the file is missing."""
+    """Read the rows of a CSV file; an empty list if the file is missing."""
     if not path.exists():
         return []
     with open(path, newline="") as file:

@@ -36,7 +36,7 @@ def draw_robot(to: Path, kept: Mapping[str, np.ndarray]) -> None:
 
 
 def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray]]) -> None:
-    """Draw Figure 3: displacement or velocity over time, one line an episode, with a cross where the robot fell.
+    """Draw Figure 3: displacement or velocity over time, one line per episode, with a cross where the robot fell.
 
     Args:
         path: PNG file to write.
@@ -61,7 +61,7 @@ def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray
         row[0].set_ylabel(f"{task.replace('_', ' ')}\n{LABELS[task]}")
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
-    figure.suptitle("In reality: one line an episode, × where the robot fell, dashed the target", fontsize=9)
+    figure.suptitle("In reality: one line per episode; ×: the robot fell; dashed line: target", fontsize=9)
     _save(figure, path)
 
 

@@ -1,8 +1,9 @@
 """Extracts the data of the paper's Figures 3 and 4 from runs: trajectories in reality, states in the simulator.
 
-They are stored in wheel_legged_figures.npz beside the results, because run folders are temporary. For each run, named
-by its identity in the CSV with ``-`` for empty columns, there is ``way <run>``, a trajectory ``[episodes, T]`` sampled
-every 0.2 s with NaN after a fall, and ``states <run>``, a histogram ``[pitch, pitch rate]``.
+The data are stored in wheel_legged_figures.npz beside the results, because run folders are temporary. The NPZ file has
+two arrays per run: ``way <run>``, trajectories ``[episodes, T]`` sampled every 0.2 s with NaN after a fall, and
+``states <run>``, a histogram ``[pitch, pitch rate]`` (H2O and H2O+ only). ``<run>`` is the run's identity in the CSV
+file, with ``-`` for empty columns.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,13 +26,13 @@ from torchrl_h2o.training.trained_policy import load_policy
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
 EVERY = 0.2  # s
-EPISODES = 5  # the first episodes of the run's own table
+EPISODES = 5  # the first of the episodes that the run's table averages
 COMPARED = ("h2o", "h2o_plus")  # the methods whose simulated data the paper compares
 BINS = (np.linspace(-0.55, 0.55, 56), np.linspace(-8.0, 8.0, 65))  # of pitch (rad) and pitch rate (rad/s)
 
 
 def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> dict[str, np.ndarray]:
-    """Add runs that are missing in the NPZ file from their folders, and return the arrays of the requested runs.
+    """Add requested runs that the NPZ file does not have from their folders, and return the arrays of these runs.
 
     Args:
         path: NPZ file, created if missing.
@@ -39,7 +40,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
         told: rows of the results file for the requested runs; other runs are ignored.
 
     Returns:
-        Arrays by ``way <run>`` and ``states <run>``.
+        Arrays by the keys ``way <run>`` and ``states <run>``.
     """
     asked = {tuple(row[key] for key in IDENTITY): _name(row) for row in told}
     arrays = dict(np.load(path)) if path.exists() else {}
@@ -61,7 +62,7 @@ def _name(row: Mapping[str, str]) -> str:
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
-    """Trajectories of the policy in reality, ``[episodes, T]``: position (m) or velocity (m/s), NaN after a fall."""
+    """Roll out the policy in reality: position (m) or velocity (m/s), ``[episodes, T]``, NaN after a fall."""
     env = make_reality(cfg, EPISODES)
     with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         torch.manual_seed(SEED)
@@ -76,7 +77,7 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 
 
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
-    """Pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
+    """Read pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
     real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns))
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     title = METHODS[cfg.method].title
@@ -100,6 +101,6 @@ def counted(states: np.ndarray) -> np.ndarray:
 
 
 def spread_entropy(counts: np.ndarray) -> float:
-    """Entropy of a histogram, nats; its exponential is the number of evenly filled cells with the same entropy."""
+    """Entropy of a histogram, in nats. exp(entropy) equals the number of cells of a uniform histogram with it."""
     share = counts[counts > 0] / counts.sum()
     return float(-(share * np.log(share)).sum())

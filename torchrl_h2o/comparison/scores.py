@@ -1,4 +1,4 @@
-"""Arranges the rows of a results file as a table: a row a task, a column a method, a cell all seeds."""
+"""Arranges the rows of a results file as a table: one row per task, one column per method, all seeds in one cell."""
 
 import statistics
 from collections import defaultdict
@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from torchrl_h2o.comparison.grids import OFFLINE
 
-Reference = tuple[float, float]  # returns that score 0 and 100
-#: Returns that score 0 and 100: those of D4RL's random and expert policies (Fu et al., 2020, arXiv 2004.07219); for the
-#: robot a return of 0 and 30 s without a fault.
+Reference = tuple[float, float]  # returns with score 0 and score 100
+#: Returns with score 0 and score 100. For HalfCheetah and Walker2d: D4RL's random and expert policies (Fu et al., 2020,
+#: arXiv 2004.07219). For the robot: 0, and the return of 30 s without a fault.
 REFERENCES = {
     "HalfCheetah-v5": (-280.178953, 12135.0),
     "Walker2d-v5": (1.629008, 4592.3),
@@ -22,7 +22,7 @@ Task = tuple[str, ...]
 
 
 class MixedRunsError(ValueError):
-    """Runs that cannot stand in one table."""
+    """Runs that cannot be combined in one table."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +40,26 @@ class Cell:
     seconds: dict[int, float] = field(default_factory=dict)
 
     def text(self) -> str:
-        """Mean and standard deviation over seeds (for a single seed, over its episodes), and the number of seeds."""
+        """Format mean ± standard deviation over seeds (for one seed, over its episodes), and the number of seeds."""
         values = list(self.returns.values())
         spread = statistics.stdev(values) if len(values) > 1 else next(iter(self.within.values()))
         return f"{statistics.mean(values):,.0f} ± {spread:,.0f} ({len(values)})"
 
     def lasts(self) -> str:
-        """Mean length of an episode, s."""
+        """Format the mean length of an episode, in s."""
         return f"{statistics.mean(self.seconds.values()):.1f}" if self.seconds else ""
 
     def score(self, reference: Reference) -> str:
-        """Normalised score of the mean return."""
+        """Format the normalised score of the mean return."""
         return f"{normalised(statistics.mean(self.returns.values()), reference):.1f}" if self.returns else ""
 
 
-#: columns in which H2O+'s variants differ in the ablations, and their labels in tables
+#: columns in which the variants of H2O+ differ in the ablations, and their labels in tables
 VARIANTS = {"backbone": "", "mixing": "λ", "ratio": "ratio"}
 
 
 def task_of(row: Row) -> Task:
-    """The task of a row, within which methods are compared: environment, data, gap, variant, other overrides."""
+    """Return the task of a row: environment, data, gap, variant and other overrides. Methods are compared per task."""
     variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
     gap = f"{row['gap']} {float(row['strength']):g}" if row["gap"] else ""
     others = [row["others"]] if row.get("others") else []
@@ -70,8 +70,9 @@ def placed(rows: Iterable[Row], variants: bool) -> list[Row]:
     """Repeat each row of an offline method for every gap of its data, since that run counts for all of them.
 
     Args:
-        rows: of a results file.
-        variants: whether H2O+'s backbone, λ and ratio separate tasks, as in the ablations; otherwise they are ignored.
+        rows: rows of a results file.
+        variants: whether runs that differ in backbone, λ or ratio belong to different tasks, as in the ablations.
+            If False, these columns are ignored.
     """
     rows = [dict(row) if variants else {**row, **dict.fromkeys(VARIANTS, "")} for row in rows]
     gaps = {(row["env"], row["data"], row["others"], row["gap"], row["strength"]) for row in rows if row["gap"]}
@@ -106,7 +107,7 @@ def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
 
 
 def normalised(value: float, reference: Reference) -> float:
-    """Score of a return, linear between the two returns of ``reference``, which score 0 and 100."""
+    """Score of a return, linear in the return, with score 0 and score 100 at the two returns of ``reference``."""
     low, high = reference
     return 100 * (value - low) / (high - low)
 
@@ -120,10 +121,10 @@ def markdown(
     """Format the table as Markdown, our results above the paper's.
 
     Args:
-        table: as :func:`cells` returns it.
-        titles: of the methods, in the order of the columns.
+        table: from :func:`cells`.
+        titles: titles of the methods, in the order of the columns.
         paper: the paper's cells by task and method, as text.
-        references: by environment, the returns that score 0 and 100; tasks without one get no scores.
+        references: by environment, the returns with score 0 and score 100; other environments get no scores.
     """
     present = [name for name in titles if any(name in methods for methods in table.values())]
     head = ["environment", "data", "gap", "variant", "", *(titles[name] for name in present)]

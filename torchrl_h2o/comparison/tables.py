@@ -42,11 +42,11 @@ def report(group: str, rows: list[Row], results: Path, to: Path, references: dic
 
     Args:
         group: name of the table or figure.
-        rows: of its results file, all of one number of updates.
+        rows: rows of its results file, all with the same number of updates.
         results: folder of the results files.
         to: folder to write to.
-        references: by environment, the returns that score 0 and 100.
-        reps: bootstrap samples.
+        references: by environment, the returns with score 0 and score 100.
+        reps: number of bootstrap samples.
 
     Raises:
         MixedRunsError: if a method has two runs of a seed in a task.
@@ -79,7 +79,7 @@ def report(group: str, rows: list[Row], results: Path, to: Path, references: dic
 
 
 def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:
-    """Draw the aggregate scores and return them as lines of text; with a single seed, return the reason for none."""
+    """Draw the aggregate scores and return them as lines of text, or the reason if they cannot be computed."""
     if not scores.tasks:
         return ["Interquartile means need a task that every method has finished."]
     if len(scores.seeds) < 2:
@@ -93,7 +93,7 @@ def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: 
 
 
 def aggregate_table(means: dict, better: dict) -> str:
-    """Format interquartile means and probabilities of improvement as a Markdown table, one line a method."""
+    """Format interquartile means and probabilities of improvement as a Markdown table, one line per method."""
     lines = ["| method | interquartile mean of the normalised score | P(H2O+ does better) |", "| --- | --- | --- |"]
     for name in (name for name in TITLES if name in means):
         chance = better[name].text() if name in better else ""
@@ -102,10 +102,10 @@ def aggregate_table(means: dict, better: dict) -> str:
 
 
 def paper_cells(rows: list[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
-    """The paper's results for the tasks of a table, as text by task and method.
+    """Format the paper's results for the tasks of a table, as text by task and method.
 
     Args:
-        rows: of results/paper.csv.
+        rows: rows of results/paper.csv.
         group: name of the table or figure.
         table: our cells.
     """

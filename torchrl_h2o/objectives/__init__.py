@@ -1,4 +1,4 @@
-"""The losses of H2O+, and the terms of DARC and H2O. Needs only torch, tensordict and torchrl."""
+"""Losses of H2O+, and the additional terms of DARC and H2O. Needs only torch, tensordict and torchrl."""
 
 from torchrl_h2o.objectives.accelerated import accelerate
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss

@@ -1,4 +1,4 @@
-"""The dynamics-aware mixed value update, Eqs. (7) and (8): a Bellman target between in-sample and exploring."""
+"""Dynamics-aware mixed value update, Eqs. (7) and (8): a Bellman target that mixes V(s') and the policy's Q(s', a')."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchrl_h2o.objectives.one_step import ValueType, one_step_discount
 
 
 class MixedBellmanLoss(HybridLoss):
-    r"""Q loss on the mixed Bellman target, simulated rows weighted by the dynamics ratio.
+    r"""Q loss on the mixed Bellman target, with simulated rows weighted by the dynamics ratio.
 
     .. math::
         \mathcal B^{mix}_\lambda\hat Q=r+\lambda\gamma V(s')
@@ -30,33 +30,35 @@ class MixedBellmanLoss(HybridLoss):
         \min_Q E_{𝒟}[(Q-\mathcal B^{mix}_\lambda\hat Q)^2]
           +E_B\big[\tfrac{P}{\hat P}(Q-\mathcal B^{mix}_\lambda\hat Q)^2\big]
 
-    λ = 0 is SAC's target on both streams (6), λ = 1 the in-sample target (5). Terminated states do not bootstrap,
-    truncated ones do. Only the Q network receives gradients; the policy and V are read. γ is 0.99 until
-    ``loss.make_value_estimator(gamma=...)`` changes it, as in TorchRL.
+    λ = 0 gives SAC's target on both streams (6), λ = 1 the in-sample target (5). The target bootstraps from truncated
+    next states, but not from terminated ones. Only the Q network receives gradients; the policy and V are constants.
+    γ is 0.99 by default; ``loss.make_value_estimator(gamma=...)`` changes it, as in TorchRL.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): π(a|s), with a reparameterised distribution.
         qvalue_network (TensorDictModule or list of them): Q(s, a); writes ``"state_action_value"``, ``[*B, 1]``. A
             list is an ensemble of independent initialisations; one module is expanded to ``num_qvalue_nets``.
-        value_network (TensorDictModule, optional): V(s); writes ``"state_value"``, ``[*B, 1]``. Only λ = 0 works
-            without it.
-        mixing (float, optional): λ in [0, 1]. Defaults to 0.1, the paper's. ``loss.mixing = x`` changes it later.
+        value_network (TensorDictModule, optional): V(s); writes ``"state_value"``, ``[*B, 1]``. Required unless
+            λ = 0.
+        mixing (float, optional): λ in [0, 1]. Defaults to 0.1, the paper's value. ``loss.mixing = x`` changes it
+            later.
 
     Keyword Args:
         exploration (TensorDictModule, optional): writes ``exploration_bonus``. Defaults to
             :class:`~torchrl_h2o.objectives.EntropyBonus`.
         alpha_init (float, optional): β. Defaults to 1.0.
-        num_qvalue_nets (int, optional): size of the ensemble; the target takes its minimum. Defaults to 2.
+        num_qvalue_nets (int, optional): size of the ensemble. The target uses the minimum over the ensemble. Defaults
+            to 2.
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
 
     Raises:
-        ValueError: if λ is outside [0, 1], λ is not 0 and there is no V, or β is not positive.
+        ValueError: if λ is outside [0, 1], if λ > 0 and ``value_network`` is None, or if β is not positive.
 
     Reads observation, action, ``real`` ``[*B]``, ``("next", ...)`` observation, reward ``[*B, 1]`` and terminated
     ``[*B, 1]``. Reads if present: ``dynamics_ratio`` ``[*B]`` (default 1), ``priority_weight`` ``[*B]`` and
-    ``steps_to_next_obs`` ``[*B, 1]``, the n of an n-step transition as ``MultiStepTransform`` writes it, which makes
-    the discount γⁿ. Writes ``loss_qvalue``, the sum over the ensemble, and into the input ``td_error`` ``[*B]``, the
-    largest of the ensemble, as TorchRL's losses do.
+    ``steps_to_next_obs`` ``[*B, 1]``, the number of steps n of an n-step transition, as written by
+    ``MultiStepTransform``; the discount is then γⁿ. Returns ``loss_qvalue``, the sum over the ensemble. Writes
+    ``td_error`` ``[*B]``, the largest absolute error of the ensemble, into the input, as TorchRL's losses do.
 
     Source:
         H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eqs. (7) and (8).
@@ -82,13 +84,13 @@ class MixedBellmanLoss(HybridLoss):
 
         Attributes:
             action: Defaults to the key that the actor writes.
-            value: V(s), as the value network writes it. Defaults to ``"state_value"``.
-            state_action_value: Q(s, a), as the Q network writes it. Defaults to ``"state_action_value"``.
+            value: V(s), written by the value network. Defaults to ``"state_value"``.
+            state_action_value: Q(s, a), written by the Q network. Defaults to ``"state_action_value"``.
             reward: below ``"next"``. Defaults to ``"reward"``.
             terminated: below ``"next"``. Defaults to ``"terminated"``.
             dynamics_ratio: P / P̂ of the simulated rows. Defaults to ``"dynamics_ratio"``.
             steps_to_next_obs: n of an n-step transition. Defaults to ``"steps_to_next_obs"``.
-            priority: the td error, written. Defaults to ``"td_error"``.
+            priority: the td error, written into the input. Defaults to ``"td_error"``.
             log_prob: log π(a'|s'), given to the exploration term. Defaults to ``"_log_prob"``.
             alpha: β, given to the exploration term. Defaults to ``"alpha"``.
             exploration_bonus: written by the exploration term. Defaults to ``"exploration_bonus"``.
@@ -151,7 +153,7 @@ class MixedBellmanLoss(HybridLoss):
         dtype = next(iter(self.qvalue_network_params.values(True, True))).dtype
         self.register_coeff_buffer("mixing", mixing, dtype=dtype)
         self.register_coeff_buffer("gamma", 0.99, dtype=dtype)
-        _ = self.vmap_randomness  # decided at the first access, which must not happen inside a compiled forward
+        _ = self.vmap_randomness  # TorchRL sets it at the first access, which must not be inside a compiled forward
         self.register_buffer("log_alpha", torch.tensor(math.log(alpha_init), dtype=dtype))
 
     def make_value_estimator(self, value_type: ValueType = None, **hyperparams) -> MixedBellmanLoss:
@@ -159,7 +161,7 @@ class MixedBellmanLoss(HybridLoss):
 
         Args:
             value_type: ``ValueEstimators.TD0``, TorchRL's ``TD0Estimator`` or an instance of it. Defaults to TD0.
-            **hyperparams: ``gamma``; for a class, the arguments of its constructor.
+            **hyperparams: ``gamma``; if ``value_type`` is a class, the arguments of its constructor.
 
         Returns:
             This loss.
@@ -239,7 +241,7 @@ class MixedBellmanLoss(HybridLoss):
         return self._entry(out, self.tensor_keys.value).squeeze(-1)
 
     def _next_policy_value(self, next_states: TensorDictBase) -> Tensor:
-        """Q̂(s', a') of the target networks' minimum plus the exploration term, a' from the policy, ``[*B]``."""
+        """Minimum of the target networks' Q̂(s', a') plus the exploration term, with a' ~ π(.|s'), ``[*B]``."""
         keys, states = self.tensor_keys, next_states.copy()
         action, log_prob = self.sample_action(states)
         states.set(keys.action, action)
@@ -255,7 +257,7 @@ class MixedBellmanLoss(HybridLoss):
         return rsample_and_log_prob(policy)
 
     def qvalues(self, tensordict: TensorDictBase, params: TensorDictBase, *, frozen: bool = False) -> Tensor:
-        """Q(s, a) of every member of the ensemble, ``[num_qvalue_nets, *B]``; with ``frozen`` constant parameters."""
+        """Q(s, a) of each ensemble member, ``[num_qvalue_nets, *B]``; ``frozen`` makes the parameters constants."""
         out = self.calls.outputs(self.qvalue_network, tensordict, params, self.vmap_randomness, frozen=frozen)
         return self._entry(out, self.tensor_keys.state_action_value).squeeze(-1)
 

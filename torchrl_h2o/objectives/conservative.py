@@ -17,26 +17,28 @@ from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 
 class DynamicsDivergence(TensorDictModuleBase):
-    r"""Estimate :math:`D_{KL}(\hat P\|P)` at (s, a), the simulator's error, from noisy next states.
+    r"""Estimate the simulator's error at (s, a), :math:`D_{KL}(\hat P\|P)`, from noisy next states.
 
     .. math::
         u(s,a)=\tfrac 1N\sum_i\log\frac{\hat P(s'_i|s,a)}{P(s'_i|s,a)},\qquad s'_i\sim\mathcal N(s',\sigma^2)
 
-    :class:`ConservativeLoss` normalises it over a batch's simulated rows, which gives ω of Eq. (1).
+    :class:`ConservativeLoss` normalises u over the simulated rows of a batch. The result is ω of Eq. (1).
 
     Args:
         estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`.
         noise (Tensor or float): σ, in the observation's units, ``[observation_dim]`` or one number. For example the
-            standard deviation of the real data's observations. The authors' value is smaller: their code includes
-            the zeros of the simulated part of the buffer, which is still empty then.
-        num_samples (int, optional): N. Defaults to 10, the authors'.
+            standard deviation of the real data's observations. The authors' σ is smaller: their code also counts the
+            zeros in the part of the buffer reserved for simulated data, which is still empty at that moment.
+        num_samples (int, optional): N. Defaults to 10, as in the authors' code.
 
     Keyword Args:
-        clamp (tuple of float, optional): bounds of the estimate. Defaults to ``(1e-45, 10.0)``, the authors'.
-        out_keys (sequence of NestedKey, optional): Defaults to ``["dynamics_divergence"]``, ``[*B]``, a constant.
+        clamp (tuple of float, optional): bounds of the estimate. Defaults to ``(1e-45, 10.0)``, as in the authors'
+            code.
+        out_keys (sequence of NestedKey, optional): key of the estimate, ``[*B]``, a constant. Defaults to
+            ``["dynamics_divergence"]``.
 
     Raises:
-        ValueError: if ``num_samples`` is below 1, or the lower bound is not positive, as its logarithm is taken.
+        ValueError: if ``num_samples`` is below 1, or the lower bound is not positive (the loss takes its logarithm).
 
     Source:
         H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464), as restated in H2O+ (Niu et al., 2023,
@@ -93,19 +95,20 @@ class ConservativeLoss(LossWrapper):
     .. math::
         \alpha_c\Big(\log\sum_{s,a\sim B}\omega(s,a)e^{Q(s,a)}-E_{𝒟}[Q(s,a)]\Big)
 
-    ω is the batch's ``dynamics_divergence``, written by :class:`DynamicsDivergence`, normalised over the simulated
-    rows. The term, ``loss_conservative``, is summed over the ensemble and trains only Q. H2O is this term added to SAC
-    on both streams with a Bellman error weighted by the dynamics ratio, as in the example.
+    ω is the batch's ``dynamics_divergence``, written by :class:`DynamicsDivergence` and normalised over the simulated
+    rows. The term, ``loss_conservative``, is summed over the ensemble and trains only Q. The method H2O adds this term
+    to SAC on both streams, with the Bellman error weighted by the dynamics ratio; the example builds it.
 
     Args:
-        loss (LossModule): with a ``qvalue_network``, as TorchRL's SAC, TD3 and IQL losses have and this package's.
-        alpha_c (float, optional): weight of the term, not negative. Defaults to 0.01, the authors'.
+        loss (LossModule): a loss with a ``qvalue_network``, such as TorchRL's SAC, TD3 and IQL losses or a loss of
+            this package.
+        alpha_c (float, optional): weight of the term, at least 0. Defaults to 0.01, as in the authors' code.
 
     Raises:
-        ValueError: if the loss inside has no ``qvalue_network`` or does not return means, or α_c is negative.
+        ValueError: if ``loss`` has no ``qvalue_network`` or a reduction other than "mean", or if α_c is negative.
 
-    Reads the inputs of the loss inside, ``real`` ``[*B]`` and, if present, ``dynamics_divergence`` ``[*B]`` (default:
-    equal weights). A stream without rows contributes zero.
+    Reads the inputs of ``loss``, ``real`` ``[*B]`` and, if present, ``dynamics_divergence`` ``[*B]`` (default: equal
+    weights). A stream without rows contributes zero.
 
     Source:
         H2O (Niu et al., 2022, https://arxiv.org/abs/2206.13464), as restated in H2O+ (Niu et al., 2023,
@@ -126,7 +129,7 @@ class ConservativeLoss(LossWrapper):
         >>> batch = TensorDict(observation=torch.randn(8, 3), action=torch.rand(8, 1), real=torch.arange(8) < 4,
         ...                    next=TensorDict(observation=torch.randn(8, 3), reward=torch.randn(8, 1),
         ...                                    terminated=torch.zeros(8, 1, dtype=torch.bool)), batch_size=8)
-        >>> losses = loss(divergence(estimator(batch)))  # with the ratio, and with ω
+        >>> losses = loss(divergence(estimator(batch)))  # the batch now has the ratio and ω
         >>> sum(term for name, term in losses.items() if name.startswith("loss_")).backward()
     """
 
@@ -183,7 +186,7 @@ class ConservativeLoss(LossWrapper):
     def _soft_maximum(self, qvalues: Tensor, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """log Σ ω e^Q over the simulated rows, ``[num_qvalue_nets]``; zero without such rows."""
         sim = rows.sim
-        lowest = torch.finfo(qvalues.dtype).min  # -inf would give NaN (-inf + inf) if no row is simulated
+        lowest = torch.finfo(qvalues.dtype).min  # with -inf, a batch without simulated rows would give NaN (-inf + inf)
         divergence = tensordict.get(self.tensor_keys.dynamics_divergence, None)
         logits = torch.zeros_like(qvalues[0]) if divergence is None else like_rows(divergence.detach(), sim).log()
         if rows.priority is not None:

@@ -1,4 +1,4 @@
-"""The default exploration term of the mixed Bellman target, Eq. (7): the policy's entropy."""
+"""Default exploration term of the mixed Bellman target, Eq. (7): the policy's entropy."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ class EntropyBonus(TensorDictModuleBase):
     r"""Entropy term of Eq. (7): :math:`-\beta\log\pi(a'|s')`.
 
     Any TensorDict module that writes an exploration bonus (``[*B]`` or ``[*B, 1]``, in units of the reward) can
-    replace it. The loss calls that module without gradients on the *next* states. Its input holds the observation, the
-    policy's action, the action's log-probability ``[*B]`` and β ``[*B]``.
+    replace this one. The loss calls the module without gradients on the *next* states. The module's input contains the
+    observation, the policy's action, the action's log-probability ``[*B]`` and β ``[*B]``.
 
     Keyword Args:
         log_prob (NestedKey, optional): log-probability, read. Defaults to ``"_log_prob"``.
         alpha (NestedKey, optional): β, read. Defaults to ``"alpha"``.
         exploration_bonus (NestedKey, optional): the bonus, written. Defaults to ``"exploration_bonus"``.
 
-    :class:`~torchrl_h2o.objectives.MixedBellmanLoss` renames these together with its own keys.
+    ``set_keys`` of :class:`~torchrl_h2o.objectives.MixedBellmanLoss` renames these keys too.
 
     Source:
         H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (7).

@@ -19,40 +19,42 @@ from torchrl_h2o.objectives.value import InSampleValueLoss
 
 
 class H2OPlusLoss(LossWrapper):
-    r"""All losses of H2O+: add the ``loss_*`` terms and take one step of one optimiser.
+    r"""All losses of H2O+. Add the ``loss_*`` terms and minimise the sum with one optimiser.
 
     .. math::
         \max_\pi E_{𝒟\cup B}[Q(s,a)-\beta\log\pi(a|s)]
 
-    Each term trains one network: ``loss_value`` V (4), ``loss_qvalue`` Q (7, 8), ``loss_actor`` the policy (10),
-    ``loss_alpha`` β, ``loss_ratio_sa`` and ``loss_ratio_sas`` the discriminators (9).
+    Each term trains one part (the paper's equation in brackets): ``loss_value`` trains V (4), ``loss_qvalue`` Q (7, 8),
+    ``loss_actor`` the policy (10), ``loss_alpha`` β, ``loss_ratio_sa`` and ``loss_ratio_sas`` the discriminators (9).
 
     Args:
-        bellman_loss (MixedBellmanLoss): holds the policy, Q and β, and reads V. This class makes its β a parameter
-            unless ``fixed_alpha``.
+        bellman_loss (MixedBellmanLoss): holds the policy, Q and β, and reads V. Its β becomes a trained parameter
+            unless ``fixed_alpha`` is true.
         value_loss (InSampleValueLoss, optional): the backbone, built from the same value network as ``bellman_loss``.
-            Without it, and with ``mixing=0.0``, this is SAC on both streams, Eq. (6).
-        ratio_loss (DynamicsRatioLoss, optional): holds the discriminators, whose ratio weighs the simulated rows.
-            Without it the batch's own ``dynamics_ratio`` does; without either the weight is 1.
+            Without it, and with ``mixing=0.0``, the loss is SAC on both streams, Eq. (6).
+        ratio_loss (DynamicsRatioLoss, optional): holds the discriminators. Their ratio weights the simulated rows.
+            Without it, the batch's ``dynamics_ratio`` weights them; if the batch has none, the weight is 1.
 
     Keyword Args:
-        weighted (bool, optional): whether the ratio weighs the simulated rows. With ``False`` the discriminators are
-            trained and the weight is 1. Defaults to ``True``.
+        weighted (bool, optional): whether the ratio weights the simulated rows. With ``False`` the discriminators are
+            still trained, but the weight is 1. Defaults to ``True``.
         fixed_alpha (bool, optional): whether β stays constant. Defaults to ``False``.
-        target_entropy (float or "auto", optional): in nats; ``"auto"`` is -dim(A), from the actor's spec.
+        target_entropy (float or "auto", optional): in nats. ``"auto"``, the default, is -dim(A), from the actor's
+            spec.
 
     Raises:
-        ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if a part has another reduction, or if the
-            target entropy is "auto" and the actor has no action spec.
+        ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if their reductions differ, or if the target
+            entropy is "auto" and the actor has no action spec.
 
-    ``loss(batch)`` trains the discriminators on the same batch, ``loss(batch, pairs)`` on a batch of their own, as the
-    authors do (128 + 128 and 256 + 256 rows). Reads the inputs of its parts. Writes the losses above and, to be logged,
-    ``alpha``, ``entropy``, and with a ``ratio_loss`` ``accuracy_sa``, ``accuracy`` and, if weighted,
-    ``dynamics_ratio``, its mean over the simulated rows.
+    ``loss(batch)`` trains the discriminators on the same batch. ``loss(batch, pairs)`` trains them on the second batch,
+    as the authors do (``batch`` with 128 + 128 rows, ``pairs`` with 256 + 256). Reads the inputs of its parts. Returns
+    the losses above and values for logging: ``alpha`` and ``entropy``; with a ``ratio_loss`` also ``accuracy_sa`` and
+    ``accuracy``; if weighted also ``dynamics_ratio``, the mean over the simulated rows.
 
-    The ratio is computed from the discriminators before their step, so that all losses take one backward pass and
-    compile to one graph. The authors compute it after that step. To do so, leave ``ratio_loss`` out, train it first,
-    and write the estimator's ``dynamics_ratio`` into the batch.
+    The ratio is computed with the discriminators' parameters before this step's update, so that all losses share one
+    backward pass and compile to one graph. The authors' code computes it after the discriminators' update. To reproduce
+    that order, omit ``ratio_loss`` here, take the step of a separate :class:`DynamicsRatioLoss` first, and write the
+    estimator's ``dynamics_ratio`` into the batch.
 
     Source:
         H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eqs. (4) to (10); β as in SAC (Haarnoja et al.,
@@ -193,7 +195,7 @@ class H2OPlusLoss(LossWrapper):
 
         Args:
             tensordict: transitions of both streams, ``[*B]``. Its td error is written into it.
-            pairs: transitions for the discriminators, ``[*C]``. Defaults to the same ones.
+            pairs: transitions for the discriminators, ``[*C]``. Defaults to ``tensordict``.
         """
         bellman, batch = self.bellman_loss, tensordict.copy()
         rows = bellman._rows(batch)
@@ -236,17 +238,17 @@ class H2OPlusLoss(LossWrapper):
         return terms
 
     def _value_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
-        """Compute V's loss, Eq. (4): regress it on the target Q at the data's own actions."""
+        """Compute the loss of V, Eq. (4): regress V on the target Q at the actions in the data."""
         batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
         return {"loss_value": self.value_loss.value_loss(batch, rows)}
 
     @torch.no_grad()
     def _data_qvalue(self, batch: TensorDictBase) -> Tensor:
-        """Minimum of the target Q at the data's own actions, ``[*B]``."""
+        """Minimum of the target Q-values at the actions in the data, ``[*B]``."""
         return self.bellman_loss.qvalues(batch, self.target_qvalue_network_params).amin(0)
 
     def actor_loss(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, Tensor]:
-        """Compute Eq. (10), reduced, and log π(a|s) of the sampled actions, ``[*B]``, a constant."""
+        """Compute the reduced loss of Eq. (10), and log π(a|s) of the sampled actions as a constant, ``[*B]``."""
         bellman, states = self.bellman_loss, tensordict.copy()
         action, log_prob = bellman.sample_action(states)
         states.set(self.tensor_keys.action, action)
@@ -255,13 +257,13 @@ class H2OPlusLoss(LossWrapper):
         return self._union_expectation(terms, rows), log_prob.detach()
 
     def alpha_loss(self, log_prob: Tensor, rows: Rows) -> Tensor:
-        """Compute SAC's loss for β, reduced: it raises β while the entropy is below its target."""
+        """Compute SAC's reduced loss of β; a gradient step raises β while the entropy is below its target."""
         terms = -self.log_alpha * (log_prob + self.target_entropy)
         return self._union_expectation(terms, rows)
 
 
 def _check_shared_value(bellman_loss: MixedBellmanLoss, value_loss: InSampleValueLoss | None) -> None:
-    """Require that both losses hold the same V, or none."""
+    """Check that both losses use the same V, or that neither uses one."""
     read = None if bellman_loss.value_network is None else bellman_loss.value_network_params
     trained = None if value_loss is None else value_loss.value_network_params
     if read is None and trained is None:

@@ -35,12 +35,12 @@ class Rows:
         self._streams: dict[torch.dtype, Tensor] = {}
 
     def weights(self, dtype: torch.dtype, *, prioritised: bool = True) -> Tensor:
-        """Weights that sum to one over each stream, ``[*B]``: equal ones, or in proportion to ``priority``."""
+        """Weights that sum to one over each stream, ``[*B]``: equal, or proportional to ``priority``."""
         key = dtype, prioritised and self.priority is not None
         if key not in self._weights:
             streams = [rows.to(dtype) for rows in (self.real, self.sim)]
             if key[1]:
-                # Selected, not multiplied: 0 * inf is NaN.
+                # torch.where instead of a product with the mask, because 0 * inf is NaN.
                 streams = [torch.where(rows > 0, self.priority.to(dtype), 0.0) for rows in streams]
             totals = [rows.sum() for rows in streams]
             self._weights[key] = sum(
@@ -49,14 +49,14 @@ class Rows:
         return self._weights[key]
 
     def streams(self, dtype: torch.dtype) -> Tensor:
-        """Number of streams that have rows, at least one, ``[]``."""
+        """Number of streams that have rows, clamped to at least 1, ``[]``."""
         if dtype not in self._streams:
             self._streams[dtype] = sum(rows.any().to(dtype) for rows in (self.real, self.sim)).clamp_min(1)
         return self._streams[dtype]
 
 
 class HybridLoss(LossModule):
-    """Base of the losses over real (𝒟) and simulated (B) rows.
+    """Base class of the losses over real (𝒟) and simulated (B) rows.
 
     A subclass lists the entries it reads in ``_read_keys`` and those it writes in ``_written_keys``, and reduces its
     per-row terms with :meth:`_expectation` or :meth:`_union_expectation`. TorchRL's ``loss_mask_key`` and
@@ -65,8 +65,8 @@ class HybridLoss(LossModule):
 
     Args:
         reduction (str, optional): ``"mean"`` (default) takes each expectation over its own stream;
-            ``"sum"`` adds all terms; ``"none"`` returns one term per row, of the batch's shape, and zero on
-            the rows of a stream that the loss does not read.
+            ``"sum"`` adds all terms; ``"none"`` returns one term per row, ``[*B]``, with zeros on the rows of a stream
+            that the loss does not use.
     """
 
     @dataclass
@@ -105,7 +105,7 @@ class HybridLoss(LossModule):
         """Entries that the loss requires: its ``in_keys``."""
 
     def _optional_keys(self) -> Iterable[NestedKey]:
-        """Entries that the loss reads if the batch has them; dispatched after the ``in_keys``."""
+        """Entries that the loss reads if the batch has them; as call arguments they follow the ``in_keys``."""
         return (self.tensor_keys.priority_weight,)
 
     @abstractmethod
@@ -149,7 +149,7 @@ class HybridLoss(LossModule):
         self._out_keys = keys
 
     def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        """Return a required entry, or raise a KeyError that names it."""
+        """Return a required entry, or raise a KeyError with its name."""
         value = tensordict.get(key, None)
         if value is None:
             raise KeyError(
@@ -180,7 +180,7 @@ class HybridLoss(LossModule):
         return Rows(real, sim, either, None if priority is None else like_rows(priority, real))
 
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
-        # TorchRL's own looks the key up in ``keys()``, which a nested key is not in.
+        # TorchRL's implementation looks the key up in ``keys()``, which does not contain nested keys.
         if self.use_prioritized_weights in (True, "auto"):
             return tensordict.get(self.tensor_keys.priority_weight, None)
         return None
@@ -194,17 +194,17 @@ class HybridLoss(LossModule):
         reduction: str | None = None,
         prioritised: bool = True,
     ) -> Tensor:
-        """Add the means over each stream, :math:`E_𝒟[.] + E_B[.]`, or take one of the two.
+        """Add the means over both streams, :math:`E_𝒟[.] + E_B[.]`, or compute one of the two.
 
         Args:
             terms: one per row, ``[*B]``.
-            rows: of the batch. A stream without rows contributes zero.
-            among: ``rows.real`` or ``rows.sim``, for one expectation only.
-            reduction: replaces the loss's own.
-            prioritised: whether ``priority_weight`` weighs the terms.
+            rows: streams of the batch. A stream without rows contributes zero.
+            among: ``rows.real`` or ``rows.sim``, for one expectation only. Defaults to both streams.
+            reduction: used instead of the loss's ``reduction``.
+            prioritised: whether the terms are weighted by ``priority_weight``.
         """
         among = rows.either if among is None else among
-        # Selected, not multiplied: 0 * inf is NaN.
+        # masked_fill instead of a product with the mask, because 0 * inf is NaN.
         selected = terms if among is None else terms.masked_fill(~among, 0.0)
         reduction = reduction or self.reduction
         if reduction == "mean":
@@ -216,12 +216,12 @@ class HybridLoss(LossModule):
     def _union_expectation(
         self, terms: Tensor, rows: Rows, reduction: str | None = None, *, prioritised: bool = True
     ) -> Tensor:
-        """Take :math:`E_{𝒟∪B}[.]`: the average of the two streams' means, or the mean of the only stream."""
+        """Compute :math:`E_{𝒟∪B}[.]`: the average of the two streams' means, or the mean of the only stream."""
         total = self._expectation(terms, rows, reduction=reduction, prioritised=prioritised)
         return total / rows.streams(terms.dtype) if (reduction or self.reduction) == "mean" else total
 
     def _metric(self, terms: Tensor, rows: Rows) -> Tensor:
-        """Reduce a figure to be logged: the unweighted mean, or one value per row with ``reduction="none"``."""
+        """Reduce a logged quantity: the unweighted mean, or one value per row with ``reduction="none"``."""
         reduction = "none" if self.reduction == "none" else "mean"
         return self._union_expectation(terms.detach(), rows, reduction, prioritised=False)
 
@@ -236,10 +236,10 @@ class HybridLoss(LossModule):
 
 
 def like_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """Drop the trailing singleton that ``rows`` lacks: ``[*B, 1]`` becomes ``[*B]``."""
+    """Remove a trailing dimension of size 1 that ``rows`` does not have: ``[*B, 1]`` becomes ``[*B]``."""
     return tensor.squeeze(-1) if tensor.ndim > rows.ndim else tensor
 
 
 def total_loss(terms: dict[str, Tensor]) -> Tensor:
-    """Add the terms named ``loss_*``: of one run, ``[]``, or of each member of a population, ``[N]``."""
+    """Add the terms named ``loss_*``. Their shape is ``[]`` for one run, ``[N]`` for a population of N runs."""
     return sum(term for name, term in terms.items() if name.startswith("loss_"))

@@ -1,4 +1,4 @@
-"""Weigh each row of any TorchRL loss by the dynamics ratio."""
+"""Weight each row of any TorchRL loss by the dynamics ratio."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ class ImportanceWeightedLoss(LossWrapper):
     """Multiply every row's terms of a TorchRL loss by a weight from the batch.
 
     If the batch has ``real``, rows marked True keep weight 1, as in Eq. (8): measured rows need no correction. Only
-    ``loss_*`` terms are weighted, and the weights are constants. ``SoftUpdate`` works on it as on the loss inside.
+    ``loss_*`` terms are weighted, and gradients do not pass through the weights. ``SoftUpdate`` accepts this loss and
+    updates the targets of ``loss``.
 
     Args:
-        loss (LossModule): built with ``reduction="none"`` (TorchRL's SACLoss and IQLLoss also want
+        loss (LossModule): built with ``reduction="none"`` (TorchRL's SACLoss and IQLLoss also need
             ``scalar_output_mode="exclude"``).
         key (NestedKey, optional): the weights, ``[*B]`` or ``[*B, 1]``. Defaults to ``"dynamics_ratio"``.
 
@@ -31,7 +32,7 @@ class ImportanceWeightedLoss(LossWrapper):
             Defaults to ``"mean"``.
 
     Raises:
-        ValueError: if the loss inside reduces its terms, or does not write a name in ``terms``.
+        ValueError: if ``loss`` reduces its terms, or does not write one of ``terms``.
         KeyError: if the batch has no weights.
 
     Source:
@@ -104,7 +105,7 @@ class ImportanceWeightedLoss(LossWrapper):
 
 
 def _scale(terms: Tensor, weights: Tensor) -> Tensor:
-    """Multiply terms by weights, whose trailing singletons are dropped or added to fit."""
+    """Multiply terms by weights, after trailing dimensions of size 1 are removed from or added to the weights."""
     while weights.ndim > terms.ndim:
         weights = weights.squeeze(-1)
     return terms * weights.reshape(weights.shape + (1,) * (terms.ndim - weights.ndim))

@@ -1,4 +1,4 @@
-"""Base class of losses that contain another loss, and expose its keys, its discount and its target networks."""
+"""Base class of losses that contain another loss and expose its keys, its discount and its target networks."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
 class LossWrapper(HybridLoss):
-    """A loss around another loss. ``SoftUpdate``, ``make_value_estimator`` and ``set_keys`` reach the loss inside.
+    """A loss around an inner loss. ``SoftUpdate``, ``make_value_estimator`` and ``set_keys`` apply to the inner loss.
 
     Args:
-        loss (LossModule): the loss inside.
+        loss (LossModule): the inner loss.
 
     Keyword Args:
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
     """
 
-    # The attribute that holds the loss inside.
+    # Name of the attribute that holds the inner loss.
     _inside_name = "loss"
 
     def __init__(self, loss: LossModule, *, reduction: str = "mean") -> None:
@@ -34,11 +34,11 @@ class LossWrapper(HybridLoss):
 
     @property
     def _parts(self) -> list[LossModule]:
-        """Losses that share this one's settings."""
+        """Inner losses that receive the settings of this loss."""
         return [self._inside]
 
     def set_keys(self, **kwargs) -> None:
-        """Rename the keys that this class reads, and all others in the loss inside."""
+        """Rename the keys that this class reads, and all other keys in the inner loss."""
         inside = self._inside
         own = {key: value for key, value in kwargs.items() if hasattr(self.tensor_keys, key)}
         others = {k: v for k, v in kwargs.items() if k not in own or hasattr(inside.tensor_keys, k)}
@@ -48,13 +48,13 @@ class LossWrapper(HybridLoss):
             inside.set_keys(**others)
 
     def make_value_estimator(self, *args, **kwargs) -> LossWrapper:
-        """Set the value estimator of the loss inside."""
+        """Set the value estimator of the inner loss."""
         self._inside.make_value_estimator(*args, **kwargs)
         return self
 
     @property
     def value_estimator(self):
-        """The value estimator of the loss inside."""
+        """Value estimator of the inner loss."""
         return self._inside.value_estimator
 
     @property
@@ -89,20 +89,20 @@ class LossWrapper(HybridLoss):
             part.reset_parameters_recursive()
 
     def _load_from_state_dict(self, *args, **kwargs) -> None:
-        # TorchRL's losses make the buffer of an automatic target entropy at its first use. A state_dict has it, so it
-        # must exist before the loss inside is loaded.
+        # TorchRL's losses register the buffer of an automatic target entropy at its first use. A state_dict contains
+        # that buffer, so it must exist before the inner loss is loaded.
         if "_target_entropy" in self._inside.__dict__:
             _ = self._inside.target_entropy
         super()._load_from_state_dict(*args, **kwargs)
 
-    # SoftUpdate finds the targets of the loss inside through the following three.
+    # SoftUpdate finds the target networks of the inner loss through the property and the method below.
     @property
     def _has_update_associated(self) -> dict[str, bool]:
         return {} if self._inside is None else self._inside._has_update_associated
 
     @_has_update_associated.setter
     def _has_update_associated(self, value: dict[str, bool]) -> None:
-        """Does nothing: the loss inside has its own."""
+        """Does nothing: the inner loss keeps its own record."""
 
     def named_children(self) -> Iterator[tuple[str, nn.Module]]:
         yield from super().named_children()

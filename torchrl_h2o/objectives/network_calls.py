@@ -1,4 +1,4 @@
-"""Call networks whose parameters are held apart from them, as TorchRL's losses hold them."""
+"""Call networks whose parameters are stored outside of them, as in TorchRL's losses."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from torchrl.objectives.utils import _vmap_func
 
 
 class NetworkCalls:
-    """TorchRL's way: the parameters are put into the module for one call, under ``vmap`` for an ensemble.
+    """Calls networks as TorchRL does: puts the parameters into the module for one call, with ``vmap`` for an ensemble.
 
-    Every loss has one of these as its attribute ``calls``. :func:`~torchrl_h2o.objectives.accelerate` replaces it.
+    Each loss has an instance as its attribute ``calls``. :func:`~torchrl_h2o.objectives.accelerate` replaces it.
     """
 
     def outputs(
@@ -23,10 +23,10 @@ class NetworkCalls:
         *,
         frozen: bool = False,
     ) -> TensorDictBase:
-        """Run a network on some parameters.
+        """Run a network with the given parameters.
 
         Args:
-            network: the module. Its own parameters are not read.
+            network: the module. The parameters it holds are not used.
             tensordict: inputs, ``[*B]``. Other entries are ignored.
             params: parameters of one network, ``[]``, or of an ensemble, ``[N]``.
             randomness: ``vmap``'s setting for an ensemble whose networks draw random numbers.
@@ -44,7 +44,7 @@ class NetworkCalls:
     def distribution(
         self, network: ProbabilisticTensorDictSequential, tensordict: TensorDictBase, params: TensorDictBase
     ) -> Distribution:
-        """Return a policy's distribution for some parameters.
+        """Return a policy's action distribution with the given parameters.
 
         Args:
             network: the policy.

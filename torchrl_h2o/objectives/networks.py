@@ -1,4 +1,4 @@
-"""The paper's networks as TensorDict modules: two hidden layers of 256 with ReLU, small initial outputs."""
+"""The paper's networks as TensorDict modules: two hidden layers of 256 units with ReLU, and small initial outputs."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
 class GaussianParameters(nn.Module):
     """Splits a network's output ``[*B, 2 n]`` into the mean and the standard deviation of a Gaussian, ``[*B, n]`` each.
 
-    The log standard deviation is clamped to [-20, 2], as in the authors' code: it can neither vanish nor overflow.
+    The log standard deviation is clamped to [-20, 2], as in the authors' code, to prevent underflow and overflow.
 
     Args:
-        trainable (bool, optional): whether the log standard deviation is scaled by a trained multiplier and shifted
-            by a trained offset, from 1 and -1, as in the authors' code. Defaults to ``False``.
+        trainable (bool, optional): whether the log standard deviation is scaled by a trained multiplier (initially 1)
+            and shifted by a trained offset (initially -1), as in the authors' code. Defaults to ``False``.
     """
 
     def __init__(self, trainable: bool = False) -> None:
@@ -62,17 +62,17 @@ def make_actor(
 
     Args:
         observation_dim (int): size of ``observation`` ``[*B, observation_dim]``.
-        action_spec (TensorSpec): of one environment, ``[action_dim]``, bounded.
+        action_spec (TensorSpec): bounded action spec of one environment, ``[action_dim]``.
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
 
     Keyword Args:
-        trainable_log_std (bool, optional): add the multiplier and the offset of the log standard deviation that the
-            authors' code trains. By default the offset is the initial bias of the last layer, which is trained with
-            the network: the same initial policy with two parameters less. Defaults to ``False``.
+        trainable_log_std (bool, optional): whether to add the trained multiplier and offset of the log standard
+            deviation that the authors' code has. Without them, the last layer's bias starts at the offset, so the
+            initial policy is the same with two parameters fewer. Defaults to ``False``.
 
     Returns:
-        A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its
-        standard deviation starts at exp(-1) before the tanh, the authors' log-std offset.
+        A policy that writes ``loc``, ``scale``, ``action`` ``[*B, action_dim]`` and ``_log_prob`` ``[*B]``. Its initial
+        standard deviation before the tanh is exp(-1), as with the authors' log-std offset.
 
     Raises:
         ValueError: if the action is not bounded.
@@ -150,7 +150,7 @@ def make_dynamics_ratio_estimator(
         observation_dim (int): size of ``observation``.
         action_dim (int): size of ``action``.
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
-        **kwargs: arguments of :class:`DynamicsRatioEstimator`.
+        **kwargs: keyword arguments of :class:`DynamicsRatioEstimator`.
 
     Examples:
         >>> make_dynamics_ratio_estimator(17, 6, logit_bound=None).in_keys

@@ -1,4 +1,4 @@
-"""The discount of a one-step target, read from what TorchRL's ``make_value_estimator`` accepts."""
+"""Discount of a one-step target, from the arguments that TorchRL's ``make_value_estimator`` accepts."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ def one_step_discount(value_type: ValueType, hyperparams: dict, default: float) 
 
     Args:
         value_type: a ``ValueEstimators`` member, an estimator's class or instance, or None for TD(0).
-        hyperparams: ``gamma``; for a class, the arguments of its constructor.
-        default: γ if none is given.
+        hyperparams: ``gamma``; if ``value_type`` is a class, the arguments of its constructor.
+        default: γ if ``hyperparams`` has none.
 
     Raises:
-        NotImplementedError: if the estimator is not TD(0): Eq. (7) has no other target.
+        NotImplementedError: if the estimator is not TD(0), because Eq. (7) defines a one-step target only.
         ValueError: if a TD(0) estimator changes the rewards.
         TypeError: for a hyperparameter that TD(0) does not have.
     """

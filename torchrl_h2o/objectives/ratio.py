@@ -1,4 +1,4 @@
-"""The dynamics ratio P(s'|s,a) / P̂(s'|s,a) from two discriminators, Eq. (9), and the loss that trains them."""
+"""Dynamics ratio P(s'|s,a) / P̂(s'|s,a) from two discriminators, Eq. (9), and the loss that trains them."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from torchrl_h2o.objectives.network_calls import NetworkCalls
 
 
 class DynamicsRatioEstimator(TensorDictModuleBase):
-    r"""Dynamics ratio of a transition, real over sim, from two real-or-simulated classifiers.
+    r"""Dynamics ratio of a transition, real over simulated, from two classifiers of real and simulated data.
 
     .. math::
         \frac{P}{\hat P}=\frac{p(real|s,a,s')}{1-p(real|s,a,s')}\Big/\frac{p(real|s,a)}{1-p(real|s,a)}
 
-    Reads a transition and writes two entries, so it also serves as a replay buffer's transform. Both entries are
+    Reads a transition and writes two entries, so it can also be the transform of a replay buffer. Both entries are
     constants without gradients; :class:`DynamicsRatioLoss` trains the networks.
 
     Args:
         sa_network (TensorDictModule): reads observation and action, writes logits ``[*B, 2]``, (real, simulated).
-        sas_network (TensorDictModule): the same with ``("next", "observation")`` beside them.
+        sas_network (TensorDictModule): the same, and reads ``("next", "observation")`` too.
 
     Keyword Args:
-        logit_bound (float or None, optional): every logit is ``bound * tanh(logit)``, so the log-ratio stays
-            within ``2 * bound`` of zero. ``None`` switches it off. Defaults to 2.0.
+        logit_bound (float or None, optional): replaces each logit by ``bound * tanh(logit)``, so that the log-ratio
+            with ``residual`` lies within ``[-2 * bound, 2 * bound]``. ``None`` sets no bound. Defaults to 2.0.
         residual (bool, optional): whether the first network's logits are added to the second's, so that the second
             learns only the contribution of s'. Defaults to ``True``.
         detach_residual (bool, optional): whether the added logits are constants, so that each network is trained by
-            its own loss. ``False`` is the authors' code, where the second loss also trains the first network.
-            Defaults to ``True``: Eq. (9) needs the first network's p(real|s,a), which the second loss disturbs.
-        clamp (tuple of float or None, optional): bounds of ``dynamics_ratio`` (``log_dynamics_ratio`` has none).
-            ``None`` switches it off. Defaults to ``(1e-5, 1.0)``.
-        out_keys (sequence of NestedKey, optional): Defaults to ``["log_dynamics_ratio", "dynamics_ratio"]``, each of
-            the batch's shape ``[*B]``.
+            its own loss. ``False`` reproduces the authors' code, where the second loss also trains the first network.
+            Defaults to ``True``, because gradients of the second loss bias the p(real|s,a) that Eq. (9) needs.
+        clamp (tuple of float or None, optional): bounds of ``dynamics_ratio``; ``log_dynamics_ratio`` is not clamped.
+            ``None`` sets no bounds. Defaults to ``(1e-5, 1.0)``.
+        out_keys (sequence of NestedKey, optional): keys of the two entries, ``[*B]`` each. Defaults to
+            ``["log_dynamics_ratio", "dynamics_ratio"]``.
 
     Raises:
         ValueError: if the bound is not positive, or the clamp is not an interval of non-negative numbers.
@@ -90,12 +90,12 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
     def log_odds(
         self, tensordict: TensorDictBase, params: TensorDictBase | None = None, calls: NetworkCalls | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Log-odds of real over simulated.
+        """Compute the log-odds of real against simulated.
 
         Args:
             tensordict (TensorDictBase): transitions, ``[*B]``.
-            params (TensorDictBase, optional): replaces this module's own parameters.
-            calls (NetworkCalls, optional): how the networks are run on ``params``. Defaults to TorchRL's way.
+            params (TensorDictBase, optional): used instead of this module's parameters.
+            calls (NetworkCalls, optional): runs the networks with ``params``. Defaults to TorchRL's method.
 
         Returns:
             The log-odds given (s, a) and given (s, a, s'), ``[*B]`` each. With ``residual`` the second includes the
@@ -147,8 +147,9 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
 class DynamicsRatioLoss(HybridLoss):
     """Cross-entropy of the two discriminators, with equal weight on both streams.
 
-    In training mode Gaussian noise is added to every input, after ``loss.eval()`` none. So ``accuracy`` in evaluation
-    mode on a held-out batch measures how visible the dynamics gap is (0.5: not at all).
+    In training mode, Gaussian noise is added to all inputs; after ``loss.eval()``, none is added. In evaluation mode,
+    ``accuracy`` on a held-out batch therefore measures how well the discriminator detects the dynamics gap (0.5 is
+    chance).
 
     By default each network is trained by its own loss, unlike in the authors' code; see ``detach_residual`` of
     :class:`DynamicsRatioEstimator`.
@@ -157,13 +158,13 @@ class DynamicsRatioLoss(HybridLoss):
         estimator (DynamicsRatioEstimator): holds the two networks.
 
     Keyword Args:
-        input_noise (float or None, optional): standard deviation of the noise, in each input's own unit. 0 or
-            ``None`` switches it off. Defaults to 0.1.
+        input_noise (float or None, optional): standard deviation of the noise, in the unit of each input. 0 or
+            ``None`` adds no noise. Defaults to 0.1.
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
 
-    Reads the estimator's inputs, ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Writes
-    ``loss_ratio_sa``, ``loss_ratio_sas``, and the two classifiers' accuracies, ``accuracy_sa`` of (s, a) and
-    ``accuracy`` of (s, a, s'), each the mean of the two streams' hit rates.
+    Reads the estimator's inputs, ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Returns
+    ``loss_ratio_sa``, ``loss_ratio_sas``, and the accuracies of the two classifiers: ``accuracy_sa`` of the one that
+    reads (s, a), ``accuracy`` of the one that reads (s, a, s'). Each is the mean of the two streams' accuracies.
 
     Source:
         H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (9), after DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916).
@@ -223,7 +224,7 @@ class DynamicsRatioLoss(HybridLoss):
         )
 
     def _noisy(self, x: Tensor) -> Tensor:
-        # The numbers of torch.randn_like, drawn by a function that compiled populations can supply numbers to.
+        # The same numbers as torch.randn_like. Compiled populations replace normal_ to supply recorded numbers.
         return x + self.input_noise * torch.empty_like(x).normal_()
 
     def _cross_entropy(self, log_odds: Tensor, rows: Rows) -> Tensor:

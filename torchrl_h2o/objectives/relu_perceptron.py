@@ -1,7 +1,7 @@
-"""A perceptron with ReLU, or an ensemble of them, as one node of the autograd graph.
+"""A perceptron with ReLU, or an ensemble of perceptrons, as one node of the autograd graph.
 
-Called layer by layer, a small network spends as much time on the graph and on memory allocation as on products. One
-node applies ReLU in place, and masks gradients by the activations.
+If a small network is called layer by layer, the graph and memory allocation take as much time as the matrix products.
+A single node applies ReLU in place, and masks gradients by the activations.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def relu_perceptron(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tenso
         biases: of each layer, ``[out]`` or ``[N, out]``.
 
     Raises:
-        RuntimeError: in a backward with ``create_graph=True``, as second derivatives are not implemented.
+        RuntimeError: in a backward pass with ``create_graph=True``; second derivatives are not implemented.
 
     Returns:
         ``[B, out]`` or ``[N, B, out]``.
@@ -40,12 +40,12 @@ def relu_perceptron(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tenso
 
 
 def _forward(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> list[Tensor]:
-    """The output of each layer, after its activation."""
+    """Output of each layer after its activation."""
     activations = []
     for index, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if weight.ndim == 2:
             x = F.linear(x, weight, bias)
-        elif index == 0:  # all members read the same inputs, so one product serves them all
+        elif index == 0:  # all members have the same inputs, so one product computes them all
             x = F.linear(x, weight.flatten(0, 1), bias.flatten()).unflatten(-1, weight.shape[:2]).movedim(-2, 0)
         else:
             x = torch.baddbmm(bias.unsqueeze(-2), x, weight.mT)
@@ -99,10 +99,10 @@ class _ReluPerceptron(torch.autograd.Function):
 
 
 def relu(x: Tensor) -> Tensor:
-    """Apply ReLU in compiled losses.
+    """Apply ReLU; faster than ``torch.relu`` in compiled losses.
 
-    For ``torch.relu`` the compiler stores a boolean mask, which CPUs write one number at a time. The gradient of this
-    function is masked by the sign of the output instead.
+    For ``torch.relu`` the compiler stores a boolean mask, which CPUs write one element at a time. This function masks
+    the gradient by the sign of the output instead.
     """
     return _Relu.apply(x)
 

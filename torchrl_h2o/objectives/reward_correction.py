@@ -13,26 +13,27 @@ from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 class DynamicsRewardCorrection(TensorDictModuleBase):
     r"""Add the log dynamics ratio to the reward of simulated transitions: :math:`r+\log\frac{P}{\hat P}(s'|s,a)`.
 
-    With TorchRL's ``SACLoss`` this is DARC. Call it on a batch, or pass it to a replay buffer as its transform, which
-    corrects each sample with the current discriminators: ``ReplayBuffer(..., transform=correction)``.
+    Together with TorchRL's ``SACLoss`` this gives DARC. Call the module on a batch, or make it the transform of a
+    replay buffer, ``ReplayBuffer(..., transform=correction)``; each sample is then corrected with the current
+    discriminators.
 
     Args:
         estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`. Its log ratio is bounded by
             ``logit_bound``, not by ``clamp``.
-        scale (float, optional): reward per nat of the log ratio. If the loss sees ``c * reward``, use ``scale=c``.
-            Defaults to 1.0.
+        scale (float, optional): reward per nat of the log ratio. If the loss receives rewards multiplied by c, use
+            ``scale=c``. Defaults to 1.0.
 
     Keyword Args:
         reward (NestedKey, optional): read and replaced, ``[*B, 1]`` or ``[*B]``. Defaults to ``("next", "reward")``.
-        real (NestedKey, optional): marks measured rows, which keep their reward. Without it every row counts as
-            simulated. Defaults to ``"real"``.
+        real (NestedKey, optional): marks measured rows, which keep their reward. If the batch has no such entry, all
+            rows count as simulated. Defaults to ``"real"``.
 
     Raises:
         KeyError: if a transition lacks the estimator's inputs or the reward.
 
     Source:
-        DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916), the correction Δr; H2O+ (Niu et al.,
-        2023, https://arxiv.org/abs/2309.12716), Eq. (9), the ratio.
+        The correction Δr: DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916). The ratio: H2O+ (Niu et
+        al., 2023, https://arxiv.org/abs/2309.12716), Eq. (9).
 
     Examples:
         >>> import torch

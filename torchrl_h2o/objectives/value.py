@@ -1,4 +1,4 @@
-"""In-sample state-value losses, Eq. (4): regress V(s) on Q(s, a) at the data's own actions.
+"""In-sample state-value losses, Eq. (4): regress V(s) on Q(s, a) at the actions in the data.
 
 The three backbones differ in their ``penalty``, a function of the advantage y = Q(s, a) - V(s).
 """
@@ -18,9 +18,9 @@ from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 
 
 class InSampleValueLoss(HybridLoss):
-    r"""In-sample value loss :math:`\min_V E_{(s,a)\sim 𝒟}\,L^f_V(Q(s,a)-V(s))`, abstract in :meth:`penalty`.
+    r"""Base class of the in-sample value loss :math:`\min_V E_{(s,a)\sim 𝒟}\,L^f_V(Q(s,a)-V(s))`.
 
-    To add a backbone, subclass this and define :meth:`penalty`.
+    To add a backbone, derive a class and define :meth:`penalty`, the function :math:`L^f_V`.
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
@@ -29,8 +29,8 @@ class InSampleValueLoss(HybridLoss):
         reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"``. Defaults to ``"mean"``, the mean over the
             real rows. Simulated rows have no effect.
 
-    Reads the network's inputs, ``state_action_value`` ``[*B]`` or ``[*B, 1]`` (target Q at the data's own action, used
-    as a constant), ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Writes ``loss_value``.
+    Reads the network's inputs, ``state_action_value`` ``[*B]`` or ``[*B, 1]`` (target Q at the action in the data, used
+    as a constant), ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Returns ``loss_value``.
 
     Source:
         H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716), Eq. (4), after SQL and EQL (Xu et al., 2023, https://arxiv.org/abs/2303.15810).
@@ -56,7 +56,7 @@ class InSampleValueLoss(HybridLoss):
 
         Attributes:
             value: V(s). Defaults to ``"state_value"``.
-            state_action_value: target Q at the data's own action. Defaults to ``"state_action_value"``.
+            state_action_value: target Q at the action in the data. Defaults to ``"state_action_value"``.
         """
 
         value: NestedKey = "state_value"
@@ -73,7 +73,7 @@ class InSampleValueLoss(HybridLoss):
 
     @abstractmethod
     def penalty(self, advantage: Tensor) -> Tensor:
-        """:math:`L^f_V(y)` of the advantage y, elementwise: ``[*B]`` to ``[*B]``."""
+        """Compute :math:`L^f_V(y)` of the advantage y, elementwise: ``[*B]`` to ``[*B]``."""
 
     def _read_keys(self) -> Iterable[NestedKey]:
         return (
@@ -90,7 +90,7 @@ class InSampleValueLoss(HybridLoss):
         return self._output({"loss_value": self.value_loss(tensordict, self._rows(tensordict))}, tensordict)
 
     def value_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
-        """Compute Eq. (4), reduced."""
+        """Compute the reduced loss of Eq. (4)."""
         out = self.calls.outputs(self.value_network, tensordict, self.value_network_params)
         value = self._entry(out, self.tensor_keys.value).squeeze(-1)
         qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
@@ -102,9 +102,9 @@ class ExpectileValueLoss(InSampleValueLoss):
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
-        expectile (float, optional): :math:`\tau` in (0, 1). 0.5 gives the mean of Q over the data's actions, values
-            near 1 approach its maximum. Defaults to 0.7, IQL's; the authors' code has 0.5, and 0.9 in its script for
-            the wheel-legged robot.
+        expectile (float, optional): :math:`\tau` in (0, 1). With 0.5, V is the mean of Q over the actions in the data;
+            values near 1 approach the maximum. Defaults to 0.7, as in IQL. The authors' code uses 0.5, and 0.9 in its
+            script for the wheel-legged robot.
 
     Keyword Args:
         reduction (str, optional): see :class:`InSampleValueLoss`.
@@ -139,9 +139,8 @@ class SparseValueLoss(InSampleValueLoss):
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
-        alpha (float, optional): in units of the return. Small values approach the maximum over the data's
-            actions, large ones the mean.
-            Defaults to 1.0.
+        alpha (float, optional): temperature, in units of the return. With small values V approaches the maximum of Q
+            over the actions in the data, with large values the mean. Defaults to 1.0.
 
     Keyword Args:
         reduction (str, optional): see :class:`InSampleValueLoss`.
@@ -172,15 +171,14 @@ class SparseValueLoss(InSampleValueLoss):
 class ExponentialValueLoss(InSampleValueLoss):
     r"""EQL's and XQL's loss :math:`\exp(y/\alpha)-y/\alpha`, finite for any advantage.
 
-    Above ``clip`` the exponential is replaced by its tangent: value and gradient stay finite and keep their sign, so
-    an outlier still raises V. Below ``clip`` both are exact.
+    For :math:`y/\alpha` above ``clip``, the exponential is replaced by its tangent at ``clip``: value and gradient stay
+    finite and keep their sign, so an outlier still raises V. Below ``clip``, value and gradient are exact.
 
     Args:
         value_network (TensorDictModule): V(s); writes ``"state_value"``, ``[*B, 1]``.
-        alpha (float, optional): in units of the return. Small values approach the maximum over the data's
-            actions, large ones the mean.
-            Defaults to 1.0.
-        clip (float, optional): the largest :math:`y/\alpha` with an exact exponential. Defaults to 7.0, as in XQL.
+        alpha (float, optional): temperature, in units of the return. With small values V approaches the maximum of Q
+            over the actions in the data, with large values the mean. Defaults to 1.0.
+        clip (float, optional): value of :math:`y/\alpha` above which the tangent is used. Defaults to 7.0, as in XQL.
 
     Keyword Args:
         reduction (str, optional): see :class:`InSampleValueLoss`.
@@ -202,7 +200,7 @@ class ExponentialValueLoss(InSampleValueLoss):
         tensor([True, True])
     """
 
-    # The loss is constant beyond this: the tangent there, summed over a batch, must stay inside float32's range.
+    # Bound of |y / alpha|, beyond which the loss is constant, so that the sum over a batch stays in float32's range.
     _BOUND = 1e25
 
     def __init__(
@@ -215,7 +213,9 @@ class ExponentialValueLoss(InSampleValueLoss):
     ) -> None:
         _check_alpha(alpha)
         if not 0 < clip <= 20:
-            raise ValueError(f"clip must lie in (0, 20], not {clip}: beyond exp(20) float32 has no room for a batch.")
+            raise ValueError(
+                f"clip must lie in (0, 20], not {clip}: beyond exp(20) the sum over a batch may overflow float32."
+            )
         super().__init__(value_network, reduction=reduction)
         self.alpha = alpha
         self.clip = clip

@@ -1,1 +1,1 @@
-"""The experiment around a loss: environments, collection, a loop that resumes, evaluation, films, populations."""
+"""The experiment around a loss: environments, collection, a resumable loop, evaluation, films, populations."""

@@ -1,7 +1,7 @@
 """Collectors of simulated transitions: in this process, in worker processes, or in Ray workers on many machines.
 
-The collectors are TorchRL's. Workers receive the policy's weights and send transitions. Each worker has a simulator and
-random streams of its own, seeded from the run's seed.
+The collectors are TorchRL's. Workers receive the policy's weights and send transitions. Each worker has its own
+simulator and random streams, seeded from the run's seed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,7 +34,7 @@ def check_collector(cfg: DictConfig) -> None:
 
     Raises:
         ModuleNotFoundError: if Ray is chosen and not installed.
-        ValueError: if an epoch's steps cannot be divided evenly among all worlds of all workers.
+        ValueError: if ``steps_per_epoch`` is not a multiple of the number of worlds of all workers.
     """
     chosen = _chosen(cfg)
     if chosen.backend == "ray" and find_spec("ray") is None:
@@ -42,8 +42,9 @@ def check_collector(cfg: DictConfig) -> None:
     workers = chosen.get("workers", 1)
     if workers < 1 or cfg.num_worlds < 1 or cfg.steps_per_epoch % (workers * cfg.num_worlds):
         raise ValueError(
-            f"collector.workers={workers} num_worlds={cfg.num_worlds}: all worlds of all workers share the steps of an "
-            f"epoch alike; choose so many that steps_per_epoch={cfg.steps_per_epoch} is a multiple of them"
+            f"collector.workers={workers} num_worlds={cfg.num_worlds}: the worlds of all workers share the steps of an "
+            f"epoch equally; choose numbers such that steps_per_epoch={cfg.steps_per_epoch} is a multiple of their "
+            "product"
         )
 
 
@@ -51,16 +52,16 @@ def check_collector(cfg: DictConfig) -> None:
 def collecting(
     cfg: DictConfig, simulator: EnvBase, actor: torch.nn.Module, keys: Sequence[NestedKey]
 ) -> Iterator[BaseCollector]:
-    """Yields a collector that returns one epoch of simulated transitions at a time; its workers end with the block.
+    """Yields a collector that returns one epoch of simulated transitions at a time; shuts its workers down at the end.
 
-    Call ``update_policy_weights_()`` to send the policy's present weights. Every batch begins with fresh episodes, so
+    Call ``update_policy_weights_()`` to send the policy's current weights. Every batch begins with new episodes, so
     that an epoch depends on its seed and its policy only.
 
     Args:
         cfg: the run's configuration.
         simulator: the environment of this process; workers build their own.
         actor: the policy.
-        keys: the entries of a transition that Ray's workers send.
+        keys: the entries of a transition that Ray's workers send back.
     """
     chosen = _chosen(cfg)
     options = {"frames_per_batch": cfg.steps_per_epoch, "reset_at_each_iter": True}
@@ -68,7 +69,7 @@ def collecting(
         if chosen.backend == "direct":
             collector = Collector(simulator, actor, **options)
         elif chosen.backend == "process":
-            threads = torch.get_num_threads()  # TorchRL would divide them among the workers
+            threads = torch.get_num_threads()  # by default TorchRL would divide them among the workers
             stack.callback(torch.set_num_threads, threads)
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": {"num_threads": threads}}
             collector = Collector(simulator_maker(cfg), actor, backend="process", **options)
@@ -90,7 +91,7 @@ def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:
     """Further arguments of TorchRL's RayCollector."""
     chosen = cfg.collector
     return {
-        # RayCollector collects nothing without a total.
+        # Without a total, RayCollector collects nothing.
         "total_frames": Budget.from_config(cfg).epochs * cfg.steps_per_epoch,
         "collector_class": SeededCollector,
         "collector_kwargs": [{"postproc": methodcaller("select", *keys)} for _ in range(chosen.workers)],
@@ -100,12 +101,12 @@ def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:
 
 @contextmanager
 def _ray(chosen: DictConfig) -> Iterator[None]:
-    """Connects to Ray: this process's runtime, this machine's cluster, or a new one.
+    """Connects to Ray: the runtime of this process, the cluster of this machine, or a new one.
 
     Raises:
-        RuntimeError: for more workers than the cluster has processors; Ray would wait for them silently.
+        RuntimeError: if the workers need more processors than the cluster has; Ray would wait without a message.
     """
-    import ray  # an extra
+    import ray  # optional dependency
 
     mine = not ray.is_initialized()
     if mine:

@@ -1,4 +1,4 @@
-"""Environments and preprocessing of a run, from its whole configuration."""
+"""Environments and preprocessing of a run, built from its complete configuration."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torchrl_h2o.training.task import Task
 
 
 def task_of(cfg: DictConfig) -> Task:
-    """The task of a run. Raises what :meth:`Task.from_config` raises."""
-    # Configurations of earlier versions have no gap_fix.
+    """Builds the task of a run; raises the errors of :meth:`Task.from_config`."""
+    # cfg.get, because configurations of earlier versions have no gap_fix.
     return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.get("gap_fix"))
 
 
 def preprocessing_of(cfg: DictConfig) -> Preprocessing:
-    """The preprocessing of a run whose normalisation has been measured."""
+    """Builds the preprocessing of a run, after :func:`measure_observation_norm` has completed the configuration."""
     norm = cfg.observation_norm
     return Preprocessing(
         loc=None if norm is None else tuple(norm.loc),
@@ -32,33 +32,33 @@ def preprocessing_of(cfg: DictConfig) -> Preprocessing:
 
 
 def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:
-    """Writes the real data's mean and standard deviation into the configuration, if the run normalises with them."""
+    """Writes mean and standard deviation of the real observations into the configuration, if the run normalises."""
     fitted = Preprocessing.fit(real, normalise=cfg.normalise_observation, norm=cfg.observation_norm)
     cfg.observation_norm = fitted.norm
 
 
 def make_reality(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:
-    """Builds reality as a run's learner sees it.
+    """Builds reality with the run's preprocessing.
 
     Args:
         cfg: the run's configuration.
         num_worlds: see :meth:`Task.make_reality`.
-        raw: whether observations stay in their own units.
+        raw: whether observations stay in physical units, without preprocessing.
         **kwargs: further arguments of the env, such as ``render_mode``.
     """
     return task_of(cfg).make_reality(num_worlds, None if raw else preprocessing_of(cfg), **kwargs)
 
 
 def make_simulator(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:
-    """Builds the simulator as a run's learner sees it; arguments as for :func:`make_reality`."""
+    """Builds the simulator with the run's preprocessing; arguments as for :func:`make_reality`."""
     return task_of(cfg).make_simulator(num_worlds, None if raw else preprocessing_of(cfg), **kwargs)
 
 
 def simulator_maker(cfg: DictConfig) -> Callable[[], EnvBase]:
-    """A picklable factory of the run's simulator, for worker processes; report files are read here, not there."""
+    """Picklable factory of the run's simulator for worker processes; report files are read in this process."""
     return partial(task_of(cfg).make_simulator, cfg.num_worlds, preprocessing_of(cfg))
 
 
 def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
-    """The real transitions as a run's learner sees them."""
+    """Applies the run's preprocessing to the real transitions."""
     return preprocessing_of(cfg).apply(real)

@@ -1,4 +1,4 @@
-"""Films a policy, where MuJoCo can render: with a display, or without one through EGL or OSMesa."""
+"""Films a policy. MuJoCo renders with a display or, without one, through EGL or OSMesa."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ FPS = 25
 
 
 class RenderingUnavailableError(RuntimeError):
-    """MuJoCo found no OpenGL."""
+    """MuJoCo found no OpenGL implementation."""
 
 
 def try_to_film(task: Task, preprocessing: Preprocessing, policy: torch.nn.Module, directory: Path) -> Path | None:
-    """Films the policy into the run's folder; a failure is reported and returns None, as the run is complete."""
+    """Films the policy into the run's folder. If that fails, writes a message and returns None; the run is complete."""
     try:
         return film(task, preprocessing, policy, directory / "policy.mp4")
     except Exception as error:
@@ -42,17 +42,17 @@ def film(
 
     Args:
         task: the task.
-        preprocessing: of the observations that the policy reads.
+        preprocessing: preprocessing of the policy's observations.
         policy: writes ``action``.
         path: an .mp4 file, or a folder (no suffix) for PNG frames.
         simulator: whether to film in the simulator.
-        seconds: of simulated time.
+        seconds: simulated time to film, in s.
 
     Returns:
         The file or folder written.
 
     Raises:
-        RenderingUnavailableError: if MuJoCo cannot render here, with what to do.
+        RenderingUnavailableError: if MuJoCo cannot render on this machine; the message states what to install.
     """
     frames = _frames(task, preprocessing, policy, simulator, seconds)
     import imageio.v3 as iio

@@ -1,4 +1,4 @@
-"""One job: methods trained on the same data and evaluated in reality, with the files that a run leaves."""
+"""One job: trains methods on the same data, evaluates them in reality and writes the run's files."""
 
 import time
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
 
     Args:
         cfg: the run's configuration.
-        directory: its folder.
-        methods: the one that the job is about, then baselines to compare it with.
+        directory: the run's folder.
+        methods: the main method, then its baselines.
     """
     start = time.perf_counter()
     real = prepare(cfg, directory)
@@ -52,7 +52,7 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
 
 
 def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
-    """Validates gap, report and collector, then loads the real data and saves the completed configuration."""
+    """Validates gap, report and collector, loads the real data, and saves the configuration with the normalisation."""
     task = task_of(cfg)
     task.make_simulator()
     check_collector(cfg)

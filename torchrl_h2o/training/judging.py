@@ -44,17 +44,17 @@ def judge(
     Args:
         task: the task, for the picture's title.
         reality: the environment of the evaluations, preprocessed as in training.
-        simulator: one episode of the first policy is evaluated in it.
-        policies: by method; the first is the one that the run is about, the others are baselines.
-        trainings: their trainings, by method.
-        behaviour: returns of the data's own episodes.
-        directory: where the files go.
+        simulator: the simulator, in which one episode of the first policy is evaluated.
+        policies: by method; the first belongs to the main method, the others to baselines.
+        trainings: finished trainings, by method.
+        behaviour: returns of the episodes in the data.
+        directory: folder to write to.
         episodes: number of episodes in reality.
         settings: further entries of the summary, see :func:`run_settings`.
-        wall_s: seconds that the run has taken so far.
+        wall_s: wall time of the run so far, in s.
 
     Returns:
-        The evaluations in reality by method, and the data's behaviour.
+        The evaluations in reality by method, and ``behaviour`` under its own name.
     """
     start = time.perf_counter()
     main = next(iter(policies))
@@ -79,13 +79,13 @@ def judge(
 
 
 def write_failure(directory: Path, failure: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
-    """Writes the summary.json of a run without a policy, with the reason of its failure."""
+    """Writes the summary.json of a failed run, which has no policy, with the reason of the failure."""
     failed = {"updates": failure["updates"], "return_real": None, "failure": failure["why"]}
     write_summary(directory, {**settings, **failed})
 
 
 def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
-    """The entries of a summary that describe the run: environment, gap, data, the method's options and the seed."""
+    """Collects the entries of summary.json that describe a run: environment, gap, data, options of H2O+, seed."""
     of_h2o_plus = ("backbone", "mixing", "ratio")  # options that no other method reads
     return {
         "env": cfg.env.name,
@@ -99,7 +99,7 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
 
 
 def write_summary(directory: Path, summary: dict) -> None:
-    """Writes summary.json, with the versions and the command that made it."""
+    """Writes summary.json, and adds the versions of the packages and the command."""
     summary = summary | {
         "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
         "command": shlex.join(["python", *sys.argv]),
@@ -108,7 +108,7 @@ def write_summary(directory: Path, summary: dict) -> None:
 
 
 def _commit() -> dict[str, str]:
-    """The commit of the library, if it runs from a repository. Changed result files do not count as changes."""
+    """Commit of the library, if it runs from a repository, marked -dirty if files outside recipes/results changed."""
     git = ["git", "-C", str(Path(__file__).parent)]
     try:
         commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
@@ -122,12 +122,12 @@ def _commit() -> dict[str, str]:
 def table_of_run(
     in_reality: Mapping[str, Evaluation], directory: Path, film: Path | None, seconds_per_step: float
 ) -> str:
-    """Mean return and length of the episodes in reality, one line per policy, and the names of the files.
+    """Format mean return and length of the episodes in reality, one line per policy, and the names of the files.
 
     Args:
         in_reality: evaluations by the name of the policy.
         directory: the run's folder.
-        film: the film's file, if there is one.
+        film: path of the film, or None.
         seconds_per_step: control step, in s.
     """
     folder = os.path.relpath(directory)
@@ -141,7 +141,7 @@ def table_of_run(
 
 
 def table_of_population(in_reality: Mapping[str, Evaluation | None], directory: Path, seconds_per_step: float) -> str:
-    """The same for a population, one line per member; None stands for a member that failed."""
+    """Format the same table for a population, one line per member; None stands for a member that failed."""
     folder = os.path.relpath(directory)
     lines = [
         *_lines(in_reality, seconds_per_step),

@@ -1,4 +1,4 @@
-"""A learner: networks, losses, optimiser and data, and one update of them."""
+"""A learner: networks, losses, optimiser and data, with a method that makes one update."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,13 +20,13 @@ class Learner:
 
     Args:
         actor: the policy.
-        losses: by their names in a checkpoint; each holds the networks that it trains.
-        optimiser: of all of their parameters.
-        targets: moves the target networks.
+        losses: loss modules by their names in a checkpoint; each contains the networks that it trains.
+        optimiser: optimiser of the parameters of all losses.
+        targets: updates the target networks.
         replay: the replay buffer.
         batch_sizes: (real, simulated) rows of each batch of one update.
-        terms_of: function of these batches that returns terms named ``loss_*``, which are summed, and figures to log.
-        figures: function of the same batches that returns further figures, computed at evaluations only.
+        terms_of: maps these batches to terms named ``loss_*``, which are summed, and values to log.
+        figures: maps the same batches to further values to log, computed at evaluations only.
         pays_to_compile: whether ``terms_of`` is faster when compiled.
         batches: the batches of the last update.
     """
@@ -43,11 +43,11 @@ class Learner:
     batches: list[TensorDictBase] = field(default_factory=list)
 
     def sample(self) -> list[TensorDictBase]:
-        """The batches of one update."""
+        """Draws the batches of one update."""
         return [self.replay.sample(size) for size in self.batch_sizes]
 
     def update(self) -> dict[str, torch.Tensor]:
-        """Makes one update of all networks; returns the terms."""
+        """Makes one update of all networks and returns the terms."""
         self.batches = self.sample()
         losses = self.terms_of(*self.batches)
         self.optimiser.zero_grad()
@@ -70,12 +70,12 @@ class Learner:
 def make_networks(
     cfg: DictConfig, observation_dim: int, action_spec: TensorSpec
 ) -> tuple[ProbabilisticActor, list[ValueOperator]]:
-    """Builds the policy and two Q networks from the run's seed, the same for every method."""
+    """Builds the policy and two Q networks. Their initial weights depend on the run's seed, not on the method."""
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
     return actor, [make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells) for _ in range(2)]
 
 
 def adam(*losses: LossModule, lr: float) -> torch.optim.Adam:
-    """Builds one fused Adam for the parameters of all losses."""
+    """Builds one fused Adam optimiser for the parameters of all losses."""
     return torch.optim.Adam([p for loss in losses for p in loss.parameters()], lr=lr, fused=True)

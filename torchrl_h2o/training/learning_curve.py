@@ -1,4 +1,4 @@
-"""Draws the picture of a run: returns in reality over the updates, and the discriminators' accuracy."""
+"""Draws learning_curve.png of a run: returns in reality over the updates, and the discriminators' accuracy."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,7 +28,7 @@ BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13)
 
 
 class Trained(Protocol):
-    """A finished training: its metrics and its speed."""
+    """A finished training: metrics, number of updates and speed."""
 
     rows: list[dict]
     updates: int
@@ -36,13 +36,13 @@ class Trained(Protocol):
 
 
 def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour: Evaluation, task: Task) -> None:
-    """Draws learning_curve.png from the trainings' metrics; the data's own return is a dashed line.
+    """Draws learning_curve.png from the trainings' metrics; a dashed line shows the mean return in the data.
 
     Args:
-        path: of the PNG.
-        trainings: by method; the discriminators of the first are drawn.
-        behaviour: returns of the data's own episodes.
-        task: for the title and the length of episodes.
+        path: PNG file to write.
+        trainings: by method; the right panel shows the discriminators of the first.
+        behaviour: returns of the episodes in the data.
+        task: the task, for the title and the length of episodes.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained", width_ratios=(3, 2))
     for name, training in trainings.items():
@@ -59,9 +59,9 @@ def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour:
             lw=0,
         )
     top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour.mean])
-    if left.get_ylim()[0] < -abs(top):  # unbounded negative returns would flatten the rest
+    if left.get_ylim()[0] < -abs(top):  # very negative returns would compress all other curves
         left.set_ylim(-0.25 * abs(top), 1.1 * top)
-        left.text(0.01, 0.01, "returns below are cut off", transform=left.transAxes, fontsize=8, color="0.4")
+        left.text(0.01, 0.01, "lower returns are cut off", transform=left.transAxes, fontsize=8, color="0.4")
     left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=_label_of(behaviour, task))
     gap = f", simulator with {task.gap}" if task.gap else ""
     left.set(xlabel="updates", ylabel="return in reality", title=f"{task.name}{gap}")
@@ -76,7 +76,7 @@ def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour:
 
 
 def _label_of(behaviour: Evaluation, task: Task) -> str:
-    """Label of the data's line, with the length of their episodes where a policy's episodes are limited to less."""
+    """Label of the data's line. It states the episode length in the data if that exceeds the policies' time limit."""
     longest = task.max_episode_steps
     if longest is None or behaviour.mean_length <= longest:
         return "the data's behaviour"
@@ -84,7 +84,7 @@ def _label_of(behaviour: Evaluation, task: Task) -> str:
 
 
 def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
-    """Accuracy of the discriminators and the mean ratio; an empty panel for a method without discriminators."""
+    """Draws accuracy of the discriminators and mean ratio; hides the panel for a method without discriminators."""
     updates = [row["updates"] for row in rows]
     lines = [
         ("accuracy_sa", "o-", None, "accuracy on (s, a)"),
@@ -97,5 +97,5 @@ def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
         return
     for key, style, colour, label in lines:
         axis.plot(updates, [row[key] for row in rows], style, ms=3, color=colour, label=label)
-    axis.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (0.5: cannot be told)")
+    axis.set(xlabel="updates", ylim=(0, 1.02), title="real or simulated? (accuracy 0.5: chance)")
     axis.legend(**BELOW)

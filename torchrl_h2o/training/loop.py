@@ -31,8 +31,9 @@ class Method:
     """A method of the comparison.
 
     Args:
-        title: its name in progress bars, tables and checkpoint folders.
-        make_learner: builds its learner from the configuration, the observation's size, the action's spec and the data.
+        title: name in progress bars, tables and checkpoint folders.
+        make_learner: builds the learner from the configuration, the observation's size, the action's spec and the
+            replay buffer.
     """
 
     title: str
@@ -42,13 +43,13 @@ class Method:
 class Trainee:
     """A learner with its environments: collects in the simulator, evaluates in reality.
 
-    A learner without simulated batches has no simulator, so nothing is collected and no policy is chosen there.
+    For a learner that uses no simulated rows, no simulator is built: nothing is collected, and ``keep`` has no effect.
 
     Args:
         make_learner: see :class:`Method`.
         cfg: the run's configuration.
-        replay: the data, preprocessed. The networks are on its device. Simulators stay on the CPU, with a copy of the
-            policy.
+        replay: the preprocessed data. The networks are on the buffer's device. Simulators stay on the CPU and use a
+            copy of the policy there.
     """
 
     def __init__(self, make_learner: MakeLearner, cfg: DictConfig, replay: HybridReplayBuffer) -> None:
@@ -73,12 +74,12 @@ class Trainee:
 
     @property
     def policy(self) -> torch.nn.Module:
-        """The policy that the run returns: the last, or the best in the simulator."""
+        """The policy that the run returns: the last one, or the best in the simulator if ``keep`` requires it."""
         return self.actor if self._best is None else self._best.policy
 
     @property
     def actor(self) -> torch.nn.Module:
-        """The trained policy with its present parameters, on the CPU."""
+        """The trained policy with its current parameters, on the CPU."""
         self._copy_to_cpu()
         return self._actor
 
@@ -87,7 +88,7 @@ class Trainee:
             self._actor.load_state_dict(self.learner.actor.state_dict())
 
     def begin_epoch(self, epoch: int) -> None:
-        """Seeds the random streams of the epoch, torch's and the simulator's, and collects its transitions."""
+        """Seeds torch and the simulator for the epoch, and collects the epoch's transitions."""
         seed = epoch_seed(self.cfg.seed, epoch)
         torch.manual_seed(seed)
         if self._collector is not None:
@@ -95,7 +96,7 @@ class Trainee:
             self._collect()
 
     def _collect(self) -> None:
-        """Adds one epoch of the policy's transitions in the simulator to the replay buffer."""
+        """Runs the policy in the simulator for one epoch and adds the transitions to the replay buffer."""
         self._copy_to_cpu()
         self._collector.update_policy_weights_()
         simulated = next(self._rollouts).reshape(-1)
@@ -103,10 +104,13 @@ class Trainee:
         self.learner.replay.extend(simulated)
 
     def look(self, rows: list[dict]) -> dict[str, float]:
-        """Evaluates the present policy; keeps it if it is the best in the simulator so far.
+        """Evaluates the current policy; with ``keep=best_in_simulator`` also stores it if it is the best so far.
 
         Args:
             rows: metrics of the earlier evaluations.
+
+        Returns:
+            Metrics of this evaluation by name.
         """
         actor = self.actor
         in_reality = evaluate(self._reality, actor, self.cfg.eval_episodes)
@@ -127,13 +131,13 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     """Trains one method.
 
     Args:
-        method: what to train.
+        method: the method to train.
         cfg: the run's configuration.
         real: the measured transitions, ``[T]``.
         directory: the run's folder.
 
     Returns:
-        The policy that ``keep`` selects, and the training with its metrics.
+        The policy selected by ``keep``, and the training with its metrics.
     """
     real = preprocessing_of(cfg).apply(real)
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)

@@ -1,4 +1,4 @@
-"""What the learner sees of a transition: normalised, stacked observations and a scaled reward."""
+"""Preprocessing of transitions for the learner: normalised, stacked observations and a scaled reward."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torchrl.envs import CatFrames, ObservationNorm, Transform
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Preprocessing that real data and environments share.
+    """Preprocessing that is applied to real data and environments alike.
 
     Args:
         loc: ``[n]``, mean that is subtracted from each observation; None for no normalisation.
-        scale: ``[n]``, standard deviation that observations are divided by.
-        frames: number of successive observations that the learner sees at once.
+        scale: ``[n]``, standard deviation by which observations are divided.
+        frames: number of successive observations that are stacked into one input.
         reward_scale: factor of the reward.
-        reward_offset: added to the reward before it is scaled.
+        reward_offset: constant that is added to the reward before scaling.
     """
 
     loc: tuple[float, ...] | None = None
@@ -37,12 +37,12 @@ class Preprocessing:
         norm: Mapping[str, Sequence[float]] | None = None,
         **options,
     ) -> Preprocessing:
-        """Takes mean and standard deviation of the observations from the real data.
+        """Builds a preprocessing with the mean and standard deviation of the real observations.
 
         Args:
             real: the measured transitions, ``[T]``.
             normalise: whether observations are normalised.
-            norm: ``loc`` and ``scale`` to use instead of the data's own.
+            norm: ``loc`` and ``scale`` to use instead of those measured in ``real``.
             **options: ``frames``, ``reward_scale`` and ``reward_offset``.
         """
         if norm is not None:
@@ -55,13 +55,13 @@ class Preprocessing:
 
     @property
     def norm(self) -> dict[str, list[float]] | None:
-        """Mean and standard deviation as a configuration holds them; None without normalisation."""
+        """Mean and standard deviation in the form of the option ``observation_norm``; None without normalisation."""
         if self.loc is None or self.scale is None:
             return None
         return {"loc": list(self.loc), "scale": list(self.scale)}
 
     def transforms(self) -> list[Transform]:
-        """The transforms that show an environment's observations in this way."""
+        """Builds the TorchRL transforms that preprocess an environment's observations."""
         chosen: list[Transform] = []
         if self.loc is not None:
             chosen.append(ObservationNorm(**self._tensors(), in_keys=["observation"], standard_normal=True))
@@ -70,7 +70,7 @@ class Preprocessing:
         return chosen
 
     def apply(self, real: TensorDictBase) -> TensorDictBase:
-        """The real transitions ``[T]`` as the learner sees them, in a new tensordict."""
+        """Preprocesses the real transitions ``[T]`` and returns them in a new tensordict."""
         real = real.copy()
         real["next"] = real["next"].copy().set("reward", self.reward(real["next", "reward"]))
         if self.loc is not None:
@@ -84,7 +84,7 @@ class Preprocessing:
         return real
 
     def reward(self, reward: torch.Tensor) -> torch.Tensor:
-        """The reward of the losses, from the task's own; reported returns are the task's own."""
+        """Computes the reward for the losses from the task's reward. Reported returns use the task's reward."""
         return self.reward_scale * (reward + self.reward_offset)
 
     def _tensors(self) -> dict[str, torch.Tensor]:

@@ -1,7 +1,7 @@
-"""One method's training inside a run: its epochs, progress bar, metrics and checkpoints.
+"""Training of one method inside a run: epochs, progress bar, metrics and checkpoints.
 
-Every epoch has a random stream of its own, drawn from the run's seed and the epoch's number, and starts with fresh
-simulator episodes. A run that goes on from a checkpoint therefore draws the same numbers as an unbroken one.
+Every epoch has its own random stream, seeded from the run's seed and the epoch's number, and starts with new simulator
+episodes. A run that is resumed from a checkpoint therefore draws the same random numbers as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
 
 @dataclass(frozen=True)
 class Budget:
-    """How long a training is, and how often it is evaluated and saved.
+    """Length of a training, and intervals of its evaluations and checkpoints.
 
     Args:
-        updates: of the networks, rounded up to whole epochs.
-        updates_per_epoch: between two collections in the simulator.
-        eval_every: epochs between two evaluations; the last epoch is always evaluated.
-        checkpoint_every: epochs between two checkpoints; the last epoch is always saved.
+        updates: number of updates of the networks, rounded up to whole epochs.
+        updates_per_epoch: updates between two collections in the simulator.
+        eval_every: epochs between two evaluations; the policy is always evaluated after the last epoch.
+        checkpoint_every: epochs between two checkpoints; a checkpoint is always written after the last epoch.
     """
 
     updates: int
@@ -39,7 +39,7 @@ class Budget:
 
     @classmethod
     def from_config(cls, cfg: DictConfig) -> Budget:
-        """The budget in a run's configuration."""
+        """Reads the budget from a run's configuration."""
         return cls(cfg.updates, cfg.updates_per_epoch, cfg.eval_every, cfg.checkpoint_every)
 
     @property
@@ -49,7 +49,7 @@ class Budget:
 
 
 def epoch_seed(seed: int, epoch: int) -> int:
-    """The seed of an epoch's random stream, from the run's seed and the epoch's number."""
+    """Computes the seed of an epoch's random stream from the run's seed and the epoch's number."""
     return int(np.random.SeedSequence((seed, epoch)).generate_state(1)[0])
 
 
@@ -57,19 +57,19 @@ class Training:
     """Epochs, metrics and checkpoints of one method; continues from the last checkpoint in the folder, if any.
 
     Args:
-        name: of the method, for the progress bar, the tables and the checkpoint folder.
+        name: name of the method, for the progress bar, the tables and the checkpoint folder.
         directory: the run's folder.
         budget: length of the training.
         **components: contents of a checkpoint (losses, optimisers, replay buffers).
 
     Raises:
-        RuntimeError: if the folder holds checkpoints, none of which can be read.
+        RuntimeError: if the folder contains checkpoint files, but no readable checkpoint.
     """
 
     def __init__(self, name: str, directory: Path, budget: Budget, **components: Any) -> None:
         self.name, self.directory, self.budget = name, directory, budget
         self.progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
-        # A damaged ZIP archive raises an error; a damaged folder of memory maps would read as zeros.
+        # "archive", because a damaged ZIP raises an error, while a damaged folder of memory maps is read as zeros.
         self.checkpoint = Checkpoint(format="archive", **components)
         directory.mkdir(parents=True, exist_ok=True)
         folder = checkpoint_folder(directory, name)
@@ -79,12 +79,12 @@ class Training:
             self.progress = Checkpoint.manifest(latest)["metadata"]["progress"]
         elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
             raise RuntimeError(
-                f"{folder} holds no checkpoint that can be read: remove it to train {name} from the start"
+                f"{folder} contains no checkpoint that can be read: remove it to train {name} from the start"
             )
 
     @property
     def updates(self) -> int:
-        """Number of updates of all epochs."""
+        """Total number of updates over all epochs."""
         return self.budget.epochs * self.budget.updates_per_epoch
 
     @property
@@ -93,7 +93,7 @@ class Training:
         return self.progress["rows"]
 
     def epochs(self) -> Iterator[tuple[int, bool]]:
-        """Yields each epoch's number and whether to evaluate at its end; saves a checkpoint after it."""
+        """Yields each epoch's number and whether to evaluate at its end; then saves a checkpoint if one is due."""
         done, size = self.progress["epoch"], self.budget.updates_per_epoch
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * size, unit=" updates")
         for epoch in range(done, self.budget.epochs):
@@ -108,7 +108,7 @@ class Training:
         self._bar.close()
 
     def epoch_updates(self) -> Iterator[int]:
-        """Yields the number of each update of an epoch; moves the bar and measures the time."""
+        """Yields the number of each update of an epoch, advances the progress bar and measures the time."""
         start = time.perf_counter()
         for update in range(self.budget.updates_per_epoch):
             yield update
@@ -117,11 +117,11 @@ class Training:
 
     @property
     def updates_per_second(self) -> float:
-        """Updates per second, without collection and evaluation."""
+        """Updates per second; the time of collection and evaluation does not count."""
         return self.progress["epoch"] * self.budget.updates_per_epoch / self.progress["update_seconds"]
 
     def log(self, epoch: int, **metrics: float) -> None:
-        """Adds a row of metrics, writes metrics.csv, and shows the return in reality beside the bar."""
+        """Adds a row of metrics, writes metrics.csv, and shows the return in reality beside the progress bar."""
         self.rows.append(self._row(epoch, metrics))
         write_metrics(self.directory, self.name, self.rows)
         self._bar.set_postfix(return_real=f"{metrics['return_real']:.0f}")
@@ -131,7 +131,7 @@ class Training:
 
 
 def write_metrics(directory: Path, method: str, rows: list[dict]) -> None:
-    """Writes metrics.csv: one row per evaluation, one column per metric. Rows of other methods stay."""
+    """Writes metrics.csv: one row per evaluation, one column per metric. Keeps the rows of other methods."""
     path = directory / "metrics.csv"
     if path.exists():
         with open(path, newline="") as file:

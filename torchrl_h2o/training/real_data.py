@@ -1,4 +1,4 @@
-"""The real transitions of a run: read from a data set or a log, or recorded once in reality and cached."""
+"""Real transitions of a run, read from a data set or a log, or recorded once in ``reality`` and cached."""
 
 import contextlib
 import hashlib
@@ -27,13 +27,13 @@ def read_real_data(
 
     Args:
         config: the ``env`` section of a configuration, see :class:`~torchrl_h2o.training.task.Task`.
-        reality: one env of the task, with observations in their own units.
-        data: ``"recorded"``, or what :func:`torchrl_h2o.data.load` reads: a data set's name, a file or a folder.
-        columns: the YAML file that describes a log's columns; the task's own by default.
+        reality: one env of the task, with observations in physical units.
+        data: ``"recorded"``, or a source for :func:`torchrl_h2o.data.load`: a data set's name, a file or a folder.
+        columns: YAML file that describes a log's columns. Defaults to ``columns`` of the configuration.
 
     Raises:
-        ValueError: for ``"recorded"`` where the task has no controller to record.
-        torchrl_h2o.data.DataError: for data that cannot be read or do not fit the task.
+        ValueError: for ``"recorded"`` if the task has no controller for recording.
+        torchrl_h2o.data.DataError: if the data cannot be read or do not fit the task.
     """
     if data == RECORDED:
         return _recorded(config, reality)
@@ -46,7 +46,7 @@ def read_real_data(
 
 
 def is_log(data: str) -> bool:
-    """Whether ``data`` names a log, whose columns have to be described, and not a data set."""
+    """Whether ``data`` is the file of a log, which needs a description of its columns."""
     return Path(data).is_file() and Path(data).suffix not in (".hdf5", ".h5")
 
 
@@ -72,12 +72,12 @@ def _cache() -> Path:
 
 
 def behaviour_of(real: TensorDictBase, *, recorded: bool) -> Evaluation:
-    """Returns and lengths of the data's own episodes.
+    """Returns and lengths of the episodes in the data.
 
     Args:
         real: the measured transitions, ``[T]``.
-        recorded: whether the data were recorded with ``data=recorded``, whose last episode is cut off by the number of
-            transitions and does not count unless it is the only one.
+        recorded: whether the data come from ``data=recorded``. The recording stops after a number of transitions, so
+            its last episode is incomplete; it is left out unless it terminated or is the only one.
     """
     whole = list(episodes(real))
     if recorded and len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:

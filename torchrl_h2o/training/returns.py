@@ -1,4 +1,4 @@
-"""Returns of a policy over whole episodes with deterministic actions."""
+"""Returns of a policy over complete episodes with deterministic actions."""
 
 from collections.abc import Callable
 from copy import deepcopy
@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-SEED = 1_000_000  # of the first episode of an evaluation
+SEED = 1_000_000  # seed of the first episode of an evaluation
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Evaluation:
 
     Args:
         returns: one per episode, in units of the reward.
-        lengths: in control steps.
+        lengths: one per episode, in control steps.
     """
 
     returns: list[float]
@@ -44,13 +44,13 @@ class Evaluation:
 def evaluate(
     env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int, seed: int = SEED
 ) -> Evaluation:
-    """Runs whole episodes without changing the state of torch's global generator.
+    """Runs complete episodes without changing the state of torch's global generator.
 
     Args:
         env: one env ``[]``, which runs one episode after another, or N worlds ``[N]``, which run one episode each.
         policy: writes ``action``.
         episodes: number of episodes.
-        seed: of the env.
+        seed: seed of the env and, during the evaluation, of torch.
     """
     returns, lengths = [], []
     with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -65,7 +65,7 @@ def evaluate(
 
 @torch.no_grad()
 def _run_episodes(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> tuple[list[float], list[int]]:
-    """Runs one episode in each world. Worlds that end early keep stepping, and their further rewards do not count."""
+    """Runs one episode in each world. Worlds that finish early keep stepping; their further rewards are ignored."""
     returns = torch.zeros(env.batch_size, dtype=torch.float64)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
     running = torch.ones(env.batch_size, dtype=torch.bool)
@@ -86,12 +86,12 @@ def run_episode(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
 
 
 class BestPolicy:
-    """Keeps the parameters of an actor at the evaluation with the highest return in the simulator.
+    """Stores the actor's parameters from the evaluation with the highest return in the simulator.
 
     Args:
-        actor: the policy that is trained; it is copied.
+        actor: the trained policy; this class keeps a copy.
         simulator: the environment of the evaluations.
-        episodes: number of episodes of an evaluation.
+        episodes: number of episodes per evaluation.
     """
 
     def __init__(self, actor: torch.nn.Module, simulator: EnvBase, episodes: int) -> None:
@@ -99,10 +99,10 @@ class BestPolicy:
         self.simulator, self.episodes = simulator, episodes
 
     def consider(self, actor: torch.nn.Module, rows: list[dict]) -> dict[str, float]:
-        """Evaluates the actor in the simulator and keeps it if no earlier evaluation was better.
+        """Evaluates the actor in the simulator and stores it if no earlier evaluation was better.
 
         Args:
-            actor: the policy as it is now.
+            actor: the policy with its current parameters.
             rows: metrics of the earlier evaluations, with ``return_sim``.
 
         Returns:

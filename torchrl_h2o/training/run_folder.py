@@ -20,19 +20,19 @@ KEEP = ("last", "best_in_simulator")
 
 
 def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
-    """Opens the folder of a new run, or of the run that ``resume`` names.
+    """Opens the folder of a new run, or of the run given by ``resume``.
 
     Args:
-        cfg: configuration from the command line. A resumed run keeps the configuration in its folder.
-        go_on: whether to continue a run that is in the folder already, as if ``resume`` named it.
+        cfg: configuration from the command line. A resumed run uses the configuration in its folder instead.
+        go_on: whether to continue a run that exists in the folder, as with ``resume``.
 
     Returns:
-        The configuration that counts, and the folder.
+        The run's configuration and its folder.
 
     Raises:
-        ValueError: for overrides beside ``resume``, or settings that contradict each other.
-        FileNotFoundError: if ``resume`` names a folder that is not a run's.
-        FileExistsError: if a new run would go into the folder of another one.
+        ValueError: for other overrides together with ``resume``, or settings that contradict each other.
+        FileNotFoundError: if the folder given by ``resume`` is not the folder of a run.
+        FileExistsError: if the folder of a new run already contains a run.
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
     if not OmegaConf.is_missing(cfg, "resume"):
@@ -54,10 +54,10 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
 
 
 def check_settings(cfg: DictConfig) -> None:
-    """Checks settings that would otherwise fail late.
+    """Checks settings whose errors would otherwise appear only late in a run.
 
     Raises:
-        ValueError: naming the setting and the values that are allowed.
+        ValueError: for an invalid setting; the message lists the allowed values.
     """
     if cfg.updates < 1:
         raise ValueError(f"updates={cfg.updates}: train for at least one")
@@ -70,7 +70,7 @@ def check_settings(cfg: DictConfig) -> None:
 
 
 def resolve_paths(cfg: DictConfig) -> None:
-    """Makes file names absolute, in place, since a run may be resumed from another folder."""
+    """Makes file names absolute, in place, because a run may be resumed from another working directory."""
     for key in ("data", "columns", "gap_fix"):
         if cfg[key] is not None and Path(cfg[key]).exists():
             cfg[key] = str(Path(cfg[key]).resolve())
@@ -78,7 +78,7 @@ def resolve_paths(cfg: DictConfig) -> None:
 
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
-    """Locks a run's folder against other processes. The lock ends with the process.
+    """Locks a run's folder against other processes; the lock is also released if the process is killed.
 
     Raises:
         RuntimeError: if another process has locked it.
@@ -94,7 +94,7 @@ def claimed(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def resumable(directory: Path) -> Iterator[None]:
-    """Ends an interrupted run with the command that continues it."""
+    """Handles Ctrl-C: exits with the command that continues the run."""
     try:
         yield
     except KeyboardInterrupt:
@@ -103,7 +103,7 @@ def resumable(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Delays Ctrl-C to the end of the block: inside file operations it could surface as an OSError."""
+    """Delays Ctrl-C to the end of the block, because inside file operations it could appear as an OSError."""
     if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
         yield
         return
@@ -126,7 +126,7 @@ def load_config(directory: str | Path) -> DictConfig:
     """Reads the configuration of a run.
 
     Raises:
-        FileNotFoundError: if the folder is not a run's.
+        FileNotFoundError: if the folder is not the folder of a run.
     """
     saved = Path(directory) / "config.yaml"
     if not saved.exists():
@@ -142,5 +142,5 @@ def keeps_best(cfg: DictConfig) -> bool:
 
 
 def checkpoint_folder(directory: str | Path, name: str) -> Path:
-    """The folder of a method's checkpoints."""
+    """Returns the folder of a method's checkpoints."""
     return Path(directory) / "checkpoints" / name.lower().replace(" ", "_")

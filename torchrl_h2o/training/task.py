@@ -1,4 +1,4 @@
-"""A training task: the real system, the imperfect simulator, and where real data come from."""
+"""A training task: the real system, the imperfect simulator, and the source of the real data."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Task:
     task is built, not in the worker.
 
     Args:
-        config: the ``env`` section of a configuration, resolved: ``name``, ``make`` (what builds one env),
+        config: the resolved ``env`` section of a configuration: ``name``, ``make`` (target and arguments of one env),
             ``seconds_per_step``, and optionally ``batched``, ``reward``, ``columns``, ``behaviour``, ``recording``.
         reality: effects of the target dynamics P.
-        simulator: effects of the simulator P̂, with the dynamics gap and the repair, if any.
-        gap: name of the paper's dynamics gap in the simulator, None without one.
+        simulator: effects of the simulator P̂, including the dynamics gap and the correction by ``gap_fix``, if any.
+        gap: name of the paper's dynamics gap in the simulator, or None.
     """
 
     config: Mapping[str, Any]
@@ -42,17 +42,17 @@ class Task:
     def from_config(
         cls, env: DictConfig, *, gap: str | None = None, gap_strength: float | None = None, gap_fix: str | None = None
     ) -> Task:
-        """Builds the task that a configuration describes.
+        """Builds a task from a configuration.
 
         Args:
             env: the ``env`` section of the configuration.
             gap: name of one of the paper's dynamics gaps, for the simulator.
-            gap_strength: of the gap; the paper's by default.
+            gap_strength: strength of the gap. Defaults to the paper's value.
             gap_fix: path of a ``report.json``, whose effects are added to the simulator after all others.
 
         Raises:
             ValueError: for an unknown gap, or a report without effects.
-            torchrl_h2o.data.DataError: for a report that cannot be read.
+            torchrl_h2o.data.DataError: if the report cannot be read.
         """
         simulator = [instantiate(effect) for effect in env.simulator]
         if gap is not None:
@@ -74,7 +74,7 @@ class Task:
 
     @property
     def max_episode_steps(self) -> int | None:
-        """Time limit of an episode in control steps; None for the environment's own."""
+        """Time limit of an episode in control steps; None if the configuration sets none."""
         return self.config["make"].get("max_episode_steps")
 
     def make_reality(
@@ -83,9 +83,9 @@ class Task:
         """Builds an environment with the target dynamics P.
 
         Args:
-            num_worlds: N for a batched env ``[N]``; None for one env ``[]``. A task that cannot be stepped in batches
-                gives one env in both cases.
-            preprocessing: how observations are shown to the learner; None leaves them in their own units.
+            num_worlds: N for a batched env ``[N]``; None for one env ``[]``. A task that does not support batches
+                gives one env ``[]`` in both cases.
+            preprocessing: preprocessing of the observations; None leaves them in physical units.
             **kwargs: further arguments of the env, such as ``render_mode``.
         """
         return self._make(self.reality, num_worlds, preprocessing, kwargs)

@@ -12,7 +12,7 @@ from torchrl_h2o.training.run_folder import checkpoint_folder, keeps_best
 
 
 def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") -> torch.nn.Module:
-    """Load the policy of a method's last checkpoint: the last one, or the best in the simulator if ``keep`` asks so.
+    """Load a policy from a method's last checkpoint: the last policy, or with ``keep=best_in_simulator`` the best one.
 
     Args:
         cfg: the run's configuration.
@@ -28,7 +28,9 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
         raise FileNotFoundError(f"{directory} has no checkpoint of {method!r}; it has {present or 'none'}")
     env = make_reality(cfg)
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
-    has_best = "policy" in Checkpoint.manifest(latest)["components"]  # offline methods have no simulator to rank in
+    has_best = (
+        "policy" in Checkpoint.manifest(latest)["components"]
+    )  # offline methods have none, as they use no simulator
     chosen = "policy" if keeps_best(cfg) and has_best else "actor"
     Checkpoint(**{chosen: actor}).load(latest)
     return actor

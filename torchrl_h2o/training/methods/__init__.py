@@ -1,4 +1,4 @@
-"""The methods of the paper's comparison, and two more, by name."""
+"""The six methods of the paper's comparison and two further ones, by name."""
 
 from torchrl_h2o.training.loop import Method
 from torchrl_h2o.training.methods.cql import CQL

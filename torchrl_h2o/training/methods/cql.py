@@ -1,4 +1,4 @@
-"""CQL on the real data only, with TorchRL's own loss. It has no simulator, so no dynamics gap affects it."""
+"""CQL on the real data only, with TorchRL's loss. It uses no simulator, so the dynamics gap does not affect it."""
 
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -14,8 +14,8 @@ from torchrl_h2o.training.loop import Method
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's loss on batches of real rows.
 
-    The loss draws its random actions from [-1, 1]. Actions are therefore scaled by their bounds, and the loss trains a
-    policy on [-1, 1] that shares the actor's network.
+    The loss draws its random actions from [-1, 1]. Actions are therefore scaled from their bounds to [-1, 1], and the
+    loss trains a policy with that range which shares the actor's network.
     """
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     unit_spec = Bounded(-1.0, 1.0, action_spec.shape)
@@ -42,7 +42,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         replay,
         sizes,
         terms_of,
-        pays_to_compile=False,  # matrix products of thousands of actions dominate its time
+        pays_to_compile=False,  # matrix products over thousands of actions take most of the time
     )
 
 

@@ -1,4 +1,4 @@
-"""H2O: SAC on both streams with the dynamics ratio as weight, and lower Q where the simulator is wrong."""
+"""H2O: SAC on both streams, weighted by the dynamics ratio, plus a term that lowers Q where the simulator is wrong."""
 
 import torch
 from omegaconf import DictConfig
@@ -41,7 +41,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
 
     def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
         ratio_losses = ratio_loss(pairs)
-        simulated = divergence(estimator(batch[num_real:]))  # Eq. (9), and ω before it is normalised
+        simulated = divergence(estimator(batch[num_real:]))  # the ratio of Eq. (9), and ω before normalisation
         for key in ("dynamics_ratio", "dynamics_divergence"):
             batch[key] = pad(simulated[key], (num_real, 0), value=1.0)
         return {**loss(batch), **ratio_losses}

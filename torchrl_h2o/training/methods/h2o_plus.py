@@ -1,4 +1,4 @@
-"""H2O+: the mixed Bellman update on both streams, simulated rows weighted by the dynamics ratio."""
+"""H2O+: the mixed Bellman update on both streams, with simulated rows weighted by the dynamics ratio."""
 
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -57,7 +57,7 @@ H2O_PLUS = Method("H2O+", make_learner)
 
 
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
-    """Build the backbone that ``cfg.backbone`` names.
+    """Build the value loss given by ``cfg.backbone``.
 
     Raises:
         ValueError: for an unknown name.

@@ -1,4 +1,4 @@
-"""IQL on the real data only, with TorchRL's own loss. It has no simulator, so no dynamics gap affects it."""
+"""IQL on the real data only, with TorchRL's loss. It uses no simulator, so the dynamics gap does not affect it."""
 
 from omegaconf import DictConfig
 from torchrl.data import TensorSpec

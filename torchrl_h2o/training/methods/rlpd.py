@@ -1,4 +1,4 @@
-"""RLPD: SAC on real and simulated rows in equal parts. H2O+ without V and without the dynamics ratio."""
+"""RLPD: SAC on real and simulated rows in equal parts, which equals H2O+ without V and without the dynamics ratio."""
 
 from omegaconf import DictConfig
 from torchrl.data import TensorSpec
@@ -11,7 +11,7 @@ from torchrl_h2o.training.loop import Method
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
-    """Build SAC with its target on both streams, Eq. (6)."""
+    """Build SAC on both streams, with the target of Eq. (6)."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     loss = H2OPlusLoss(MixedBellmanLoss(actor, qvalues, mixing=0.0), target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)

@@ -1,4 +1,4 @@
-"""SAC in the simulator only, with TorchRL's own loss: zero-shot transfer."""
+"""SAC in the simulator only, with TorchRL's loss: zero-shot transfer to reality."""
 
 from omegaconf import DictConfig
 from torchrl.data import TensorSpec

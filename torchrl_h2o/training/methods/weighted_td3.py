@@ -1,7 +1,7 @@
 """TD3 on real and simulated rows: TorchRL's loss, with simulated rows weighted by the dynamics ratio.
 
-Only the Bellman error is weighted. The policy is that of the other methods: TD3 uses its mean, and collects in the
-simulator with its initial standard deviation. The policy is updated at every step, not at every second one.
+Only the Bellman error is weighted. The policy network is the same as for the other methods: TD3 trains its mean, and
+the simulator is explored with its initial standard deviation. The policy is updated at every step, not at every second.
 """
 
 from omegaconf import DictConfig

@@ -1,4 +1,4 @@
-"""A population of H2O+ runs: trained at once, then evaluated one by one, each with files in its own folder."""
+"""A population of H2O+ runs: trained together, then evaluated one by one, each with files in its own folder."""
 
 import time
 from pathlib import Path
@@ -15,15 +15,15 @@ from torchrl_h2o.training.real_data import RECORDED, behaviour_of
 
 
 def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: Path) -> None:
-    """Trains all members at once, evaluates each, and writes each one's files; without baselines and films.
+    """Trains all members together, evaluates each, and writes the files of each, without films.
 
     Args:
         cfg: the configuration that the members share.
-        members: their own configurations, by name.
+        members: the configuration of each member, by name.
         directory: the population's folder.
 
     Raises:
-        ValueError: for another method than H2O+, or with baselines.
+        ValueError: for any method except H2O+, or for baselines.
     """
     if cfg.method != "h2o_plus" or cfg.baselines:
         raise ValueError(
@@ -34,7 +34,7 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
     for own in members.values():
         task_of(own).make_simulator()  # fails before the data are loaded if a gap does not fit the model
     real = prepare(cfg, directory)
-    members = members_of(cfg)  # again, as the observations' normalisation is known now
+    members = members_of(cfg)  # again, because ``prepare`` has added the normalisation of the observations
     wall_s = time.perf_counter() - start
     outcomes = train_population(make_learner, cfg, members, real, directory)
     behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)

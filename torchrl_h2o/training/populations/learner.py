@@ -1,4 +1,4 @@
-"""One update of many runs at once: batches, losses, one optimiser step, one step of all targets."""
+"""One update of many runs together: batches, losses, one optimiser step, one update of all target networks."""
 
 from collections.abc import Sequence
 
@@ -13,16 +13,16 @@ from torchrl_h2o.training.populations.replay import PopulationReplay
 
 
 class PopulationLearner:
-    """The learners of N runs as one; a member whose losses stop being finite is stopped.
+    """The learners of N runs as one. A member is stopped when its losses or parameters are no longer finite.
 
-    On a CPU each member draws from a random stream of its own, in the order in which a single run draws. On a GPU that
-    would take a thousand small kernels per update, so there all draw from torch's global generator, in a few calls.
+    On a CPU each member draws from its own random stream, in the order of a single run. On a GPU that would take a
+    thousand small kernels per update, so all members draw from torch's global generator, in a few calls.
 
     Args:
-        learners: one per member. Their own optimisers and target updaters stay unused.
+        learners: one per member. Their individual optimisers and target updaters are not used.
         replay: the members' data.
-        lr: of Adam.
-        tau: of the target networks.
+        lr: learning rate of Adam.
+        tau: weight of the online networks in an update of the target networks.
         capturable: whether a CUDA graph may capture the optimiser's step.
     """
 
@@ -40,12 +40,12 @@ class PopulationLearner:
         self._batches: list[TensorDictBase] = []
 
     def start_stream(self, number: int) -> None:
-        """Set a member's stream to the state of torch's global generator."""
+        """Copy the state of torch's global generator to a member's random stream."""
         if self.generators is not None:
             self.generators[number].set_state(torch.get_rng_state())
 
     def update(self) -> dict[str, Tensor]:
-        """Make one update and return each term of each member, ``[N]``."""
+        """Make one update and return the terms by name, ``[N]`` each."""
         terms = self.differentiate()
         healthy = total_loss(terms).isfinite()
         if not healthy.all():
@@ -57,21 +57,21 @@ class PopulationLearner:
         return terms
 
     def differentiate(self) -> dict[str, Tensor]:
-        """Make the first half of an update: losses and gradients."""
+        """Make the first half of an update: compute losses and gradients."""
         self._batches = self.sample()
         noise = self.population.draw(*self._batches, generators=self.generators)
         terms = self.losses_of(*self._batches, noise=noise)
         self.optimiser.zero_grad()
-        total_loss(terms).sum().backward()  # no member's loss depends on another's parameters
+        total_loss(terms).sum().backward()  # a member's loss depends on its own parameters only
         return terms
 
     def step(self) -> None:
-        """Make the second half of an update: the optimiser's step and the targets'."""
+        """Make the second half of an update: the optimiser's step and the update of the target networks."""
         self.optimiser.step()
         self.population.move_targets(self.tau)
 
     def check_parameters(self) -> None:
-        """Stop members whose parameters are not finite, before their next losses show it."""
+        """Record members whose parameters are not finite as failed, without waiting for their next losses."""
         self._note_failures(self.population.finite(), {})
 
     def batches_of(self, number: int) -> list[TensorDictBase]:

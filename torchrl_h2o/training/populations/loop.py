@@ -1,8 +1,8 @@
 """Many runs in one process: every combination of ``seeds``, ``gaps`` and ``mixings``, stacked and trained together.
 
-Each member has its own simulator, buffer and random stream, and draws from it in the order of a single run. So on a CPU
-it follows that run, to rounding. A member whose losses stop being finite is stopped: its networks are kept, it is
-neither simulated nor evaluated, and the others are not affected.
+Each member has its own simulator, buffer and random stream, and draws from the stream in the order of a single run. On
+a CPU its results therefore equal that run's, up to rounding. A member is stopped when its losses or parameters are no
+longer finite: its networks are no longer changed, simulated or evaluated. The other members are not affected.
 """
 
 from contextlib import ExitStack
@@ -32,7 +32,7 @@ def members_of(cfg: DictConfig) -> dict[str, DictConfig]:
     """Build the configuration of each member, by name such as ``seed_0_gravity``; empty for a single run.
 
     Raises:
-        ValueError: if a swept setting is not a list, is empty, or names a member twice.
+        ValueError: if a swept setting is not a list, is empty, or has a value twice.
     """
     swept = {one: _listed(cfg, many) for many, one in SWEPT.items() if cfg.get(many) is not None}
     members = {}
@@ -62,12 +62,12 @@ class Outcome:
     """Result of a member.
 
     Args:
-        policy: the policy that ``keep`` selects.
-        rows: its metrics, one row per evaluation.
-        updates: number of updates it made.
-        updates_per_second: of each member.
-        seconds: duration of the whole population's training.
-        failure: the number of updates after which it stopped, and the reason; or None.
+        policy: the policy selected by ``keep``.
+        rows: metrics, one row per evaluation.
+        updates: number of updates that the member made.
+        updates_per_second: updates per second of each member.
+        seconds: duration of the whole population's training, in s.
+        failure: the number of updates after which the member stopped, and the reason; None if it did not stop.
     """
 
     policy: torch.nn.Module
@@ -79,7 +79,7 @@ class Outcome:
 
 
 class PopulationTraining(Training):
-    """Epochs and checkpoints of a population, with each member's metrics in a folder of its own."""
+    """Epochs and checkpoints of a population, with the metrics of each member in the member's folder."""
 
     def rows_of(self, member: str) -> list[dict]:
         return [{k: v for k, v in row.items() if k != "member"} for row in self.rows if row["member"] == member]
@@ -90,14 +90,14 @@ class PopulationTraining(Training):
         write_metrics(self.directory / member, self.name, self.rows_of(member))
 
     def note_failure(self, member: str, failure: dict) -> None:
-        """Report once that a member has stopped, and store it in the checkpoints."""
+        """Write a message when a member stops, once, and store the failure for the checkpoints."""
         if member not in self.failures:
             self.failures[member] = failure
             tqdm.write(f"{member} stopped after {failure['updates']} updates: {failure['why']}; the others go on")
 
     @property
     def failures(self) -> dict[str, dict]:
-        """For each stopped member, the number of updates it made and the reason."""
+        """By stopped member: the number of updates that it made, and the reason."""
         return self.progress.setdefault("failures", {})
 
 
@@ -109,12 +109,12 @@ def train_population(
     Args:
         make_learner: builds the learner of one run.
         cfg: the settings that the members share.
-        members: their configurations, by name.
-        real: the measured transitions.
-        directory: the population's folder. Each member gets a folder in it, like a single run's.
+        members: the configuration of each member, by name.
+        real: the measured transitions, ``[T]``.
+        directory: the population's folder. Each member gets a folder in it, like the folder of a single run.
 
     Returns:
-        Each member's result, by name.
+        The result of each member, by name.
     """
     for name, own in members.items():
         (directory / name).mkdir(parents=True, exist_ok=True)
@@ -127,7 +127,7 @@ def train_population(
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)
     }
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    # On a CPU compiled stacks are slower.
+    # pays=False: on a CPU, compiled losses of stacked networks are slower.
     learner.losses_of = maybe_compiled(learner.losses_of, cfg.get("compiled", False), cfg.updates, pays=False)
     budget = Budget.from_config(cfg)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
@@ -160,7 +160,7 @@ def train_population(
 
 
 def _components(trainees: dict[str, Trainee], learner: PopulationLearner) -> dict:
-    """Collect what a checkpoint holds: the members' components and the shared optimiser."""
+    """Collect the contents of a checkpoint: the members' components and the shared optimiser."""
     parts = {
         f"{name}_{part}": component
         for name, trainee in trainees.items()
@@ -171,7 +171,7 @@ def _components(trainees: dict[str, Trainee], learner: PopulationLearner) -> dic
 
 
 def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outcome:
-    """Build a member's result, and save its policy in its folder for evaluate.py."""
+    """Build a member's result, and save its policy in the member's folder for evaluate.py."""
     policies = {key: trainee.components[key] for key in ("actor", "policy") if key in trainee.components}
     rotation = CheckpointRotation(checkpoint_folder(training.directory / name, training.name), keep_last=1)
     failure = training.failures.get(name)

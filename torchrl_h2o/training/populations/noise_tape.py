@@ -1,7 +1,7 @@
-"""Record which random numbers a forward draws, and play given ones back to it.
+"""Record the random draws of a forward pass, and replace them by given numbers.
 
-``vmap`` over members has one random stream for all. So that each member draws from its own, the draws of one forward
-are recorded once, made for each member outside of ``vmap``, and played back inside.
+``vmap`` uses one random stream for all members. To give each member its own stream, the draws of one forward pass are
+recorded once (kind, shape, type). The numbers are then drawn for each member outside of ``vmap`` and played back in it.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _ADVICE = "Population supplies normal and uniform numbers only; train such membe
 
 @dataclass(frozen=True)
 class Draw:
-    """One draw of a forward.
+    """One random draw of a forward pass.
 
     Args:
         kind: ``"normal"`` (mean 0, standard deviation 1) or ``"uniform"`` (0 to 1).
-        shape: of a member's numbers.
-        dtype: of the numbers.
-        device: of the numbers.
+        shape: shape of one member's numbers.
+        dtype: type of the numbers.
+        device: device of the numbers.
     """
 
     kind: str
@@ -36,14 +36,14 @@ class Draw:
     device: torch.device
 
     def make(self, generator: torch.Generator | None = None, *, members: Sequence[int] = ()) -> Tensor:
-        """Draw the numbers, ``[*members, *shape]``; from torch's global generator if none is given."""
+        """Draw the numbers, ``[*members, *shape]``, from a generator; torch's global generator by default."""
         numbers = torch.empty((*members, *self.shape), dtype=self.dtype, device=self.device)
         return numbers.normal_(generator=generator) if self.kind == "normal" else numbers.uniform_(generator=generator)
 
 
 @dataclass
 class Tape:
-    """Numbers to be played back, in the order in which the forward asks for them."""
+    """Numbers to be played back, in the order of the draws in the forward pass."""
 
     numbers: Sequence[Tensor] = ()
     position: int = field(default=0)
@@ -52,7 +52,7 @@ class Tape:
         """Return the next draw's numbers.
 
         Raises:
-            RuntimeError: if the forward draws more often than when it was recorded.
+            RuntimeError: if the forward pass makes more draws than when it was recorded.
         """
         if self.position >= len(self.numbers):
             raise RuntimeError("a member's forward draws more random numbers than when it was recorded: " + _ADVICE)
@@ -61,7 +61,10 @@ class Tape:
 
 
 class Playback(TorchFunctionMode):
-    """Answers a forward's draws from a tape. Keep one instance: a compiled forward must find it, not make it."""
+    """Replaces the draws of a forward pass by the numbers of a tape.
+
+    Create the instance before compilation and keep it, because a compiled forward pass cannot create one.
+    """
 
     def __init__(self, tape: Tape) -> None:
         super().__init__()
@@ -77,11 +80,11 @@ class Playback(TorchFunctionMode):
 
 
 class Recording(TorchFunctionMode):
-    """Notes a forward's draws in ``draws``.
+    """Records the draws of a forward pass in ``draws``.
 
     Raises:
-        NotImplementedError: for random functions that cannot be played back, such as dropout, and for tensors that
-            are filled with random numbers in place and read under another name.
+        NotImplementedError: for random functions that cannot be played back, such as dropout, and for a tensor that
+            is filled with random numbers in place and then read through another reference.
     """
 
     def __init__(self, devices: Sequence[torch.device]) -> None:
@@ -115,11 +118,11 @@ class Recording(TorchFunctionMode):
 
 
 def record(forward: Callable[[], object], devices: Sequence[torch.device] = ()) -> list[Draw]:
-    """Run a forward once without gradients and return its draws; torch's random state stays as it was.
+    """Run a forward pass once without gradients and return its draws; torch's random state is restored.
 
     Args:
-        forward: without arguments.
-        devices: whose random states are watched and restored, beside the CPU's.
+        forward: function without arguments.
+        devices: devices whose random states are watched and restored, in addition to the CPU's.
     """
     recording = Recording(devices)
     indices = [device for device in devices if device.type == "cuda"]
@@ -134,7 +137,7 @@ def _refuse_own_generator(kwargs: dict) -> None:
 
 
 def _scaled_normal(func: Callable, numbers: Tensor, args: tuple, kwargs: dict) -> Tensor:
-    """Give standard normal numbers the mean and standard deviation that the call asks for."""
+    """Scale standard normal numbers to the mean and standard deviation in the arguments of the call."""
     if func is torch.Tensor.normal_:
         args = args[1:]
     elif func is not torch.normal:
@@ -147,7 +150,7 @@ def _scaled_normal(func: Callable, numbers: Tensor, args: tuple, kwargs: dict) -
 
 
 def _scaled_uniform(func: Callable, numbers: Tensor, args: tuple, kwargs: dict) -> Tensor:
-    """Give uniform numbers the bounds that the call asks for."""
+    """Scale uniform numbers to the bounds in the arguments of the call."""
     if func is not torch.Tensor.uniform_:
         return numbers
     low = args[1] if len(args) > 1 else kwargs.get("from", 0.0)

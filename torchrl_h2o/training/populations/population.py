@@ -1,6 +1,7 @@
-"""Many runs as one: their parameters stacked, all losses computed in one call, one optimiser for all.
+"""Many runs as one: stacked parameters, all losses computed in one call, one optimiser.
 
-Small networks leave a device idle between kernels. N of them, stacked, are a few large products instead.
+With small networks a device is idle between kernels. Stacking N networks replaces many small products by few large
+ones.
 """
 
 from __future__ import annotations
@@ -21,15 +22,16 @@ Stackable = TensorDictParams | Tensor
 class Population(nn.Module):
     """The losses of N runs, evaluated together by ``torch.vmap`` over their stacked parameters and buffers.
 
-    Every tensor of a member is stacked: networks, targets, β, λ, γ. These may differ between members. Everything else
-    (widths, backbone, whether there is a ratio) is taken from the first member and must be the same in all.
+    All tensors of the members are stacked: networks, target networks, β, λ, γ. These may differ between members. All
+    other settings (layer widths, backbone, use of the ratio) are taken from the first member and must be equal in all.
 
-    The members stay usable: their own parameters become views of the stack, so a member's policy always acts with
-    the population's current parameters, and a checkpoint of the members is one of the population. Move members to
-    their device before. Only the stack has gradients, so build the optimiser from the population's parameters.
+    The members stay usable: their parameters become views of the stack. A member's policy therefore always uses the
+    population's current parameters, and a checkpoint of the members is a checkpoint of the population. Move members to
+    their device before they are stacked. Only the stack has gradients, so build the optimiser from the population's
+    parameters.
 
-    Random numbers are drawn outside of ``vmap``, see :meth:`draw`, so that each member can have a stream of its own.
-    Supported are losses and networks that draw normal or uniform numbers. Not supported, and refused with an error:
+    Random numbers are drawn outside of ``vmap``, see :meth:`draw`, so that each member can have its own stream. Losses
+    and networks may draw normal and uniform numbers. The following are not supported and raise an error:
 
     - other random functions, such as dropout or random permutations;
     - draws or branches that depend on data or parameters;
@@ -38,11 +40,11 @@ class Population(nn.Module):
     Buffers that a forward changes, such as the running means of batch normalisation, are not written back.
 
     Args:
-        members (sequence of nn.Module): one per run, a loss such as :class:`~torchrl_h2o.objectives.H2OPlusLoss` or
-            TorchRL's ``SACLoss``, or a module that holds several; ``forward(*batches)`` returns the terms by name.
+        members (sequence of nn.Module): one per run: a loss such as :class:`~torchrl_h2o.objectives.H2OPlusLoss` or
+            TorchRL's ``SACLoss``, or a module with several losses. ``forward(*batches)`` returns the terms by name.
 
     Raises:
-        ValueError: for no members, or members of unequal shapes.
+        ValueError: if there are no members, or their tensors differ in shape.
 
     Examples:
         >>> import torch
@@ -72,9 +74,9 @@ class Population(nn.Module):
         super().__init__()
         if not members:
             raise ValueError("a population needs at least one member.")
-        self.members = tuple(members)  # a tuple, so that their parameters do not count twice
+        self.members = tuple(members)  # a tuple, so that nn.Module does not register their parameters
         for member in members:
-            member.state_dict()  # TorchRL's losses make some buffers at the first access
+            member.state_dict()  # TorchRL's losses create some buffers at the first access
         own = [_tensors(member) for member in members]
         self._paths = list(own[0])
         for number, tensors in enumerate(own):
@@ -98,14 +100,14 @@ class Population(nn.Module):
 
         Args:
             *batches: as of :meth:`forward`.
-            generators: one per member, which then gets the numbers that a single run draws with it. Without them all
-                members draw from torch's global generator, in one call per draw.
+            generators: one per member; each member then gets the numbers that a single run draws with this generator.
+                By default all members draw from torch's global generator, in one call per draw.
 
         Returns:
             The numbers of each draw, ``[N, *shape]``.
 
         Raises:
-            NotImplementedError: for random functions that cannot be supplied from outside, such as dropout.
+            NotImplementedError: for random functions whose numbers cannot be supplied, such as dropout.
         """
         draws = self._recorded(batches)
         if generators is None:
@@ -114,7 +116,7 @@ class Population(nn.Module):
         return tuple(torch.stack(same) for same in zip(*of_each, strict=True))
 
     def _recorded(self, batches: Sequence[TensorDictBase]) -> list[Draw]:
-        """The draws of the first member's forward, recorded once per shape of the batches and training mode."""
+        """Draws of the first member's forward pass, recorded once per batch shapes and training mode."""
         modes = tuple(module.training for module in self.members[0].modules())
         key = (tuple(batch.batch_size for batch in batches), modes)
         if key not in self._draws:
@@ -125,15 +127,15 @@ class Population(nn.Module):
         return self._draws[key]
 
     def forward(self, *batches: TensorDictBase, noise: Sequence[Tensor] | None = None) -> dict[str, Tensor]:
-        """Compute every member's terms on its own batches.
+        """Compute the terms of each member on the member's batches.
 
         Args:
-            *batches: inputs of a member's forward, stacked, ``[N, *B]``.
-            noise: random numbers, from :meth:`draw`. Without it they are drawn from torch's global generator; a
-                compiled population needs it.
+            *batches: stacked inputs of the members' forward passes, ``[N, *B]``.
+            noise: random numbers from :meth:`draw`, required for a compiled population. By default they are drawn from
+                torch's global generator.
 
         Returns:
-            The terms of a member's forward, ``[N]`` or, of losses with ``reduction="none"``, ``[N, *B]``.
+            The terms by name, ``[N]`` each; for losses with ``reduction="none"``, ``[N, *B]``.
         """
         noise = self.draw(*batches) if noise is None else noise
         return torch.vmap(self._terms_of_one)(self.stacked, tuple(noise), *batches)
@@ -155,7 +157,7 @@ class Population(nn.Module):
 
     @torch.no_grad()
     def move_targets(self, tau: float) -> None:
-        """Move each member's target networks as ``SoftUpdate(loss, tau=tau).step()`` does.
+        """Update the target networks of each member, as ``SoftUpdate(loss, tau=tau).step()`` does.
 
         Args:
             tau: weight of the online networks.
@@ -164,20 +166,22 @@ class Population(nn.Module):
             *owner, name = path
             if name.startswith("target_") and name.endswith("_params"):
                 source = self.stacked.get((*owner, name.removeprefix("target_")))
-                self.stacked.get(path).data.lerp_(source.data, 1.0 - (1.0 - tau))  # SoftUpdate's own rounding
+                self.stacked.get(path).data.lerp_(source.data, 1.0 - (1.0 - tau))  # rounds like SoftUpdate
 
     def finite(self) -> Tensor:
-        """Whether all of a member's parameters are finite numbers, ``[N]``."""
+        """Whether all parameters of a member are finite, ``[N]``."""
         leaves = [leaf.detach().isfinite().reshape(len(self), -1).all(1) for leaf in self.parameters()]
         return torch.stack(leaves).all(0)
 
     @torch.no_grad()
     def stop(self, number: int, optimiser: torch.optim.Adam) -> None:
-        """Make the optimiser's next step leave a member unchanged. Call it before every step.
+        """Zero a member's gradients and momentum, so that the optimiser's next step does not change the member.
+
+        Call it before every step.
 
         Args:
             number: index of the member.
-            optimiser: the population's, without weight decay.
+            optimiser: the population's optimiser, without weight decay.
         """
         for parameter in self.parameters():
             if parameter.grad is not None:
@@ -188,7 +192,7 @@ class Population(nn.Module):
 
 
 def _tensors(member: nn.Module) -> dict[tuple[str, ...], Stackable]:
-    """Every tensor that a member holds, by each path to it; those of a network stay together."""
+    """All tensors of a member, by every path to them; the tensors of one network stay in one tensordict."""
     tensors: dict[tuple[str, ...], Stackable] = {}
     for name, module in member.named_modules(remove_duplicate=False):  # a shared network has several paths
         path = tuple(name.split(".")) if name else ()
@@ -213,11 +217,11 @@ def _check_alike(number: int, tensors: dict, first: dict) -> None:
 
 
 def _stack(held: list[Stackable], stacks: dict[int, Tensor]) -> TensorDictBase | Tensor:
-    """Stack the members' tensors; parameters stay parameters, and a tensor that is shared gets one stack.
+    """Stack the same tensor or network of all members. Parameters stay parameters; a shared tensor gets one stack.
 
     Args:
-        held: the same tensors or networks of each member.
-        stacks: the stacks so far, by the identity of the first member's tensor.
+        held: the tensor or network of each member.
+        stacks: the stacks so far, by ``id`` of the first member's tensor.
     """
 
     def one(*tensors: Tensor) -> Tensor:
@@ -235,7 +239,7 @@ def _stack(held: list[Stackable], stacks: dict[int, Tensor]) -> TensorDictBase |
 
 
 def _look_into(held: Stackable, stack: TensorDictBase | Tensor, number: int) -> None:
-    """Make a member's own tensors views of the stack."""
+    """Replace a member's tensors by views of the stack."""
     if isinstance(held, Tensor):
         held.data = stack.data[number]
         return
@@ -248,7 +252,7 @@ def _look_into(held: Stackable, stack: TensorDictBase | Tensor, number: int) -> 
 
 @contextmanager
 def _in_place_of_own(member: nn.Module, tensors: dict[tuple[str, ...], TensorDictBase | Tensor]) -> Iterator[nn.Module]:
-    """Give a member other tensors: an attribute of the instance hides the registered one of the same name."""
+    """Replace a member's tensors: an instance attribute hides the registered parameter or buffer of the same name."""
     owners = {path: member.get_submodule(".".join(path[:-1])) for path in tensors}
     for path, value in tensors.items():
         owners[path].__dict__[path[-1]] = value
@@ -257,12 +261,12 @@ def _in_place_of_own(member: nn.Module, tensors: dict[tuple[str, ...], TensorDic
             yield member
     finally:
         for path, owner in owners.items():
-            owner.__dict__.pop(path[-1], None)  # a shared network's owner may be listed twice
+            owner.__dict__.pop(path[-1], None)  # the module of a shared network may occur twice
 
 
 @contextmanager
 def _without_caches(member: nn.Module) -> Iterator[None]:
-    """Empty what TorchRL's losses cache of their parameters, before and after the parameters are exchanged."""
+    """Clear the parameter caches of TorchRL's losses before and after the block, in which parameters are replaced."""
     cached = [module for module in member.modules() if isinstance(module, LossModule)]
     for module in cached:
         module.__dict__["_cache"] = {}

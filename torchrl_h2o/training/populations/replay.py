@@ -1,7 +1,7 @@
-"""Replay buffers of many runs on the same real data, sampled in one call.
+"""Replay buffers of many runs with the same real data, sampled in one call.
 
-Each run has its own ``HybridReplayBuffer``. The simulated rows of all runs share one piece of memory, so one index
-operation gathers the batches of all of them.
+Each run has its own ``HybridReplayBuffer``. The simulated rows of all runs are stored in one tensor, so that one index
+operation gathers the batches of all runs.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ class PopulationReplay:
 
     Args:
         real: flat TED transitions, batch size [T], shared by all runs.
-        sim_capacity: simulated transitions that each run keeps.
+        sim_capacity: number of simulated transitions that each run stores.
         batch_size: (real, simulated) rows of a run's batch.
-        num_members: N.
+        num_members: number of runs, N.
         keys: the entries of a batch, as in :class:`HybridReplayBuffer`.
-        device: of the data and of the batches.
+        device: device of the data and of the batches.
 
     Attributes:
-        buffers: one per member, to be extended and saved separately.
+        buffers: one per member; they are extended and saved separately.
 
     Example:
         >>> import torch
@@ -39,7 +39,7 @@ class PopulationReplay:
         >>> replay.sample()["next", "reward"].shape
         torch.Size([3, 8, 1])
         >>> streams = [torch.Generator().manual_seed(seed) for seed in range(3)]
-        >>> batch = replay.sample(generators=streams)  # each row is what that member's buffer samples
+        >>> batch = replay.sample(generators=streams)  # row n equals a batch of buffers[n] with the same stream
     """
 
     def __init__(
@@ -71,13 +71,13 @@ class PopulationReplay:
         """Draw a batch for every member.
 
         Args:
-            batch_size: (real, simulated) rows of a member's batch, instead of the buffers' own.
-            generators: one per member, which then gets the rows that its own buffer draws with it. Without them all
-                members draw from torch's global generator, in one call.
+            batch_size: (real, simulated) rows of a member's batch. Defaults to the batch size of the buffers.
+            generators: one per member; each member then gets the rows that its buffer draws with this generator. By
+                default all members draw from torch's global generator, in one call.
 
         Returns:
-            TensorDict of batch size [N, real + simulated]: the buffers' entries, and ``real``, bool; the real rows
-            come first.
+            TensorDict of batch size [N, real + simulated] with the buffers' entries and the boolean ``real``. The real
+            rows come first.
         """
         n_real, n_sim = self.batch_size if batch_size is None else batch_size
         self._find_lengths(n_sim)
@@ -92,7 +92,7 @@ class PopulationReplay:
         return TensorDict(batch, batch_size=size, device=self.device)
 
     def _find_lengths(self, n_sim: int) -> None:
-        """Keep the buffers' lengths on the device, to avoid a synchronising copy for every batch."""
+        """Copy the buffers' lengths to the device if they changed, to avoid a synchronising copy for every batch."""
         lengths = [len(buffer.real) for buffer in self.buffers], [len(buffer.sim) for buffer in self.buffers]
         if n_sim and not all(lengths[1]):
             raise RuntimeError(
@@ -104,7 +104,7 @@ class PopulationReplay:
             self._lengths.copy_(torch.tensor(lengths)[..., None])
 
     def _draw(self, stream: int, count: int, generators: Sequence[torch.Generator] | None) -> torch.Tensor:
-        """Row numbers below each member's length, ``[N, count]``."""
+        """Draw row numbers below the length of each member's buffer, ``[N, count]``."""
         if generators is None:
             uniform = torch.rand(len(self.buffers), count, device=self.device, dtype=torch.double)
             return (uniform * self._lengths[stream]).long()
