@@ -161,8 +161,8 @@ class H2OPlusLoss(LossWrapper):
 
     def __getattr__(self, name: str) -> Any:
         reached = ("actor_network", "qvalue_network", "value_network", "log_alpha")
-        if name in reached and self._inside_if_set is not None:
-            return getattr(self._inside, name)
+        if name in reached and (inside := self._inside_if_set) is not None:
+            return getattr(inside, name)
         return super().__getattr__(name)
 
     def _read_keys(self) -> Iterable[NestedKey]:

@@ -116,6 +116,6 @@ class LossWrapper(HybridLoss):
         yield from ((name, module) for name, module in self._inside.named_children() if name.startswith("target_"))
 
     def __getattr__(self, name: str) -> Any:
-        if name.endswith("_params") and self._inside_if_set is not None:
-            return getattr(self._inside, name)
+        if name.endswith("_params") and (inside := self._inside_if_set) is not None:
+            return getattr(inside, name)
         return super().__getattr__(name)

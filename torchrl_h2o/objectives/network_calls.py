@@ -40,7 +40,7 @@ class NetworkCalls:
         """
         inputs, params = tensordict.select(*network.in_keys), params.detach() if frozen else params
         if params.ndim:
-            vmapped = cast(Callable[..., TensorDictBase], _vmap_func(network, (None, 0), randomness=randomness))
+            vmapped = cast("Callable[..., TensorDictBase]", _vmap_func(network, (None, 0), randomness=randomness))
             return vmapped(inputs, params)
         with params.to_module(network, preserve_module_state=False):
             return network(inputs)
