@@ -1,6 +1,7 @@
 """Loads the policy of a finished or interrupted run from its folder."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -29,6 +30,6 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
     env = make_reality(cfg)
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
     has_best = "policy" in Checkpoint.manifest(latest)["components"]  # offline methods have no simulator to rank in
-    chosen = "policy" if keeps_best(cfg) and has_best else "actor"
-    Checkpoint(**{chosen: actor}).load(latest)
+    component: dict[str, Any] = {"policy" if keeps_best(cfg) and has_best else "actor": actor}
+    Checkpoint(**component).load(latest)
     return actor
