@@ -6,6 +6,7 @@ Methods as in Agarwal et al., Deep Reinforcement Learning at the Edge of the Sta
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rliable import library, metrics
@@ -118,7 +119,8 @@ def _interval(runs: np.ndarray | tuple[np.ndarray, ...], statistic: Callable, re
     state = np.random.get_state()
     np.random.seed(seed)  # rliable ignores random_state and draws from the global generator
     try:
-        points, bounds = library.get_interval_estimates({"": runs}, statistic, reps=reps)
+        scores: Mapping[str, Any] = {"": runs}  # rliable accepts a tuple too, although it annotates a list
+        points, bounds = library.get_interval_estimates(scores, statistic, reps=reps)
     finally:
         np.random.set_state(state)
     return Interval(float(points[""][0]), *(float(bound) for bound in bounds[""][:, 0]))

@@ -10,6 +10,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from torchrl_h2o.comparison.aggregates import Interval
 from torchrl_h2o.comparison.scores import Row, Task, task_of
@@ -64,7 +66,7 @@ def _curves(rows: Sequence[Row]) -> dict[tuple[Task, str], dict[int, list[float]
     return curves
 
 
-def _draw_band(axis: plt.Axes, curve: Mapping[int, list[float]], title: str) -> None:
+def _draw_band(axis: Axes, curve: Mapping[int, list[float]], title: str) -> None:
     at = sorted(curve)
     colour = COLOURS.get(title)
     axis.plot(at, [np.mean(curve[x]) for x in at], color=colour, label=title, lw=1.5)
@@ -97,7 +99,7 @@ def draw_aggregates(
     _save(figure, path)
 
 
-def _draw_intervals(axis: plt.Axes, intervals: Mapping[str, Interval], titles: Mapping[str, str]) -> None:
+def _draw_intervals(axis: Axes, intervals: Mapping[str, Interval], titles: Mapping[str, str]) -> None:
     names = [name for name in titles if name in intervals][::-1]
     for height, name in enumerate(names):
         interval, colour = intervals[name], COLOURS.get(titles[name])
@@ -108,7 +110,7 @@ def _draw_intervals(axis: plt.Axes, intervals: Mapping[str, Interval], titles: M
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)

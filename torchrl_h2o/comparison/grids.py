@@ -6,6 +6,7 @@ The paper is H2O+, Niu et al. (2023), arXiv 2309.12716.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import product
+from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -49,7 +50,8 @@ class Grid:
             worlds = [*product(self.datasets, self.gaps, self.strengths), *product(self.tasks, (None,), (None,))]
             done = set()
             for (world, gap, strength), method, variant in product(worlds, self.methods, self.variants):
-                env, data = (world, None) if world in self.tasks else (env_of(world), world)
+                # chosen_grid has checked that data sets name an environment.
+                env, data = (world, None) if world in self.tasks else (cast(str, env_of(world)), world)
                 gap = None if method in OFFLINE else gap
                 overrides = _run(env, data, gap, strength, method, variant, seed)
                 if overrides is not None and tuple(overrides) not in done:

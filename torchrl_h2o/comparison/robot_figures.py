@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from torchrl_h2o.comparison.robot_trajectories import BINS, COMPARED, EVERY, SHOWN, spread_entropy
 from torchrl_h2o.envs.wheel_legged.env import TARGET_VELOCITY
@@ -65,7 +68,7 @@ def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray
     _save(figure, path)
 
 
-def _draw_episode(axis: plt.Axes, value: np.ndarray, limits: tuple[float, float], colour: str | None) -> None:
+def _draw_episode(axis: Axes, value: np.ndarray, limits: tuple[float, float], colour: str | None) -> None:
     t = EVERY * np.arange(1, len(value) + 1)
     axis.plot(t, value, color=colour, lw=1.0, alpha=0.6)
     stands = np.flatnonzero(~np.isnan(value))
@@ -83,7 +86,7 @@ def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]
     tasks = [task for task in SHOWN if any(key[0] == task for key in states)]
     size = {"figsize": (9, 3.6 * len(tasks)), "layout": "constrained", "squeeze": False}
     figure, axes = plt.subplots(len(tasks), len(COMPARED), sharex=True, sharey=True, **size)
-    most = max(sum(runs).max() for runs in states.values())
+    most = max(cast(np.ndarray, sum(runs)).max() for runs in states.values())
     for row, task in zip(axes, tasks, strict=True):
         for axis, method in zip(row, COMPARED, strict=True):
             runs = states.get((task, method), [])
@@ -100,7 +103,7 @@ def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]
     _save(figure, path)
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     plt.close(figure)

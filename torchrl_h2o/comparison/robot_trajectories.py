@@ -8,6 +8,7 @@ file, with ``-`` for empty columns.
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -81,7 +82,8 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns))
     replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     title = METHODS[cfg.method].title
-    Checkpoint(replay=replay).load(CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest())
+    latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
+    Checkpoint(replay=replay).load(cast(Path, latest))  # a run with a summary has one
     return _in_units(cfg, replay.sim[:]["observation"], ("theta", "theta_dot")).numpy()
 
 

@@ -1,5 +1,6 @@
 """Writes a group's table, learning curves and aggregate scores, with the paper's numbers for comparison."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from torchrl_h2o.comparison.aggregates import BASE, Scores, common_scores, improvements, interquartile_means
@@ -101,7 +102,7 @@ def aggregate_table(means: dict, better: dict) -> str:
     return "\n".join(lines)
 
 
-def paper_cells(rows: list[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
+def paper_cells(rows: Sequence[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
     """Format the paper's results for the tasks of a table, as text by task and method.
 
     Args:

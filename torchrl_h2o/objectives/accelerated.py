@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -86,12 +86,12 @@ class PerceptronCalls(NetworkCalls):
         return super().distribution(network, tensordict, params)
 
 
-def _layers(network: nn.Module) -> list[tuple[Path, nn.Module]] | None:
+def _layers(network: TensorDictModuleBase) -> list[tuple[Path, nn.Module]] | None:
     """Layers of a perceptron, each with the path to its parameters; None for any other network."""
     several = len(network.in_keys) > 1
     if type(network) not in _PLAIN or _is_hooked(network) or (several and type(network.module) is not MLP):
         return None
-    layers = list(_flat(network.module, ("module",)))
+    layers = list(_flat(cast(nn.Module, network.module), ("module",)))
     plain = all(_is_plain(layer) for _, layer in layers) and any(type(layer) is nn.Linear for _, layer in layers)
     return layers if plain else None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
@@ -17,6 +18,14 @@ from torchrl.objectives import ValueEstimators
 from torchrl_h2o.objectives.exploration import EntropyBonus
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, like_rows
 from torchrl_h2o.objectives.one_step import ValueType, one_step_discount
+
+if TYPE_CHECKING:
+
+    class _ScheduledBuffer:
+        """Type of a scalar buffer that TorchRL overwrites in place when a number is assigned to it."""
+
+        def __get__(self, instance: object, owner: type | None = None) -> Tensor: ...
+        def __set__(self, instance: object, value: float | Tensor) -> None: ...
 
 
 class MixedBellmanLoss(HybridLoss):
@@ -121,6 +130,10 @@ class MixedBellmanLoss(HybridLoss):
     value_network: TensorDictModule | None
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
+    exploration: TensorDictModuleBase
+    mixing: _ScheduledBuffer
+    gamma: _ScheduledBuffer
+    log_alpha: Tensor
 
     def __init__(
         self,
@@ -145,7 +158,9 @@ class MixedBellmanLoss(HybridLoss):
         self.tensor_keys.action = _action_key(actor_network)
         if isinstance(qvalue_network, Sequence):
             num_qvalue_nets = len(qvalue_network)
-        self.convert_to_functional(qvalue_network, "qvalue_network", num_qvalue_nets, create_target_params=True)
+        # TorchRL accepts a sequence of networks, although it annotates one.
+        qvalues = cast(TensorDictModule, qvalue_network)
+        self.convert_to_functional(qvalues, "qvalue_network", num_qvalue_nets, create_target_params=True)
         self.value_network = None
         if value_network is not None:
             self.convert_to_functional(value_network, "value_network")
@@ -227,17 +242,19 @@ class MixedBellmanLoss(HybridLoss):
         keys = self.tensor_keys
         next_states = tensordict.get("next")
         next_value = self._next_policy_value(next_states)
-        if self.value_network is not None:
-            next_value = self.mixing * self._next_value(next_states) + (1 - self.mixing) * next_value
+        value_network = self.value_network
+        if value_network is not None:
+            value = self._next_value(value_network, next_states)
+            next_value = self.mixing * value + (1 - self.mixing) * next_value
         reward = like_rows(self._entry(next_states, keys.reward), next_value)
         terminated = like_rows(self._entry(next_states, keys.terminated).bool(), next_value)
         steps = tensordict.get(keys.steps_to_next_obs, None)
         discount = self.gamma if steps is None else self.gamma ** like_rows(steps, next_value)
         return reward + discount * torch.where(terminated, 0.0, next_value)  # Eq. (7)
 
-    def _next_value(self, next_states: TensorDictBase) -> Tensor:
+    def _next_value(self, value_network: TensorDictModule, next_states: TensorDictBase) -> Tensor:
         """V(s') of the online value network, ``[*B]``."""
-        out = self.calls.outputs(self.value_network, next_states, self.value_network_params)
+        out = self.calls.outputs(value_network, next_states, self.value_network_params)
         return self._entry(out, self.tensor_keys.value).squeeze(-1)
 
     def _next_policy_value(self, next_states: TensorDictBase) -> Tensor:

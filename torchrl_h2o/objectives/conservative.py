@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -55,6 +56,11 @@ class DynamicsDivergence(TensorDictModuleBase):
         torch.Size([5])
     """
 
+    # TorchRL annotates these as lists of flat keys.
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
+    noise: Tensor
+
     def __init__(
         self,
         estimator: DynamicsRatioEstimator,
@@ -77,7 +83,7 @@ class DynamicsDivergence(TensorDictModuleBase):
         self.out_keys = list(out_keys)
         self._next_keys = [key for key in self.in_keys if key not in estimator.sa_network.in_keys]
 
-    @dispatch
+    @dispatch()
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = tensordict.select(*self.in_keys)
@@ -144,6 +150,7 @@ class ConservativeLoss(LossWrapper):
         dynamics_divergence: NestedKey = "dynamics_divergence"
 
     tensor_keys: _AcceptedKeys
+    loss: LossModule
 
     def __init__(self, loss: LossModule, alpha_c: float = 0.01) -> None:
         if not hasattr(loss, "qvalue_network"):
@@ -162,8 +169,9 @@ class ConservativeLoss(LossWrapper):
         return *self.loss.in_keys, self.tensor_keys.real
 
     def _optional_keys(self) -> Iterable[NestedKey]:
-        inside = self.loss._optional_keys() if hasattr(self.loss, "_optional_keys") else ()
-        return *inside, *super()._optional_keys(), self.tensor_keys.dynamics_divergence
+        inside: Any = self.loss
+        optional = inside._optional_keys() if hasattr(inside, "_optional_keys") else ()
+        return *optional, *super()._optional_keys(), self.tensor_keys.dynamics_divergence
 
     def _written_keys(self) -> Iterable[NestedKey]:
         return *self.loss.out_keys, "loss_conservative"
@@ -175,7 +183,7 @@ class ConservativeLoss(LossWrapper):
 
     def conservative_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Compute the first bracket of Eq. (1), times α_c, ``[]``."""
-        inside = self.loss
+        inside: Any = self.loss  # has a Q network, as the constructor checks
         out = self.calls.outputs(
             inside.qvalue_network, tensordict, inside.qvalue_network_params, inside.vmap_randomness
         )

@@ -31,6 +31,10 @@ class EntropyBonus(TensorDictModuleBase):
         tensor([ 1.0000, -0.5000])
     """
 
+    # TorchRL annotates these as lists of flat keys.
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
+
     def __init__(
         self,
         *,
@@ -42,7 +46,7 @@ class EntropyBonus(TensorDictModuleBase):
         self.in_keys = [log_prob, alpha]
         self.out_keys = [exploration_bonus]
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         log_prob, alpha = (tensordict.get(key) for key in self.in_keys)
         return tensordict.set(self.out_keys[0], -alpha * log_prob)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor, nn
 from torchrl.data import Composite
@@ -90,6 +91,7 @@ class H2OPlusLoss(LossWrapper):
     bellman_loss: MixedBellmanLoss
     value_loss: InSampleValueLoss | None
     ratio_loss: DynamicsRatioLoss | None
+    target_entropy: Tensor
 
     def __init__(
         self,
@@ -120,7 +122,7 @@ class H2OPlusLoss(LossWrapper):
             bellman_loss.log_alpha = nn.Parameter(log_alpha)
         if target_entropy == "auto":
             target_entropy = -float(_action_dim(bellman_loss.actor_network, self.tensor_keys.action))
-        self.register_coeff_buffer("target_entropy", target_entropy, dtype=bellman_loss.mixing.dtype)
+        self.register_coeff_buffer("target_entropy", cast(float, target_entropy), dtype=bellman_loss.mixing.dtype)
 
     @property
     def _parts(self) -> list[LossModule]:
@@ -159,9 +161,10 @@ class H2OPlusLoss(LossWrapper):
         """β, the weight of the entropy, as a constant, ``[]``."""
         return self.bellman_loss.alpha
 
-    def __getattr__(self, name: str):
-        if name in ("actor_network", "qvalue_network", "value_network", "log_alpha") and self._inside is not None:
-            return getattr(self._inside, name)
+    def __getattr__(self, name: str) -> Any:
+        reached = ("actor_network", "qvalue_network", "value_network", "log_alpha")
+        if name in reached and (inside := self._inside_if_set) is not None:
+            return getattr(inside, name)
         return super().__getattr__(name)
 
     def _read_keys(self) -> Iterable[NestedKey]:
@@ -202,7 +205,7 @@ class H2OPlusLoss(LossWrapper):
         ratio_terms = self._ratio_terms(batch, rows, pairs)
         loss_qvalue = bellman.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
-        value_terms = {} if self.value_loss is None else self._value_terms(batch, rows)
+        value_terms = self._value_terms(batch, rows)
         loss_actor, log_prob = self.actor_loss(batch, rows)
         terms = {
             "loss_actor": loss_actor,
@@ -239,8 +242,11 @@ class H2OPlusLoss(LossWrapper):
 
     def _value_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
         """Compute the loss of V, Eq. (4): regress V on the target Q at the actions in the data."""
-        batch.set(self.value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
-        return {"loss_value": self.value_loss.value_loss(batch, rows)}
+        value_loss = self.value_loss
+        if value_loss is None:
+            return {}
+        batch.set(value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
+        return {"loss_value": value_loss.value_loss(batch, rows)}
 
     @torch.no_grad()
     def _data_qvalue(self, batch: TensorDictBase) -> Tensor:
@@ -276,7 +282,7 @@ def _check_shared_value(bellman_loss: MixedBellmanLoss, value_loss: InSampleValu
         )
 
 
-def _are_shared(params: TensorDictParams, others: TensorDictParams) -> bool:
+def _are_shared(params: TensorDictBase, others: TensorDictBase) -> bool:
     keys = set(params.keys(True, True))
     return keys == set(others.keys(True, True)) and all(params.get(key) is others.get(key) for key in keys)
 

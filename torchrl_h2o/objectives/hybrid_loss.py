@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -36,12 +37,13 @@ class Rows:
 
     def weights(self, dtype: torch.dtype, *, prioritised: bool = True) -> Tensor:
         """Weights that sum to one over each stream, ``[*B]``: equal, or proportional to ``priority``."""
-        key = dtype, prioritised and self.priority is not None
+        priority = self.priority if prioritised else None
+        key = dtype, priority is not None
         if key not in self._weights:
             streams = [rows.to(dtype) for rows in (self.real, self.sim)]
-            if key[1]:
+            if priority is not None:
                 # torch.where instead of a product with the mask, because 0 * inf is NaN.
-                streams = [torch.where(rows > 0, self.priority.to(dtype), 0.0) for rows in streams]
+                streams = [torch.where(rows > 0, priority.to(dtype), 0.0) for rows in streams]
             totals = [rows.sum() for rows in streams]
             self._weights[key] = sum(
                 rows / torch.where(total > 0, total, 1.0) for rows, total in zip(streams, totals, strict=True)
@@ -51,7 +53,8 @@ class Rows:
     def streams(self, dtype: torch.dtype) -> Tensor:
         """Number of streams that have rows, clamped to at least 1, ``[]``."""
         if dtype not in self._streams:
-            self._streams[dtype] = sum(rows.any().to(dtype) for rows in (self.real, self.sim)).clamp_min(1)
+            count = cast(Tensor, sum(rows.any().to(dtype) for rows in (self.real, self.sim)))
+            self._streams[dtype] = count.clamp_min(1)
         return self._streams[dtype]
 
 
@@ -242,4 +245,4 @@ def like_rows(tensor: Tensor, rows: Tensor) -> Tensor:
 
 def total_loss(terms: dict[str, Tensor]) -> Tensor:
     """Add the terms named ``loss_*``. Their shape is ``[]`` for one run, ``[N]`` for a population of N runs."""
-    return sum(term for name, term in terms.items() if name.startswith("loss_"))
+    return cast(Tensor, sum(term for name, term in terms.items() if name.startswith("loss_")))

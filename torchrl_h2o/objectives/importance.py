@@ -55,6 +55,8 @@ class ImportanceWeightedLoss(LossWrapper):
         >>> loss(batch)["loss_qvalue"].backward()
     """
 
+    loss: LossModule
+
     def __init__(
         self,
         loss: LossModule,
@@ -73,7 +75,8 @@ class ImportanceWeightedLoss(LossWrapper):
         there = self._written_keys()
         self.terms = tuple(there if terms is None else terms)
         if unknown := set(self.terms) - set(there):
-            raise ValueError(f"{type(loss).__name__} has no {', '.join(unknown)} to weigh, but {', '.join(there)}")
+            names = ", ".join(map(str, unknown))
+            raise ValueError(f"{type(loss).__name__} has no {names} to weigh, but {', '.join(map(str, there))}")
 
     def _read_keys(self) -> Iterable[NestedKey]:
         return *self.loss.in_keys, self.key

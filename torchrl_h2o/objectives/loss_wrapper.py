@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any, cast
 
 from tensordict import NestedKey
 from torch import nn
@@ -29,7 +30,12 @@ class LossWrapper(HybridLoss):
         setattr(self, self._inside_name, loss)
 
     @property
-    def _inside(self) -> LossModule | None:
+    def _inside(self) -> LossModule:
+        return cast(LossModule, self._inside_if_set)
+
+    @property
+    def _inside_if_set(self) -> LossModule | None:
+        """The loss inside; None while the base class's constructor runs."""
         return self.__dict__.get("_modules", {}).get(self._inside_name)
 
     @property
@@ -71,7 +77,7 @@ class LossWrapper(HybridLoss):
 
     @loss_mask_key.setter
     def loss_mask_key(self, key: NestedKey | str | None) -> None:
-        HybridLoss.loss_mask_key.fset(self, key)
+        HybridLoss.loss_mask_key.__set__(self, key)
         for part in self._parts:
             part.loss_mask_key = key
 
@@ -98,7 +104,8 @@ class LossWrapper(HybridLoss):
     # SoftUpdate finds the target networks of the inner loss through the property and the method below.
     @property
     def _has_update_associated(self) -> dict[str, bool]:
-        return {} if self._inside is None else self._inside._has_update_associated
+        inside = self._inside_if_set
+        return {} if inside is None else inside._has_update_associated
 
     @_has_update_associated.setter
     def _has_update_associated(self, value: dict[str, bool]) -> None:
@@ -108,7 +115,7 @@ class LossWrapper(HybridLoss):
         yield from super().named_children()
         yield from ((name, module) for name, module in self._inside.named_children() if name.startswith("target_"))
 
-    def __getattr__(self, name: str):
-        if name.endswith("_params") and self._inside is not None:
-            return getattr(self._inside, name)
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith("_params") and (inside := self._inside_if_set) is not None:
+            return getattr(inside, name)
         return super().__getattr__(name)

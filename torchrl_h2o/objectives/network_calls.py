@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import cast
+
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch.distributions import Distribution
@@ -37,7 +40,8 @@ class NetworkCalls:
         """
         inputs, params = tensordict.select(*network.in_keys), params.detach() if frozen else params
         if params.ndim:
-            return _vmap_func(network, (None, 0), randomness=randomness)(inputs, params)
+            vmapped = cast("Callable[..., TensorDictBase]", _vmap_func(network, (None, 0), randomness=randomness))
+            return vmapped(inputs, params)
         with params.to_module(network, preserve_module_state=False):
             return network(inputs)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
+from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
@@ -17,8 +19,9 @@ HIDDEN = (256, 256)
 
 def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
     network = MLP(in_features, out_features, num_cells=list(num_cells), activation_class=nn.ReLU)
-    nn.init.xavier_uniform_(network[-1].weight, gain=1e-2)
-    nn.init.zeros_(network[-1].bias)
+    last = cast(nn.Linear, network[-1])
+    nn.init.xavier_uniform_(last.weight, gain=1e-2)
+    nn.init.zeros_(last.bias)
     return network
 
 
@@ -90,11 +93,11 @@ def make_actor(
     """
     if not isinstance(action_spec, Bounded):
         raise ValueError(f"a tanh-Gaussian policy needs a bounded action, not {type(action_spec).__name__}.")
-    action_dim = action_spec.shape[-1]
+    action_dim, space = action_spec.shape[-1], cast(ContinuousBox, action_spec.space)
     network = _mlp(observation_dim, 2 * action_dim, num_cells)
     if not trainable_log_std:
         with torch.no_grad():
-            network[-1].bias[action_dim:].fill_(-1.0)
+            cast(nn.Linear, network[-1]).bias[action_dim:].fill_(-1.0)
     return ProbabilisticActor(
         TensorDictModule(
             nn.Sequential(network, GaussianParameters(trainable_log_std)),
@@ -104,7 +107,7 @@ def make_actor(
         in_keys=["loc", "scale"],
         spec=action_spec,
         distribution_class=TanhNormal,
-        distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
+        distribution_kwargs={"low": space.low, "high": space.high},
         return_log_prob=True,
         log_prob_key="_log_prob",
     )

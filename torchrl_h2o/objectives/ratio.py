@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
@@ -61,6 +62,10 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         >>> estimator(batch)["dynamics_ratio"].shape
         torch.Size([5])
     """
+
+    # TorchRL annotates these as lists of flat keys.
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
 
     def __init__(
         self,
@@ -123,7 +128,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         real, sim = logits.unbind(-1)
         return real - sim
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         log_ratio, ratio = self.ratio(tensordict)
         log_key, key = self.out_keys
@@ -194,7 +199,8 @@ class DynamicsRatioLoss(HybridLoss):
         super().__init__(reduction=reduction)
         if input_noise is not None and input_noise < 0:
             raise ValueError(f"input_noise is a standard deviation and cannot be {input_noise}; None is no noise.")
-        self.convert_to_functional(estimator, "estimator", create_target_params=False)
+        # TorchRL accepts any compatible module, although it annotates a TensorDictModule.
+        self.convert_to_functional(cast(TensorDictModule, estimator), "estimator", create_target_params=False)
         self.input_noise = input_noise
 
     def _read_keys(self) -> Iterable[NestedKey]:
@@ -225,7 +231,7 @@ class DynamicsRatioLoss(HybridLoss):
 
     def _noisy(self, x: Tensor) -> Tensor:
         # The same numbers as torch.randn_like. Compiled populations replace normal_ to supply recorded numbers.
-        return x + self.input_noise * torch.empty_like(x).normal_()
+        return x + cast(float, self.input_noise) * torch.empty_like(x).normal_()
 
     def _cross_entropy(self, log_odds: Tensor, rows: Rows) -> Tensor:
         terms = F.softplus(torch.where(rows.real, -log_odds, log_odds))  # -log p(own stream)

@@ -73,16 +73,19 @@ class _ReluPerceptron(torch.autograd.Function):
         ctx.save_for_backward(inputs[0], *inputs[1 : 1 + ctx.depth], *outputs[1:])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, of_output: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # create_graph=True
             raise RuntimeError(
                 "an accelerated perceptron has no gradient of its gradient; do without accelerate(loss), or use "
                 "another activation than nn.ReLU"
             )
         depth = ctx.depth
-        of_input, of_weights, of_biases = None, [None] * depth, [None] * depth
-        if gradient is None:
+        of_input: Tensor | None = None
+        of_weights: list[Tensor | None] = [None] * depth
+        of_biases: list[Tensor | None] = [None] * depth
+        if of_output is None:
             return of_input, *of_weights, *of_biases
+        gradient: Tensor = of_output
         read = (ctx.saved_tensors[0], *ctx.saved_tensors[1 + depth :])
         weights = ctx.saved_tensors[1 : 1 + depth]
         for index in reversed(range(depth)):

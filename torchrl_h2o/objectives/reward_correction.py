@@ -49,6 +49,10 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
         tensor(True)
     """
 
+    # TorchRL annotates these as lists of flat keys.
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
+
     def __init__(
         self,
         estimator: DynamicsRatioEstimator,
@@ -64,7 +68,7 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
         self.in_keys = [*estimator.in_keys, reward]
         self.out_keys = [reward]
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
         correction = self.scale * estimated.get(self.estimator.out_keys[0])

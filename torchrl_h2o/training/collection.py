@@ -8,12 +8,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from operator import methodcaller
+from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, EnvCreator
 
 from torchrl_h2o.training.environments import simulator_maker
 from torchrl_h2o.training.progress import Budget
@@ -72,11 +73,11 @@ def collecting(
             threads = torch.get_num_threads()  # by default TorchRL would divide them among the workers
             stack.callback(torch.set_num_threads, threads)
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": {"num_threads": threads}}
-            collector = Collector(simulator_maker(cfg), actor, backend="process", **options)
+            collector = Collector(_of_worker(cfg), actor, backend="process", **options)
         elif chosen.backend == "ray":
             stack.enter_context(_ray(chosen))
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": _ray_options(cfg, keys)}
-            collector = Collector(simulator_maker(cfg), actor, backend="ray", **options)
+            collector = Collector(_of_worker(cfg), actor, backend="ray", **options)
         else:
             raise ValueError(f"collector.backend={chosen.backend}: choose direct, process or ray")
         stack.callback(collector.shutdown)
@@ -85,6 +86,10 @@ def collecting(
 
 def _chosen(cfg: DictConfig) -> DictConfig:
     return cfg.get("collector") or DIRECT  # configurations of earlier versions have no such entry
+
+
+def _of_worker(cfg: DictConfig) -> EnvCreator:
+    return cast(EnvCreator, simulator_maker(cfg))  # TorchRL accepts any function, although it annotates its own class
 
 
 def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import torch
 from tqdm import tqdm
@@ -75,7 +77,7 @@ def _frames(task: Task, preprocessing: Preprocessing, policy: torch.nn.Module, s
 
     def watched(tensordict):
         if next(steps) % stride == 0:
-            frames.append(env.render())
+            frames.append(cast(Callable, env.render)())  # a method of the environment inside
         return policy(tensordict)
 
     env.set_seed(0)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torchrl.data import TensorSpec
-from torchrl.modules import ProbabilisticActor, ValueOperator
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
@@ -69,7 +70,7 @@ class Learner:
 
 def make_networks(
     cfg: DictConfig, observation_dim: int, action_spec: TensorSpec
-) -> tuple[ProbabilisticActor, list[ValueOperator]]:
+) -> tuple[ProbabilisticActor, list[TensorDictModule]]:
     """Builds the policy and two Q networks. Their initial weights depend on the run's seed, not on the method."""
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)

@@ -8,6 +8,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
 
 from torchrl_h2o.training.returns import Evaluation
 from torchrl_h2o.training.task import Task
@@ -30,9 +31,14 @@ BELOW = {"frameon": False, "loc": "upper center", "bbox_to_anchor": (0.5, -0.13)
 class Trained(Protocol):
     """A finished training: metrics, number of updates and speed."""
 
-    rows: list[dict]
-    updates: int
-    updates_per_second: float
+    @property
+    def rows(self) -> list[dict]: ...
+
+    @property
+    def updates(self) -> int: ...
+
+    @property
+    def updates_per_second(self) -> float: ...
 
 
 def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour: Evaluation, task: Task) -> None:
@@ -83,7 +89,7 @@ def _label_of(behaviour: Evaluation, task: Task) -> str:
     return f"the data's behaviour (episodes of {behaviour.mean_length * task.seconds_per_step:.0f} s)"
 
 
-def _draw_discriminators(axis: plt.Axes, rows: list[dict]) -> None:
+def _draw_discriminators(axis: Axes, rows: list[dict]) -> None:
     """Draws accuracy of the discriminators and mean ratio; hides the panel for a method without discriminators."""
     updates = [row["updates"] for row in rows]
     lines = [

@@ -7,11 +7,13 @@ from contextlib import ExitStack, closing
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
+from torchrl.collectors import BaseCollector
 from torchrl.data import TensorSpec
 
 from torchrl_h2o.data import HybridReplayBuffer
@@ -93,12 +95,13 @@ class Trainee:
         torch.manual_seed(seed)
         if self._collector is not None:
             self._collector.set_seed(seed % 2**31)
-            self._collect()
+            self._collect(self._collector)
 
-    def _collect(self) -> None:
+    def _collect(self, collector: BaseCollector) -> None:
         """Runs the policy in the simulator for one epoch and adds the transitions to the replay buffer."""
         self._copy_to_cpu()
-        self._collector.update_policy_weights_()
+        # TorchRL's overloads leave out the call without arguments, which sends the collector's own policy.
+        cast(Any, collector).update_policy_weights_()
         simulated = next(self._rollouts).reshape(-1)
         simulated["next", "reward"] = self._preprocessing.reward(simulated["next", "reward"])
         self.learner.replay.extend(simulated)

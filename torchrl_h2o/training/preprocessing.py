@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
@@ -64,7 +65,9 @@ class Preprocessing:
         """Builds the TorchRL transforms that preprocess an environment's observations."""
         chosen: list[Transform] = []
         if self.loc is not None:
-            chosen.append(ObservationNorm(**self._tensors(), in_keys=["observation"], standard_normal=True))
+            norm = self._tensors()
+            loc, scale = norm.get("loc"), norm.get("scale")
+            chosen.append(ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True))
         if self.frames > 1:
             chosen.append(CatFrames(N=self.frames, dim=-1, in_keys=["observation"]))
         return chosen
@@ -72,10 +75,10 @@ class Preprocessing:
     def apply(self, real: TensorDictBase) -> TensorDictBase:
         """Preprocesses the real transitions ``[T]`` and returns them in a new tensordict."""
         real = real.copy()
-        real["next"] = real["next"].copy().set("reward", self.reward(real["next", "reward"]))
+        real["next"] = cast(TensorDictBase, real["next"]).copy().set("reward", self.reward(real["next", "reward"]))
         if self.loc is not None:
             norm = self._tensors()
-            for part in (real, real["next"]):
+            for part in (real, cast(TensorDictBase, real["next"])):
                 part["observation"] = (part["observation"] - norm["loc"]) / norm["scale"]
         if self.frames > 1:
             both = CatFrames(N=self.frames, dim=-1, in_keys=["observation", ("next", "observation")])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
@@ -60,7 +60,8 @@ class Task:
         if gap_fix is not None:
             simulator.extend(_effects_of_report(gap_fix))
         reality = tuple(instantiate(effect) for effect in env.reality)
-        return cls(OmegaConf.to_container(env, resolve=True), reality, tuple(simulator), gap)
+        config = cast(dict[str, Any], OmegaConf.to_container(env, resolve=True))
+        return cls(config, reality, tuple(simulator), gap)
 
     @property
     def name(self) -> str:
@@ -107,7 +108,8 @@ class Task:
         if num_worlds is not None and self.config.get("batched", False):
             env = BatchedMujocoEnv(env, num_worlds)
         shown = [] if preprocessing is None else preprocessing.transforms()
-        return TransformedEnv(env, Compose(DoubleToFloat(), *shown))
+        transforms: list[Any] = [DoubleToFloat(), *shown]  # TorchRL annotates each one as a list
+        return TransformedEnv(env, Compose(*transforms))
 
 
 def _effects_of_report(path: str) -> tuple[Effect, ...]:

@@ -1,6 +1,7 @@
 """Loads the policy of a finished or interrupted run from its folder."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -28,9 +29,7 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
         raise FileNotFoundError(f"{directory} has no checkpoint of {method!r}; it has {present or 'none'}")
     env = make_reality(cfg)
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
-    has_best = (
-        "policy" in Checkpoint.manifest(latest)["components"]
-    )  # offline methods have none, as they use no simulator
-    chosen = "policy" if keeps_best(cfg) and has_best else "actor"
-    Checkpoint(**{chosen: actor}).load(latest)
+    has_best = "policy" in Checkpoint.manifest(latest)["components"]  # offline methods have none
+    component: dict[str, Any] = {"policy" if keeps_best(cfg) and has_best else "actor": actor}
+    Checkpoint(**component).load(latest)
     return actor

@@ -1,8 +1,12 @@
 """CQL on the real data only, with TorchRL's loss. It uses no simulator, so the dynamics gap does not affect it."""
 
+from typing import cast
+
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, TensorSpec
+from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import CQLLoss, SoftUpdate
 
@@ -20,9 +24,10 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     unit_spec = Bounded(-1.0, 1.0, action_spec.shape)
     unit_actor = ProbabilisticActor(
-        actor.module[0], in_keys=["loc", "scale"], spec=unit_spec, distribution_class=TanhNormal
+        cast(TensorDictModule, actor.module[0]), in_keys=["loc", "scale"], spec=unit_spec, distribution_class=TanhNormal
     )
-    low, high = action_spec.space.low, action_spec.space.high
+    space = cast(ContinuousBox, action_spec.space)
+    low, high = space.low, space.high
 
     loss = CQLLoss(unit_actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy, **cfg.cql)
     loss.make_value_estimator(gamma=cfg.gamma)

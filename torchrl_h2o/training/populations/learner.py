@@ -1,10 +1,11 @@
 """One update of many runs together: batches, losses, one optimiser step, one update of all target networks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.training.learner import Learner
@@ -30,8 +31,8 @@ class PopulationLearner:
         self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float, capturable: bool = False
     ) -> None:
         self.learners, self.replay, self.tau = learners, replay, tau
-        self.population = Population([learner.terms_of for learner in learners])
-        self.losses_of = self.population  # may be compiled
+        self.population = Population([cast(nn.Module, learner.terms_of) for learner in learners])  # H2O+'s are its loss
+        self.losses_of: Callable[..., dict[str, Tensor]] = self.population  # may be compiled
         self.optimiser = torch.optim.Adam(self.population.parameters(), lr=lr, fused=True, capturable=capturable)
         on_cpu = replay.device.type == "cpu"
         self.generators = [torch.Generator() for _ in learners] if on_cpu else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
@@ -120,7 +121,7 @@ class Population(nn.Module):
         modes = tuple(module.training for module in self.members[0].modules())
         key = (tuple(batch.batch_size for batch in batches), modes)
         if key not in self._draws:
-            first = [batch[0].copy() for batch in batches]
+            first = [cast(TensorDictBase, batch[0]).copy() for batch in batches]
             devices = {batch.device for batch in batches if batch.device is not None}
             with _without_caches(self.members[0]):
                 self._draws[key] = record(lambda: self.members[0](*first), list(devices))
@@ -232,22 +233,25 @@ def _stack(held: list[Stackable], stacks: dict[int, Tensor]) -> TensorDictBase |
 
     if isinstance(held[0], Tensor):
         return one(*held)
+    networks = cast(list[TensorDictBase], held)
     return TensorDict(
-        {key: one(*(params.get(key) for params in held)) for key in held[0].keys(True, True)},
-        batch_size=[len(held), *held[0].batch_size],
+        {key: one(*(params.get(key) for params in networks)) for key in networks[0].keys(True, True)},
+        batch_size=[len(networks), *networks[0].batch_size],
     )
 
 
 def _look_into(held: Stackable, stack: TensorDictBase | Tensor, number: int) -> None:
     """Replace a member's tensors by views of the stack."""
-    if isinstance(held, Tensor):
+    if not isinstance(held, TensorDictParams):
         held.data = stack.data[number]
         return
-    for key in held.keys(True, True):
-        held.get(key).data = stack.get(key).data[number]
-    own = held._param_td
-    for params in (held, own, *(value for value in own.values(True) if is_tensor_collection(value))):
-        params._erase_cache()  # a locked tensordict caches values computed from its old tensors
+    params, stacked = cast(TensorDictBase, held), cast(TensorDictBase, stack)
+    for key in params.keys(True, True):
+        params.get(key).data = stacked.get(key).data[number]
+    own = cast(TensorDictBase, held._param_td)
+    nested = [cast(TensorDictBase, value) for value in own.values(True) if is_tensor_collection(value)]
+    for part in (params, own, *nested):
+        part._erase_cache()  # a locked tensordict caches values computed from its old tensors
 
 
 @contextmanager
@@ -267,7 +271,7 @@ def _in_place_of_own(member: nn.Module, tensors: dict[tuple[str, ...], TensorDic
 @contextmanager
 def _without_caches(member: nn.Module) -> Iterator[None]:
     """Clear the parameter caches of TorchRL's losses before and after the block, in which parameters are replaced."""
-    cached = [module for module in member.modules() if isinstance(module, LossModule)]
+    cached: list[nn.Module] = [module for module in member.modules() if isinstance(module, LossModule)]
     for module in cached:
         module.__dict__["_cache"] = {}
     try:

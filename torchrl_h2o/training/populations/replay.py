@@ -7,6 +7,7 @@ operation gathers the batches of all runs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -53,7 +54,8 @@ class PopulationReplay:
         device: torch.device | str = "cpu",
     ) -> None:
         real = real.select(*keys).to(device)
-        memory = real[:1].expand(num_members, sim_capacity).apply(lambda rows: rows.new_empty(rows.shape))
+        wide = cast(TensorDictBase, real[:1].expand(num_members, sim_capacity))
+        memory = cast(TensorDictBase, wide.apply(lambda rows: rows.new_empty(rows.shape)))
         self.buffers = [
             HybridReplayBuffer(real, sim_capacity, batch_size, keys=keys, device=device, sim_memory=memory[member])
             for member in range(num_members)
