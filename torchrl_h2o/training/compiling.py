@@ -5,6 +5,7 @@ same random numbers.
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -44,16 +45,16 @@ class _CompiledAtFirstCall:
         self._plain, self._needed = losses_of, needed
         self._chosen: Callable | None = None  # set at the first call
 
-    def __call__(self, *batches: TensorDictBase) -> Mapping[str, Tensor]:
+    def __call__(self, *batches: TensorDictBase, **noise: Any) -> Mapping[str, Tensor]:
         if self._chosen is None:
             tqdm.write("compiling the losses, about half a minute (compiled=false skips this)")
             self._chosen = compiled(self._plain)
             try:
-                return self._chosen(*batches)
+                return self._chosen(*batches, **noise)
             except TorchDynamoException as error:  # for example without a C++ compiler or Python's header files
                 if self._needed:
                     raise
                 reason = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
                 tqdm.write(f"the losses cannot be compiled here; the slower uncompiled ones are used: {reason}")
                 self._chosen = self._plain
-        return self._chosen(*batches)
+        return self._chosen(*batches, **noise)

@@ -149,7 +149,7 @@ def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(com
 @pytest.mark.slow
 def test_one_command_leaves_a_folder_a_member_and_one_table(command, tmp_path):
     small = [*SMALL, *ROBOT, *SMALLER, "updates=10", "hydra.run.dir=out"]
-    printed = run(command(*small, "seeds=[0,1]", "gaps=[gravity]"))
+    printed = run(command(*small, "seeds=[0,1]", "gaps=[gravity]", script="train.py"))
     for name, seed in (("seed_0_gravity", 0), ("seed_1_gravity", 1)):
         summary = json.loads((tmp_path / "out" / name / "summary.json").read_text())
         assert (summary["seed"], summary["gap"], summary["updates"]) == (seed, "gravity", 10)
