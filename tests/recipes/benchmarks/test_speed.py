@@ -24,7 +24,7 @@ def test_updates_are_set_beside_a_textbook_s_and_beside_the_limit(tmp_path):
     result = json.loads((tmp_path / "update.json").read_text())
     assert result["flop"] / 1e9 == pytest.approx(1.21, rel=0.05)  # with the authors' sizes, HalfCheetah
     assert result["limit"] == result["gflop_per_second"] * 1e9 / result["flop"]
-    assert {"textbook", "ours, not compiled", "SAC, TorchRL's loss", "SAC of our parts"} == set(
+    assert {"textbook", "ours, not compiled", "ours, neither", "SAC, TorchRL's loss", "SAC of our parts"} == set(
         result["updates_per_second"]
     )
     assert 0.0 < result["updates_per_second"]["ours, not compiled"] < result["limit"]
