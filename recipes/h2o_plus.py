@@ -84,7 +84,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     # Environments: to collect, to evaluate during training, and for the evaluation at the end
     simulator = task.make_simulator(cfg.num_worlds, preprocessing)
     reality = task.make_reality(cfg.eval_episodes, preprocessing)
-    trials = task.make_simulator(cfg.eval_episodes, preprocessing)
+    trials = task.make_simulator(cfg.eval_episodes, preprocessing) if keeps_best(cfg) else None
     final_reality = task.make_reality(cfg.final_episodes, preprocessing)
     final_simulator = task.make_simulator(1, preprocessing)
     observation_dim = reality.observation_spec["observation"].shape[-1]
@@ -128,7 +128,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     # Contents of a checkpoint; with keep=best_in_simulator also the policy with the highest return in the simulator
     parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "replay": replay, "schedule": schedule}
     best = None
-    if keeps_best(cfg):
+    if trials is not None:
         best = BestPolicy(actor, trials, cfg.eval_episodes)
         parts["policy"] = best.policy
     training = Training("H2O+", folder, budget, **parts)

@@ -125,6 +125,7 @@ def trained_estimator(real_shift, sim_shift, steps=600):
     return estimator, gaussian_transitions(10_000, real_shift, sim_shift, rng)
 
 
+@pytest.mark.slow
 def test_trained_log_ratio_is_the_true_one_on_gaussian_dynamics():
     estimator, (batch, truth) = trained_estimator(real_shift=0.6, sim_shift=0.0)
     got = estimator(batch)["log_dynamics_ratio"]
@@ -134,6 +135,7 @@ def test_trained_log_ratio_is_the_true_one_on_gaussian_dynamics():
     assert slope == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_trained_ratio_is_one_where_the_dynamics_agree():
     estimator, (batch, _) = trained_estimator(real_shift=0.4, sim_shift=0.4, steps=300)
     log_ratio = estimator(batch)["log_dynamics_ratio"]

@@ -60,6 +60,7 @@ def test_where_dynamics_are_equal_darc_is_sac(batch):
     torch.testing.assert_close(*got, rtol=0.0, atol=0.0)
 
 
+@pytest.mark.slow
 def test_discriminators_that_have_learnt_correct_little_in_a_right_simulator_and_much_in_a_wrong_one():
     corrections = {}
     for gap in (0.0, 1.0):

@@ -158,7 +158,7 @@ def test_cql_s_policy_is_not_also_told_to_copy(compose):
 def test_a_method_that_learns_from_real_data_alone_has_no_simulator(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=20", "keep=best_in_simulator", config="train")
     monkeypatch.delattr(HybridReplayBuffer, "extend")
-    monkeypatch.delattr("torchrl_h2o.training.loop.make_simulator")
+    monkeypatch.delattr("torchrl_h2o.training.task.Task.make_simulator")
     policy, training = train(METHODS[name], cfg, real, tmp_path)
     assert "return_sim" not in training.rows[-1]
     kept = load_policy(cfg, tmp_path, METHODS[name].title)

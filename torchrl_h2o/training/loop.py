@@ -19,7 +19,7 @@ from torchrl.data import TensorSpec
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
-from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of
+from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.returns import BestPolicy, evaluate
@@ -56,8 +56,8 @@ class Trainee:
 
     def __init__(self, make_learner: MakeLearner, cfg: DictConfig, replay: HybridReplayBuffer) -> None:
         self.cfg = cfg
-        self._preprocessing = preprocessing_of(cfg)
-        self._reality = make_reality(cfg, cfg.eval_episodes)
+        task, self._preprocessing = task_of(cfg), preprocessing_of(cfg)
+        self._reality = task.make_reality(cfg.eval_episodes, self._preprocessing)
         observation_dim = self._reality.observation_spec["observation"].shape[-1]
         with replay.device:
             action_spec = self._reality.action_spec_unbatched.to(replay.device)
@@ -67,11 +67,12 @@ class Trainee:
         self._open = ExitStack()
         self._collector = self._best = None
         if self.learner.simulates:
-            simulator = make_simulator(cfg, cfg.num_worlds)
+            simulator = task.make_simulator(cfg.num_worlds, self._preprocessing)
             self._collector = self._open.enter_context(collecting(cfg, simulator, self._actor, replay.keys))
             self._rollouts = iter(self._collector)
             if keeps_best(cfg):
-                self._best = BestPolicy(self._actor, make_simulator(cfg, cfg.eval_episodes), cfg.eval_episodes)
+                trials = task.make_simulator(cfg.eval_episodes, self._preprocessing)
+                self._best = BestPolicy(self._actor, trials, cfg.eval_episodes)
                 self.components["policy"] = self._best.policy
 
     @property

@@ -1,6 +1,7 @@
 """A population as a command: one folder per member, and each member equals a single run."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -87,6 +88,17 @@ def test_an_interrupted_population_goes_on_as_an_unbroken_one(compose, tmp_path,
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
     for member in ("seed_0", "seed_1"):
         assert rows(tmp_path / "parts" / member) == rows(tmp_path / "whole" / member)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
+def test_a_compiled_population_reaches_the_figures_of_an_uncompiled_one(compose, tmp_path):
+    cfg, real = compose("seeds=[0,1]", "updates=20")
+    plain = train_all(cfg, real, tmp_path / "plain")
+    cfg.compiled = True
+    compiled = train_all(cfg, real, tmp_path / "compiled")
+    for name, outcome in plain.items():
+        assert_same_figures(compiled[name].rows, outcome.rows, 1e-4)
 
 
 def break_seed_1(monkeypatch, at_epoch):

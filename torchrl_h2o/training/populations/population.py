@@ -36,7 +36,8 @@ class Population(nn.Module):
 
     - other random functions, such as dropout or random permutations;
     - draws or branches that depend on data or parameters;
-    - members that differ in structure.
+    - members that differ in structure;
+    - under ``torch.compile``, draws by another function than ``Tensor.normal_``.
 
     Buffers that a forward changes, such as the running means of batch normalisation, are not written back.
 
