@@ -19,7 +19,6 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from torch.optim.lr_scheduler import LinearLR
-from torchrl.collectors import Collector
 from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
@@ -37,9 +36,11 @@ from torchrl_h2o.objectives import (
     make_value,
     total_loss,
 )
+from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.real_data import RECORDED, behaviour_of
@@ -79,7 +80,13 @@ def train(cfg: DictConfig, folder: Path) -> None:
     cfg.observation_norm = preprocessing.norm
     save_config(cfg, folder)
     shown = preprocessing.apply(real)
-    replay = HybridReplayBuffer(shown, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    replay = HybridReplayBuffer(
+        shown,
+        sim_capacity=int(cfg.sim_capacity * len(real)),
+        batch_size=cfg.batch_size,
+        n_steps=cfg.n_steps,
+        gamma=cfg.gamma,
+    )
 
     # Environments: to collect, to evaluate during training, and for the evaluation at the end
     simulator = task.make_simulator(cfg.num_worlds, preprocessing)
@@ -94,9 +101,13 @@ def train(cfg: DictConfig, folder: Path) -> None:
     # Networks
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
-    qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
+    qvalues = make_qvalue(
+        observation_dim, action_dim, cfg.num_cells, layer_norm=cfg.layer_norm, ensemble=cfg.num_qvalue_nets
+    )
     value = make_value(observation_dim, cfg.num_cells)
-    estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
+    estimator = make_dynamics_ratio_estimator(
+        observation_dim, action_dim, cfg.num_cells, next_observation=replay.next_observation
+    )
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     if cfg.backbone == "expectile":
@@ -122,11 +133,12 @@ def train(cfg: DictConfig, folder: Path) -> None:
     optimiser = torch.optim.Adam(loss.parameters(), lr=cfg.lr, fused=True)
     schedule = LinearLR(optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
     targets = SoftUpdate(loss, tau=cfg.tau)
-    collector = Collector(simulator, actor, frames_per_batch=cfg.steps_per_epoch, reset_at_each_iter=True)
-    rollouts = iter(collector)
+    collector = simulated_transitions(simulator, actor, cfg.steps_per_epoch)
+    rollouts, episodes = iter(collector), OngoingEpisodes(collector)
 
     # Contents of a checkpoint; with keep=best_in_simulator also the policy with the highest return in the simulator
-    parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "replay": replay, "schedule": schedule}
+    parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "schedule": schedule}
+    parts |= {"replay": replay, "episodes": episodes}
     best = None
     if trials is not None:
         best = BestPolicy(actor, trials, cfg.eval_episodes)
@@ -141,9 +153,9 @@ def train(cfg: DictConfig, folder: Path) -> None:
         torch.manual_seed(seed)
 
         # Collect
-        collector.set_seed(seed % 2**31)
+        episodes.begin_epoch(epoch, seed)
         collector.update_policy_weights_()
-        simulated = next(rollouts).reshape(-1)
+        simulated = next(rollouts)
         simulated["next", "reward"] = preprocessing.reward(simulated["next", "reward"])
         replay.extend(simulated)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from os import cpu_count
 from typing import Any, cast
 
@@ -17,11 +18,12 @@ from torchrl._utils import seed_generator
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import ActionEffect, Effect, Episode, ObservationEffect, Pipeline
+from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, Pipeline
 from torchrl_h2o.effects.effect import BatchedForce
 from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 from torchrl_h2o.envs.dynamics_gap import DynamicsGap, transforms_of
 from torchrl_h2o.envs.mujoco_model import find_backend
+from torchrl_h2o.envs.recorded_episode import RecordedEpisode
 from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, roll_out
 from torchrl_h2o.envs.task_rules import rules_of
 
@@ -194,12 +196,31 @@ class BatchedMujocoEnv(EnvBase):
         self._steps[index] = 0
         self._episodes[index] = self._begin_episode(index)
 
-    def _begin_episode(self, index: int) -> Episode:
+    def _begin_episode(self, index: int) -> RecordedEpisode:
         """Begins an episode of a world's action and observation effects."""
-        pipeline, rng = self._pipelines[index], None
-        if pipeline.is_random:  # without random effects torch's generator is not used
-            rng = np.random.default_rng(int(torch.randint(2**63 - 1, ())))
-        return pipeline.begin(self._control_steps[index], rng)
+        # without random effects torch's generator is not used
+        seed = int(torch.randint(2**63 - 1, ())) if self._pipelines[index].is_random else None
+        return RecordedEpisode(partial(self._pipelines[index].begin, self._control_steps[index]), seed)
+
+    def episodes_state(self) -> dict[str, Any]:
+        """Returns the current episodes of all worlds, to be continued by :meth:`restore_episodes`.
+
+        The generators of initial states are not included; ``set_seed`` sets them.
+        """
+        return {
+            "states": torch.from_numpy(self.states.copy()),
+            "steps": torch.from_numpy(self._steps.copy()),
+            "effects": [episode.state() for episode in self._episodes],
+        }
+
+    def restore_episodes(self, state: dict[str, Any]) -> None:
+        """Continues the episodes that :meth:`episodes_state` returned, in an env of the same task and effects."""
+        self.states[:] = state["states"].numpy()
+        self._steps[:] = state["steps"].numpy()
+        self._episodes = [
+            RecordedEpisode.restored(partial(pipeline.begin, step), own)
+            for pipeline, step, own in zip(self._pipelines, self._control_steps, state["effects"], strict=True)
+        ]
 
     def _observe(self, mask: np.ndarray | slice = slice(None)) -> torch.Tensor:
         """Returns observations (N, n), with sensor effects in the worlds of a mask; TorchRL ignores other worlds."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import cast, overload
 
 import torch
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded, TensorSpec
@@ -192,7 +193,12 @@ def make_value(observation_dim: int, num_cells: Sequence[int] = HIDDEN) -> Value
 
 
 def make_dynamics_ratio_estimator(
-    observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN, **kwargs
+    observation_dim: int,
+    action_dim: int,
+    num_cells: Sequence[int] = HIDDEN,
+    *,
+    next_observation: NestedKey = ("next", "observation"),
+    **kwargs,
 ) -> DynamicsRatioEstimator:
     """Build the two discriminators of Eq. (9).
 
@@ -200,13 +206,18 @@ def make_dynamics_ratio_estimator(
         observation_dim (int): size of ``observation``.
         action_dim (int): size of ``action``.
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Keyword Args:
+        next_observation (NestedKey, optional): the entry of the one-step next state. In n-step batches it is
+            ``("next", "original_observation")``; see
+            :attr:`~torchrl_h2o.data.HybridReplayBuffer.next_observation`. Defaults to ``("next", "observation")``.
         **kwargs: keyword arguments of :class:`DynamicsRatioEstimator`.
 
     Examples:
         >>> make_dynamics_ratio_estimator(17, 6, logit_bound=None).in_keys
         ['observation', 'action', ('next', 'observation')]
     """
-    keys = ["observation", "action", ("next", "observation")]
+    keys = ["observation", "action", next_observation]
     sa_dim, sas_dim = observation_dim + action_dim, 2 * observation_dim + action_dim
     hidden = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
     return DynamicsRatioEstimator(

@@ -24,9 +24,14 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
             ``scale=c``. Defaults to 1.0.
 
     Keyword Args:
+        gamma (float, optional): discount factor of n-step rewards. Only the first of the n transitions is available, so
+            its correction is counted for all of them: it is multiplied by :math:`1+\gamma+\dots+\gamma^{m-1}`, with m =
+            ``steps_to_next_obs``. Exact for one step. Defaults to 0.99.
         reward (NestedKey, optional): read and replaced, ``[*B, 1]`` or ``[*B]``. Defaults to ``("next", "reward")``.
         real (NestedKey, optional): marks measured rows, which keep their reward. If the batch has no such entry, all
             rows count as simulated. Defaults to ``"real"``.
+        steps_to_next_obs (NestedKey, optional): number of steps m of an n-step row, read if present. Defaults to
+            ``"steps_to_next_obs"``.
 
     Raises:
         KeyError: if a transition lacks the estimator's inputs or the reward.
@@ -58,12 +63,16 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
         estimator: DynamicsRatioEstimator,
         scale: float = 1.0,
         *,
+        gamma: float = 0.99,
         reward: NestedKey = ("next", "reward"),
         real: NestedKey = "real",
+        steps_to_next_obs: NestedKey = "steps_to_next_obs",
     ) -> None:
         super().__init__()
         self.estimator = estimator
         self.scale = scale
+        self.gamma = gamma
+        self.steps_to_next_obs = steps_to_next_obs
         self.reward, self.real = reward, real
         self.in_keys = [*estimator.in_keys, reward]
         self.out_keys = [reward]
@@ -72,6 +81,10 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
         correction = self.scale * estimated.get(self.estimator.out_keys[0])
+        steps = tensordict.get(self.steps_to_next_obs, None)
+        if steps is not None:
+            discounts = self.gamma ** torch.arange(int(steps.max()), device=steps.device)
+            correction = correction * discounts.cumsum(0)[like_rows(steps, correction) - 1].to(correction)
         real = tensordict.get(self.real, None)
         if real is not None:
             correction = torch.where(like_rows(real.bool(), correction), 0.0, correction)

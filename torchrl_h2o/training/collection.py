@@ -17,6 +17,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, EnvCreator
 
 from torchrl_h2o.training.environments import simulator_maker
+from torchrl_h2o.training.ongoing_episodes import saves_episodes
 from torchrl_h2o.training.progress import Budget
 
 DIRECT = OmegaConf.create({"backend": "direct"})
@@ -49,14 +50,31 @@ def check_collector(cfg: DictConfig) -> None:
         )
 
 
+def simulated_transitions(simulator: EnvBase, actor: torch.nn.Module, steps_per_epoch: int) -> Collector:
+    """Builds the collector of this process, whose episodes go on from batch to batch if the simulator can save them.
+
+    Args:
+        simulator: the environment, ``[]`` or ``[N]``.
+        actor: the policy.
+        steps_per_epoch: number of transitions of a batch, of all worlds together.
+    """
+    if saves_episodes(simulator):
+        return Collector(simulator, actor, frames_per_batch=steps_per_epoch)
+    return Collector(
+        simulator, actor, frames_per_batch=steps_per_epoch, reset_at_each_iter=True, set_truncated=True
+    )
+
+
 @contextmanager
 def collecting(
     cfg: DictConfig, simulator: EnvBase, actor: torch.nn.Module, keys: Sequence[NestedKey]
 ) -> Iterator[BaseCollector]:
     """Yields a collector that returns one epoch of simulated transitions at a time; shuts its workers down at the end.
 
-    Call ``update_policy_weights_()`` to send the policy's current weights. Every batch begins with new episodes, so
-    that an epoch depends on its seed and its policy only.
+    Call ``update_policy_weights_()`` to send the policy's current weights. Episodes go on in the next batch if this
+    process simulates and the simulator can save them, see
+    :class:`~torchrl_h2o.training.ongoing_episodes.OngoingEpisodes`. Otherwise every batch begins with
+    new episodes, and its last transitions are marked as truncated.
 
     Args:
         cfg: the run's configuration.
@@ -65,10 +83,10 @@ def collecting(
         keys: the entries of a transition that Ray's workers send back.
     """
     chosen = _chosen(cfg)
-    options = {"frames_per_batch": cfg.steps_per_epoch, "reset_at_each_iter": True}
+    options = {"frames_per_batch": cfg.steps_per_epoch, "reset_at_each_iter": True, "set_truncated": True}
     with ExitStack() as stack:
         if chosen.backend == "direct":
-            collector = Collector(simulator, actor, **options)
+            collector = simulated_transitions(simulator, actor, cfg.steps_per_epoch)
         elif chosen.backend == "process":
             threads = torch.get_num_threads()  # by default TorchRL would divide them among the workers
             stack.callback(torch.set_num_threads, threads)

@@ -71,10 +71,12 @@ class Learner:
 def make_networks(
     cfg: DictConfig, observation_dim: int, action_spec: TensorSpec
 ) -> tuple[ProbabilisticActor, list[TensorDictModule]]:
-    """Builds the policy and two Q networks. Their initial weights depend on the run's seed, not on the method."""
+    """Builds the policy and the Q networks. Their initial weights depend on the run's seed, not on the method."""
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
-    return actor, [make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells) for _ in range(2)]
+    # cfg.get, because configurations of earlier versions have no such entries.
+    options = {"layer_norm": cfg.get("layer_norm", False), "ensemble": cfg.get("num_qvalue_nets", 2)}
+    return actor, make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells, **options)
 
 
 def adam(*losses: LossModule, lr: float) -> torch.optim.Adam:

@@ -21,6 +21,7 @@ from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.learner import Learner
+from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import keeps_best
@@ -70,6 +71,7 @@ class Trainee:
             simulator = task.make_simulator(cfg.num_worlds, self._preprocessing)
             self._collector = self._open.enter_context(collecting(cfg, simulator, self._actor, replay.keys))
             self._rollouts = iter(self._collector)
+            self.components["episodes"] = self._episodes = OngoingEpisodes(self._collector)
             if keeps_best(cfg):
                 trials = task.make_simulator(cfg.eval_episodes, self._preprocessing)
                 self._best = BestPolicy(self._actor, trials, cfg.eval_episodes)
@@ -95,7 +97,7 @@ class Trainee:
         seed = epoch_seed(self.cfg.seed, epoch)
         torch.manual_seed(seed)
         if self._collector is not None:
-            self._collector.set_seed(seed % 2**31)
+            self._episodes.begin_epoch(epoch, seed)
             self._collect(self._collector)
 
     def _collect(self, collector: BaseCollector) -> None:
@@ -103,7 +105,7 @@ class Trainee:
         self._copy_to_cpu()
         # TorchRL's overloads leave out the call without arguments, which sends the collector's own policy.
         cast(Any, collector).update_policy_weights_()
-        simulated = next(self._rollouts).reshape(-1)
+        simulated = next(self._rollouts)
         simulated["next", "reward"] = self._preprocessing.reward(simulated["next", "reward"])
         self.learner.replay.extend(simulated)
 
@@ -144,7 +146,13 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
         The policy selected by ``keep``, and the training with its metrics.
     """
     real = preprocessing_of(cfg).apply(real)
-    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    replay = HybridReplayBuffer(
+        real,
+        sim_capacity=int(cfg.sim_capacity * len(real)),
+        batch_size=cfg.batch_size,
+        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
+        gamma=cfg.gamma,
+    )
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
     compiled = cfg.get("compiled", False)  # configurations of earlier versions have no such entry

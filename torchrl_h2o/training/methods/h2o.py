@@ -25,7 +25,9 @@ from torchrl_h2o.training.loop import Method
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Build H2O, Eq. (1): a conservative term added to SAC on both streams."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
-    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
+    estimator = make_dynamics_ratio_estimator(
+        observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
+    )
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
     num_real, _ = cfg.batch_size
     spread = replay.real[:]["observation"].std(0)

@@ -26,7 +26,9 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     """Build H2O+: one loss, one optimiser, and two batches per update, the second for the discriminators."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     value_loss = make_value_loss(cfg, observation_dim)
-    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
+    estimator = make_dynamics_ratio_estimator(
+        observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
+    )
 
     loss = H2OPlusLoss(
         MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing),

@@ -18,7 +18,9 @@ from torchrl_h2o.training.loop import Method
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's TD3 loss, weighted row by row."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
-    estimator = make_dynamics_ratio_estimator(observation_dim, action_spec.shape[-1], cfg.num_cells)
+    estimator = make_dynamics_ratio_estimator(
+        observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
+    )
     td3 = TD3Loss(actor, qvalues, action_spec=action_spec, loss_function="l2", reduction="none")
     td3.make_value_estimator(gamma=cfg.gamma)
     loss = ImportanceWeightedLoss(td3, terms=["loss_qvalue"])

@@ -121,7 +121,15 @@ def train_population(
         save_config(own, directory / name)
     real = as_observed(cfg, real)
     capacity = int(cfg.sim_capacity * len(real))
-    replay = PopulationReplay(real, capacity, cfg.batch_size, len(members), device=cfg.device)
+    replay = PopulationReplay(
+        real,
+        capacity,
+        cfg.batch_size,
+        len(members),
+        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
+        gamma=cfg.gamma,
+        device=cfg.device,
+    )
     trainees = {
         name: Trainee(make_learner, own, buffer)
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)

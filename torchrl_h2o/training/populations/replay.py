@@ -13,6 +13,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS, HybridReplayBuffer
+from torchrl_h2o.data.multi_step import OngoingMultiStep, multi_step_keys
 
 
 class PopulationReplay:
@@ -23,6 +24,8 @@ class PopulationReplay:
         sim_capacity: number of simulated transitions that each run stores.
         batch_size: (real, simulated) rows of a run's batch.
         num_members: number of runs, N.
+        n_steps: n of n-step targets, as in :class:`HybridReplayBuffer`.
+        gamma: discount factor of the n-step rewards.
         keys: the entries of a batch, as in :class:`HybridReplayBuffer`.
         device: device of the data and of the batches.
 
@@ -50,14 +53,27 @@ class PopulationReplay:
         batch_size: tuple[int, int],
         num_members: int,
         *,
+        n_steps: int = 1,
+        gamma: float = 0.99,
         keys: Sequence[NestedKey] = TRANSITION_KEYS,
         device: torch.device | str = "cpu",
     ) -> None:
         real = real.select(*keys).to(device)
+        if n_steps > 1:
+            real = OngoingMultiStep(n_steps, gamma).whole(real).select(*multi_step_keys(keys))
         wide = cast(TensorDictBase, real[:1].expand(num_members, sim_capacity))
         memory = cast(TensorDictBase, wide.apply(lambda rows: rows.new_empty(rows.shape)))
         self.buffers = [
-            HybridReplayBuffer(real, sim_capacity, batch_size, keys=keys, device=device, sim_memory=memory[member])
+            HybridReplayBuffer(
+                real,
+                sim_capacity,
+                batch_size,
+                n_steps=n_steps,
+                gamma=gamma,
+                keys=keys,
+                device=device,
+                sim_memory=memory[member],
+            )
             for member in range(num_members)
         ]
         self.batch_size, self.device = tuple(batch_size), torch.device(device)
