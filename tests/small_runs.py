@@ -12,6 +12,7 @@ SMALL = [
     "updates=60",
     "updates_per_epoch=20",
     "steps_per_epoch=40",
+    "n_steps=3",
     "eval_every=1",
     "checkpoint_every=1",
     "eval_episodes=1",

@@ -1,5 +1,7 @@
 """n-step rows: sums, end marks, one-step next states, and the equality of parts and whole."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -68,7 +70,7 @@ def test_a_stream_in_parts_gives_the_rows_of_the_whole(ends, cuts):
     data, n = run(ends), 4
     bounds = [0, *sorted({cut for cut in cuts if cut < len(ends)}), len(ends)]
     stream = OngoingMultiStep(n, GAMMA)
-    parts = [stream.transform(data[a:b]) for a, b in zip(bounds, bounds[1:], strict=False)]
+    parts = [stream.transform(data[a:b]) for a, b in pairwise(bounds)]
     rows = torch.cat([part for part in parts if part is not None])
     whole = OngoingMultiStep(n, GAMMA).whole(data)[: len(data) - n]
     for key in whole.keys(True, True):  # TorchRL's sums are rounded differently for different lengths

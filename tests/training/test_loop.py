@@ -50,7 +50,7 @@ def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, 
 
 @pytest.mark.slow
 def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
-    cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=1")
+    cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=2")
     policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
     promised = [row["return_sim"] for row in training.rows]
     assert max(promised) > promised[-1]

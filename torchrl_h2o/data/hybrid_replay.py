@@ -66,6 +66,8 @@ class HybridReplayBuffer:
         ValueError: if the real data lack an entry of ``keys``; the message gives a remedy.
 
     Attributes:
+        stream_keys: the entries that :meth:`extend` reads, ``keys`` as given.
+        keys: the entries of a batch apart from ``real``; with ``n_steps`` above 1, more than ``stream_keys``.
         next_observation: the entry of the one-step next state, which discriminators read: ``("next", "observation")``,
             or ``("next", "original_observation")`` if ``n_steps`` is above 1.
 
@@ -100,14 +102,14 @@ class HybridReplayBuffer:
         if real.ndim != 1 or not len(real):
             raise ValueError(f"the real data have the batch size {list(real.batch_size)}, expected [T], T > 0")
         self.batch_size = _require_sizes(batch_size)
-        self._stream_keys = [unravel_key(key) for key in keys]
+        self.stream_keys = [unravel_key(key) for key in keys]
         self.device = torch.device(device)
         self._multi_step = OngoingMultiStep(n_steps, gamma) if n_steps > 1 else None
-        self.keys, self.next_observation = self._stream_keys, ("next", "observation")
+        self.keys, self.next_observation = self.stream_keys, ("next", "observation")
         if self._multi_step is not None:
-            self.keys = multi_step_keys(self._stream_keys)
+            self.keys = multi_step_keys(self.stream_keys)
             self.next_observation = original_key(self.next_observation)
-            real = real if STEPS in real.keys() else self._multi_step.whole(_select(real, self._stream_keys, "real"))
+            real = real if STEPS in real.keys() else self._multi_step.whole(_select(real, self.stream_keys, "real"))
         real = _select(real, self.keys, "real").to(self.device)
         self.real = ReplayBuffer(storage=TensorStorage(real, device=self.device), writer=ImmutableDatasetWriter())
         if sim_memory is not None:
@@ -142,7 +144,7 @@ class HybridReplayBuffer:
         Raises:
             ValueError: if an entry is missing or its shape differs from that of the real data.
         """
-        rows = _select(transitions, self._stream_keys, "simulated")
+        rows = _select(transitions, self.stream_keys, "simulated")
         if self._multi_step is not None:
             rows = self._multi_step.transform(rows)
             if rows is None:
@@ -239,7 +241,7 @@ class HybridReplayBuffer:
                 rows = TensorDict(dict(zip(self.keys, self._sim_rows, strict=True)), [len(self.sim)])
                 rows.cpu().memmap(cast("str", folder / "rows"), copy_existing=True)  # as in write_ted
             if waiting := self._waiting_rows():
-                rows = TensorDict(dict(zip(self._stream_keys, waiting, strict=True)), waiting[0].shape[:-1])
+                rows = TensorDict(dict(zip(self.stream_keys, waiting, strict=True)), waiting[0].shape[:-1])
                 rows.cpu().memmap(cast("str", folder / "waiting"), copy_existing=True)
 
     def loads(self, path: str | Path) -> None:
@@ -254,7 +256,7 @@ class HybridReplayBuffer:
         folder = Path(path)
         state = json.loads((folder / "stream.json").read_text(encoding="utf-8"))
         self._require_same_real(state["real"])
-        for name, keys in (("rows", self.keys), ("waiting", self._stream_keys)):
+        for name, keys in (("rows", self.keys), ("waiting", self.stream_keys)):
             state[name] = []
             if (folder / name).is_dir():
                 rows = load_memory_map(folder / name)
@@ -264,13 +266,13 @@ class HybridReplayBuffer:
     def _waiting_rows(self) -> list[torch.Tensor]:
         """Return the simulated rows whose successors are not known yet, one tensor [*B, T, n] per entry."""
         waiting = None if self._multi_step is None else self._multi_step.waiting
-        return [] if waiting is None else [waiting.get(key) for key in self._stream_keys]
+        return [] if waiting is None else [waiting.get(key) for key in self.stream_keys]
 
     def _restore_waiting_rows(self, waiting: list[torch.Tensor]) -> None:
         if self._multi_step is None:
             return
         # All entries of a transition have one dimension after those of the batch.
-        entries = dict(zip(self._stream_keys, waiting, strict=True)) if waiting else {}
+        entries = dict(zip(self.stream_keys, waiting, strict=True)) if waiting else {}
         self._multi_step.waiting = TensorDict(entries, waiting[0].shape[:-1]) if waiting else None
 
     def _draw(self, rows: list[torch.Tensor], count: int, generator: torch.Generator | None) -> torch.Tensor:

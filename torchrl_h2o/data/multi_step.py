@@ -41,9 +41,9 @@ def _is_next_state(key: NestedKey) -> bool:
 class OngoingMultiStep(MultiStepTransform):
     r"""``MultiStepTransform`` for streams of transitions in time order, whose waiting rows can be saved.
 
-    A row (s, a, r, s') becomes the n-step row with the reward :math:`\sum_{k<m}\gamma^k r_{t+k}`, the next state and the
-    end marks of step t + m - 1, and ``steps_to_next_obs`` = m. m is n, or less where the episode or the run of the data
-    ends before. The one-step next state stays, as ``("next", "original_observation")``; discriminators read it.
+    A row (s, a, r, s') becomes the n-step row with the reward :math:`\sum_{k<m}\gamma^k r_{t+k}`, the next state and
+    the end marks of step t + m - 1, and ``steps_to_next_obs`` = m. m is n, or less where the episode or the run of the
+    data ends before. The one-step next state stays, as ``("next", "original_observation")``; discriminators read it.
 
     Differences from TorchRL's class:
 

@@ -23,8 +23,8 @@ from torchrl_h2o.effects.effect import BatchedForce
 from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 from torchrl_h2o.envs.dynamics_gap import DynamicsGap, transforms_of
 from torchrl_h2o.envs.mujoco_model import find_backend
-from torchrl_h2o.envs.recorded_episode import RecordedEpisode
 from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, roll_out
+from torchrl_h2o.envs.recorded_episode import RecordedEpisode
 from torchrl_h2o.envs.task_rules import rules_of
 
 

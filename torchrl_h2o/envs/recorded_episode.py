@@ -55,9 +55,7 @@ class RecordedEpisode:
         return {"seed": self._seed, **{name: torch.from_numpy(np.array(values)) for name, values in given.items()}}
 
     @classmethod
-    def restored(
-        cls, begin: Callable[[np.random.Generator | None], Episode], state: dict[str, Any]
-    ) -> RecordedEpisode:
+    def restored(cls, begin: Callable[[np.random.Generator | None], Episode], state: dict[str, Any]) -> RecordedEpisode:
         """Begins an episode and brings it to a saved state."""
         episode = cls(begin, state["seed"])
         actions, observations = state["actions"].numpy(), state["observations"].numpy()

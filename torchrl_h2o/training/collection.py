@@ -60,9 +60,7 @@ def simulated_transitions(simulator: EnvBase, actor: torch.nn.Module, steps_per_
     """
     if saves_episodes(simulator):
         return Collector(simulator, actor, frames_per_batch=steps_per_epoch)
-    return Collector(
-        simulator, actor, frames_per_batch=steps_per_epoch, reset_at_each_iter=True, set_truncated=True
-    )
+    return Collector(simulator, actor, frames_per_batch=steps_per_epoch, reset_at_each_iter=True, set_truncated=True)
 
 
 @contextmanager
@@ -83,7 +81,7 @@ def collecting(
         keys: the entries of a transition that Ray's workers send back.
     """
     chosen = _chosen(cfg)
-    options = {"frames_per_batch": cfg.steps_per_epoch, "reset_at_each_iter": True, "set_truncated": True}
+    options = {"frames_per_batch": cfg.steps_per_epoch, "reset_at_each_iter": True}
     with ExitStack() as stack:
         if chosen.backend == "direct":
             collector = simulated_transitions(simulator, actor, cfg.steps_per_epoch)
@@ -91,7 +89,7 @@ def collecting(
             threads = torch.get_num_threads()  # by default TorchRL would divide them among the workers
             stack.callback(torch.set_num_threads, threads)
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": {"num_threads": threads}}
-            collector = Collector(_of_worker(cfg), actor, backend="process", **options)
+            collector = Collector(_of_worker(cfg), actor, backend="process", set_truncated=True, **options)
         elif chosen.backend == "ray":
             stack.enter_context(_ray(chosen))
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": _ray_options(cfg, keys)}
@@ -117,7 +115,9 @@ def _ray_options(cfg: DictConfig, keys: Sequence[NestedKey]) -> dict:
         # Without a total, RayCollector collects nothing.
         "total_frames": Budget.from_config(cfg).epochs * cfg.steps_per_epoch,
         "collector_class": SeededCollector,
-        "collector_kwargs": [{"postproc": methodcaller("select", *keys)} for _ in range(chosen.workers)],
+        "collector_kwargs": [
+            {"postproc": methodcaller("select", *keys), "set_truncated": True} for _ in range(chosen.workers)
+        ],
         "remote_configs": OmegaConf.to_container(chosen.resources),
     }
 

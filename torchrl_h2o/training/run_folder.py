@@ -65,6 +65,14 @@ def check_settings(cfg: DictConfig) -> None:
         raise ValueError(f"keep={cfg.keep}: choose {' or '.join(KEEP)}")
     if cfg.get("compiled") not in (None, "auto", True, False):
         raise ValueError(f"compiled={cfg.compiled}: choose auto, true or false")
+    steps_per_world = cfg.steps_per_epoch // cfg.num_worlds
+    if not 1 <= cfg.get("n_steps", 1) < max(2, steps_per_world):
+        raise ValueError(
+            f"n_steps={cfg.n_steps}: choose 1 to {max(1, steps_per_world - 1)}, less than the {steps_per_world} steps "
+            f"of each world in an epoch (steps_per_epoch={cfg.steps_per_epoch} of num_worlds={cfg.num_worlds})"
+        )
+    if cfg.get("num_qvalue_nets", 2) < 1:
+        raise ValueError(f"num_qvalue_nets={cfg.num_qvalue_nets}: choose at least 1; 2 is usual")
     if cfg.gap is None and cfg.get("gaps") is None and cfg.gap_strength is not None:
         raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
 

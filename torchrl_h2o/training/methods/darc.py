@@ -17,7 +17,9 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     estimator = make_dynamics_ratio_estimator(
         observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
     )
-    corrected = DynamicsRewardCorrection(estimator, scale=cfg.reward_scale, gamma=cfg.gamma)  # corrects the unscaled reward
+    corrected = DynamicsRewardCorrection(
+        estimator, scale=cfg.reward_scale, gamma=cfg.gamma
+    )  # corrects the unscaled reward
     loss = SACLoss(actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
