@@ -155,6 +155,32 @@ def test_noise_of_the_action_differs_from_world_to_world_and_is_seeded_by_torch(
     assert len((first - still).unique(dim=0)) == WORLDS
 
 
+STATEFUL = (ActionDelay(0.08), ActionNoise(0.2), ObservationDelay(0.07))
+
+
+def go_on(env, td, steps):
+    observed = []
+    for _ in range(steps):
+        td = env.step(td.set("action", torch.sin(td["observation"][:, :6] * 3.0)))["next"]
+        observed.append(td["observation"].clone())
+    return td, torch.stack(observed)
+
+
+def test_saved_episodes_go_on_in_another_env_as_in_their_own():
+    def make():
+        return BatchedMujocoEnv(TransformedEnv(TASKS["HalfCheetah"](), DynamicsGap(*STATEFUL)), WORLDS)
+
+    env, other = make(), make()
+    td, _ = go_on(env, env.reset(), 5)
+    state = env.episodes_state()
+    go_on(other, other.reset(), 9)  # its episodes must be discarded
+    _, expected = go_on(env, td.copy(), 6)
+    other.restore_episodes(state)
+    _, found = go_on(other, td.copy(), 6)
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=0.0)
+    assert (other._steps == 11).all()
+
+
 def test_noise_that_the_simulator_should_not_have_is_taken_away():
     noisy = TransformedEnv(TASKS["HalfCheetah"](), dynamics_gap("joint_noise"))
     env = BatchedMujocoEnv(noisy, 2, [ActionNoise(-1.0)])

@@ -50,6 +50,16 @@ def test_without_a_mark_every_step_is_simulated(parts, batch):
     assert corrected["next", "reward"].squeeze(-1).tolist() == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_an_n_step_row_is_corrected_once_for_each_of_its_steps(parts, batch, gamma):
+    batch["steps_to_next_obs"] = 1 + torch.arange(len(batch))[:, None] % 3
+    one_step = DynamicsRewardCorrection(parts.estimator)(batch.clone().exclude("steps_to_next_obs"))
+    n_step = DynamicsRewardCorrection(parts.estimator, gamma=gamma)(batch.clone())
+    counted = torch.tensor([sum(gamma**k for k in range(m)) for m in batch["steps_to_next_obs"].flatten()])
+    correction = [td["next", "reward"].flatten() - batch["next", "reward"].flatten() for td in (n_step, one_step)]
+    torch.testing.assert_close(correction[0], counted.to(correction[1]) * correction[1])
+
+
 def test_where_dynamics_are_equal_darc_is_sac(batch):
     got = []
     for correct in (lambda td: td, DynamicsRewardCorrection(without_gap(Parts().estimator))):

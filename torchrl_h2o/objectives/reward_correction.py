@@ -83,8 +83,8 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
         correction = self.scale * estimated.get(self.estimator.out_keys[0])
         steps = tensordict.get(self.steps_to_next_obs, None)
         if steps is not None:
-            discounts = self.gamma ** torch.arange(int(steps.max()), device=steps.device)
-            correction = correction * discounts.cumsum(0)[like_rows(steps, correction) - 1].to(correction)
+            steps = like_rows(steps, correction).to(correction.dtype)
+            correction = correction * (steps if self.gamma == 1 else (1 - self.gamma**steps) / (1 - self.gamma))
         real = tensordict.get(self.real, None)
         if real is not None:
             correction = torch.where(like_rows(real.bool(), correction), 0.0, correction)

@@ -49,7 +49,7 @@ class OngoingEpisodes:
         current = cast(Any, self._collector)._carrier.exclude("collector").flatten_keys()
         return {
             "simulator": cast(BatchedMujocoEnv, env.base_env).episodes_state(),
-            "transforms": dict(env.transform.state_dict()),
+            "transforms": {key: value.clone() for key, value in env.transform.state_dict().items()},
             "current": {key: value.clone() for key, value in current.items()},
         }
 
