@@ -19,7 +19,7 @@ from torchrl.data import TensorSpec
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
-from torchrl_h2o.training.environments import preprocessing_of, task_of
+from torchrl_h2o.training.environments import preprocessing_of, sim_capacity_of, task_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.returns import BestPolicy, evaluate
@@ -144,7 +144,7 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
         The policy selected by ``keep``, and the training with its metrics.
     """
     real = preprocessing_of(cfg).apply(real)
-    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    replay = HybridReplayBuffer(real, sim_capacity=sim_capacity_of(cfg, len(real)), batch_size=cfg.batch_size)
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
     compiled = cfg.get("compiled", False)  # configurations of earlier versions have no such entry
