@@ -43,7 +43,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
     Returns:
         Arrays by the keys ``way <run>`` and ``states <run>``.
     """
-    asked = {tuple(row[key] for key in IDENTITY): _name(row) for row in told}
+    asked = {tuple(row.get(key, "") for key in IDENTITY): _name(row) for row in told}
     arrays = dict(np.load(path)) if path.exists() else {}
     for summary in sorted(runs.glob("*/summary.json")):
         cfg = load_config(summary.parent)
@@ -59,7 +59,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
 
 
 def _name(row: Mapping[str, str]) -> str:
-    return " ".join(row[key] or "-" for key in IDENTITY)
+    return " ".join(row.get(key) or "-" for key in IDENTITY)
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
