@@ -51,7 +51,8 @@ def points_of(rows: Iterable[Row]) -> Points:
     Runs of SAC in the simulator that is not mended are repeated for every amount of data and every panel of their task.
 
     Raises:
-        MixedRunsError: if two runs differ in settings that the figure does not show.
+        MixedRunsError: if two runs differ in settings that the figure does not show, or a panel has runs of several
+            amounts of data that it does not show.
     """
     points: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in rows:
@@ -68,6 +69,9 @@ def points_of(rows: Iterable[Row]) -> Points:
                     "other settings in another file"
                 )
             runs.append(run)
+    for panel in (POOR, REAL_LOG):
+        if len(sizes := sorted({size for runs in points[panel].values() for size in runs})) > 1:
+            raise MixedRunsError(f"the panel {panel!r} shows one amount of real data, but there are runs of {sizes} s")
     return {panel: points[panel] for panel in PANELS if _has_data(points[panel])}
 
 
@@ -84,6 +88,8 @@ def _speed(row: Row) -> float | None:
 def _places(row: Row, method: str, panel: str) -> list[tuple[str, float]]:
     """Return the panels and seconds of real data in which a run counts."""
     if method == "sac":
+        if row["data_seconds"] or row["data"] != "recorded":
+            return []  # not a run of the grid, which runs SAC with the whole recording only
         sizes = {STANDING: SIZES, FORWARD: (SIZES[0], WHOLE)}.get(panel, ())
         others = [(POOR, 30.0), (REAL_LOG, WHOLE)] if panel == STANDING else []
         return [*((panel, size) for size in sizes), *others]

@@ -74,7 +74,10 @@ def _draw_lines(axis: Axes, methods: Mapping[str, Mapping[float, Sequence[Run]]]
         at = np.array(sizes) * 1.025 ** (number - (len(present) - 1) / 2)  # beside each other, not on top
         style = _style(method)
         axis.plot(at, means, **style)
-        if method != "sac":
+        if method == "sac":  # one set of runs, repeated at every size
+            low, high = np.clip(_ends(intervals[0]), LOWEST, None)
+            axis.fill_between(at, low, high, color=style["color"], alpha=0.12, lw=0)
+        else:
             for x, interval in zip(at, intervals, strict=True):
                 axis.plot([x, x], np.clip(_ends(interval), LOWEST, None), color=style["color"], lw=1.2, alpha=0.6)
         ends[method] = (at[-1], means[-1])
@@ -148,7 +151,7 @@ def _draw_dots(axis: Axes, methods: Mapping[str, Mapping[float, Sequence[Run]]],
         axis.text(113, height, f"{np.mean([run.seconds for run in runs]):.1f} s", fontsize=8, va="center")
     (size,) = {size for sizes in methods.values() for size in sizes}
     axis.set_yticks(range(len(present)), [TITLES[method] for method in present], fontsize=8)
-    axis.set(xlim=LIMITS, ylim=(-0.6, len(present) - 0.4), xlabel="return in reality; seconds balanced")
+    axis.set(xlim=LIMITS, ylim=(-0.6, len(present) - 0.4), xlabel="return in reality; at the right, seconds balanced")
     axis.set_title(f"{panel}, {size:g} s", fontsize=10)
     axis.grid(axis="x", alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
