@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -90,7 +91,7 @@ def _draw_lines(axis: Axes, methods: Mapping[str, Mapping[float, Sequence[Run]]]
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _style(method: str) -> dict:
+def _style(method: str) -> dict[str, Any]:
     """Line of a method: its colour; open squares and dashes in the mended simulator; SAC without markers."""
     colour = COLOURS.get(ALL_METHODS[method.removesuffix("_mended")].title)
     if method.endswith("_mended"):
@@ -145,7 +146,7 @@ def _draw_dots(axis: Axes, methods: Mapping[str, Mapping[float, Sequence[Run]]],
     for height, method in enumerate(present):
         (runs,) = methods[method].values()
         interval = mean_of_runs([_share(run, panel) for run in runs], reps)
-        style = _style(method) | {"ls": "-", "marker": "s" if method.endswith("_mended") else "o"}
+        style: dict[str, Any] = {**_style(method), "ls": "-", "marker": "s" if method.endswith("_mended") else "o"}
         axis.plot(np.clip(_ends(interval), LOWEST, None), [height] * 2, color=style["color"], lw=1.6, alpha=0.6)
         axis.plot(max(interval.value, LOWEST), height, **style)
         axis.text(113, height, f"{np.mean([run.seconds for run in runs]):.1f} s", fontsize=8, va="center")

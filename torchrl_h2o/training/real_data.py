@@ -77,7 +77,7 @@ def first_seconds(real: TensorDictBase, seconds: float, seconds_per_step: float)
             f"data_seconds={seconds:g} selects {rows} transitions of {seconds_per_step:g} s, but the real data have "
             f"{len(real)}, {len(real) * seconds_per_step:g} s: choose at most that, or leave data_seconds out for all"
         )
-    part = real[:rows].clone()
+    part = cast(TensorDictBase, real[:rows]).clone()
     following = cast(TensorDictBase, part["next"])
     following["truncated"][-1] |= ~following["terminated"][-1]
     following["done"][-1] = True
