@@ -38,12 +38,13 @@ from torchrl_h2o.objectives import (
 )
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.environments import sim_capacity_of
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
-from torchrl_h2o.training.real_data import RECORDED, behaviour_of
+from torchrl_h2o.training.real_data import behaviour_of, is_cut
 from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
 from torchrl_h2o.training.task import Task
@@ -67,8 +68,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
     task.make_simulator()  # fails before the data are loaded if an effect does not fit the model
 
     # Data: real transitions in TED, [T]; both streams have the same preprocessing of observations and rewards
-    real = task.read_real_data(cfg.data, cfg.columns)
-    behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
+    real = task.read_real_data(cfg.data, cfg.columns, cfg.data_seconds)
+    behaviour = behaviour_of(real, cut=is_cut(cfg))
     preprocessing = Preprocessing.fit(
         real,
         normalise=cfg.normalise_observation,
@@ -82,7 +83,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     shown = preprocessing.apply(real)
     replay = HybridReplayBuffer(
         shown,
-        sim_capacity=int(cfg.sim_capacity * len(real)),
+        sim_capacity=sim_capacity_of(cfg, len(real)),
         batch_size=cfg.batch_size,
         n_steps=cfg.n_steps,
         gamma=cfg.gamma,
@@ -198,6 +199,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         episodes=cfg.final_episodes,
         settings=settings,
         wall_s=setup_s + training.progress["seconds"],
+        preprocessing=preprocessing,
     )
     film = try_to_film(task, preprocessing, policy, folder) if cfg.render else None
     print(table_of_run(in_reality, folder, film, task.seconds_per_step))

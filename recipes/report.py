@@ -3,6 +3,8 @@
 python recipes/report.py                              # all groups with results
 python recipes/report.py groups=[returns] updates=50000
 python recipes/report.py groups=[wheel_legged] runs=outputs/paper    # with the robot's trajectories
+python recipes/report.py groups=[data_size]           # return against the amount of real data
+python recipes/report.py groups=[] by_seed=[wheel_legged]      # seconds balanced, a line per variant, a column per seed
 python recipes/report.py results=. groups=[mine] +references.Hopper-v5=[0,3200]    # mine.csv; scores 0 and 100
 """
 
@@ -18,7 +20,7 @@ from torchrl_h2o.comparison.results_file import read_rows
 from torchrl_h2o.comparison.robot_figures import draw_robot
 from torchrl_h2o.comparison.robot_trajectories import kept_results
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
-from torchrl_h2o.comparison.tables import of_one_budget, report
+from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_seeds
 
 
 @hydra.main(config_path="config", config_name="report", version_base=None)
@@ -34,12 +36,17 @@ def main(cfg: DictConfig) -> None:
                 asked = "" if cfg.updates is None else f" of {cfg.updates} updates"
                 print(f"{group}: no run{asked} in {results / group}.csv")
                 continue
+            if group == "data_size":
+                report_data_size(rows, to, cfg.reps)
+                continue
             report(group, rows, results, to, references, cfg.reps)
         except MixedRunsError as error:
             refused.append(str(error))
             continue
         if group == "wheel_legged":
             draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))
+    for group in cfg.by_seed:
+        report_seeds(results, group, to, tuple(cfg.at))
     if refused:
         sys.exit("\n".join(refused))
 

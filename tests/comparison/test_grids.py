@@ -1,5 +1,6 @@
 """The paper's grids: their runs, and that no result is lost when a grid is killed or a run fails."""
 
+import csv
 import signal
 import subprocess
 from collections import Counter
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import hydra
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import open_dict
 from torchrl.checkpoint import CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, trained
@@ -122,6 +124,76 @@ def test_every_run_is_an_override_that_hydra_reads():
             parser.parse_overrides(run)
 
 
+def test_the_data_size_figure_has_every_method_at_every_size_and_sac_once(tmp_path):
+    log = tmp_path / "log.txt"
+    log.touch()
+    grid = chosen_grid(paper("figure=data_size", f"log={log}"))
+    runs = list(grid.runs((0, 1)))
+    assert len(runs) == 2 * (4 * 6 + 2 * 6 + 6 + 6 + 2)
+    assert len({tuple(run) for run in runs}) == len(runs)
+    assert runs[50:] == [[*run[:-1], "seed=1"] for run in runs[:50]]  # all of one seed, then the next
+    assert chosen(runs[:50], "env") == {"wheel_legged": 25 + 6, "wheel_legged_forward": 13, "wheel_legged_poor": 6}
+    assert chosen(runs[:50], "data_seconds") == {"2.5": 12, "10": 6, "30": 6 + 6}
+    assert chosen(runs[:50], "data") == {str(log): 6}
+    plain = [run for run in runs[:50] if "method=sac" in run and "mend=true" not in run]
+    assert plain == [["method=sac", f"env={env}", "seed=0"] for env in ("wheel_legged", "wheel_legged_forward")]
+
+
+def test_a_part_of_the_data_size_figure_is_a_selection():
+    cfg = paper("figure=data_size", "tasks=[wheel_legged,wheel_legged_poor]", "methods=[iql,sac]", "sizes=[2.5,83]")
+    assert list(chosen_grid(cfg).runs((3,))) == [
+        ["method=iql", "env=wheel_legged", "data_seconds=2.5", "seed=3"],
+        ["method=sac", "env=wheel_legged", "seed=3"],
+        ["method=iql", "env=wheel_legged", "seed=3"],
+    ]
+    assert not any("data=" in override for run in chosen_grid(paper("figure=data_size")).runs((0,)) for override in run)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["methods=[darc]"], r"methods=\[darc\]: choose iql, cql"),
+        (["sizes=[5]"], r"sizes=\[5\]: choose 2.5, 10.0"),
+        (["sizes=10"], r"give a list, sizes=\[10\]"),
+        (["tasks=[log]"], r"log=standing_still.txt"),
+        (["log=missing.txt"], r"log=missing.txt: there is no such file"),
+        (["gaps=[gravity]"], r"gaps would have no effect"),
+    ],
+)
+def test_a_selection_that_the_data_size_figure_does_not_have_is_said(overrides, said):
+    with pytest.raises(ValueError, match=said):
+        chosen_grid(paper("figure=data_size", *overrides))
+
+
+def test_amounts_of_data_are_selections_of_one_figure_only():
+    with pytest.raises(ValueError, match="only figure=data_size has amounts of real data: leave out sizes"):
+        chosen_grid(paper("figure=wheel_legged", "sizes=[10]"))
+    with pytest.raises(ValueError, match=r"choose with sizes="):
+        check_overrides(["data_seconds=5"], list(FIGURES["data_size"].runs((0,))))
+
+
+def test_runs_that_differ_in_their_data_or_in_mending_have_different_identities():
+    found = {}
+    for run in FIGURES["data_size"].runs((0,)):
+        cfg = paper(*(override for override in run if not override.startswith("mend=")))
+        with open_dict(cfg):
+            cfg.mend = True if "mend=true" in run else None
+            cfg.overrides = run
+        found[tuple(run)] = identity(cfg)
+    assert len({tuple(who.values()) for who in found.values()}) == len(found) == 44
+    assert {who["others"] for who in found.values()} == {""}
+    assert Counter((who["data_seconds"], who["mend"]) for who in found.values()) == {
+        ("2.5", ""): 8,
+        ("2.5", "true"): 4,
+        ("10", ""): 4,
+        ("10", "true"): 2,
+        ("30", ""): 4 + 4,
+        ("30", "true"): 2 + 2,
+        ("", ""): 5 + 5,
+        ("", "true"): 2 + 2,
+    }
+
+
 GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
 
 
@@ -226,6 +298,25 @@ def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path
         adopt_runs(tmp_path / "b.csv", [who, who | {"seed": "z"}])
     assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]
     assert [row["seed"] for row in read_rows(tmp_path / "b_curves.csv")] == ["x"]
+
+
+def test_results_of_an_earlier_version_without_some_columns_are_kept(tmp_path):
+    columns = [column for column in (*IDENTITY, *RESULT) if column not in ("data_seconds", "mend", "mean_v")]
+    old = dict.fromkeys(columns, "1")
+    with open(tmp_path / "a.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerow(old)
+    new = dict.fromkeys((*IDENTITY, *RESULT), "1") | {"mend": "", "data_seconds": "2.5"}
+    same = dict.fromkeys((*IDENTITY, *RESULT), "1") | {"mend": "", "data_seconds": ""}
+    for row in (new, same):
+        append_rows(tmp_path / "a.csv", (*IDENTITY, *RESULT), [row], row)
+    assert read_rows(tmp_path / "a.csv") == [old | {"data_seconds": "", "mend": "", "mean_v": ""}, new]
+    adopt_runs(tmp_path / "b.csv", [same])
+    assert read_rows(tmp_path / "b.csv") == [old | {"data_seconds": "", "mend": "", "mean_v": ""}]
+    with pytest.raises(ValueError, match="has the columns"):
+        append_rows(tmp_path / "a.csv", IDENTITY, [new], new | {"seed": "2"})
+    assert len(read_rows(tmp_path / "a.csv")) == 2
 
 
 def checkpoint_of(folder, method):

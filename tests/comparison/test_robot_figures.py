@@ -27,7 +27,7 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     rows = read_rows(tmp_path / "wheel_legged.csv")
     kept = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
     (run,) = {key.partition(" ")[2] for key in kept}
-    assert run.startswith("h2o_plus wheel_legged/standing_still recorded - - 0 20 expectile 0.3 True ")
+    assert run.startswith("h2o_plus wheel_legged/standing_still recorded - - - - 0 20 expectile 0.3 True ")
     way, states = kept[f"way {run}"], kept[f"states {run}"]
     assert way.shape == (5, 7)  # 1.5 s
     lasts = json.loads((folder / "summary.json").read_text())["return_real"]["mean_length"] * cfg.env.seconds_per_step

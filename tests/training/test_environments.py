@@ -7,10 +7,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
+from torchrl_h2o.data import episodes
 from torchrl_h2o.objectives import make_actor
-from torchrl_h2o.training.environments import as_observed, make_reality, measure_observation_norm
-from torchrl_h2o.training.returns import evaluate
+from torchrl_h2o.training.environments import as_observed, make_reality, measure_observation_norm, preprocessing_of
+from torchrl_h2o.training.returns import SEED, evaluate
 
 CONFIG = Path(__file__).parents[2] / "recipes" / "config"
 
@@ -79,3 +81,31 @@ def test_worlds_at_once_have_episodes_of_their_own_that_count_to_their_ends(cfg,
     assert (at_once.lengths[0], at_once.returns[0]) == (first.lengths[0], pytest.approx(first.mean, rel=1e-4))
     assert evaluate(worlds, actor, episodes=4).returns[:3] == at_once.returns
     assert evaluate(worlds, actor, episodes=2).returns == at_once.returns[:2]
+
+
+@pytest.mark.parametrize("worlds", [None, 3])
+def test_an_evaluation_measures_observations_in_physical_units(cfg, worlds):
+    cfg.env.make.max_episode_steps = 60
+    cfg.observation_norm = {"loc": [1.0, 2.0, 3.0, 4.0], "scale": [0.1, 10.0, 0.5, 2.0]}
+
+    push = TensorDictModule(lambda seen: torch.full((*seen.shape[:-1], 1), 2.0), ["observation"], ["action"])
+    measured = evaluate(make_reality(cfg, worlds), push, 3, physical=preprocessing_of(cfg).physical)
+    raw = make_reality(cfg, worlds, raw=True)
+    torch.manual_seed(SEED)
+    raw.set_seed(SEED)
+    steps = raw.rollout(3 * 60, push, break_when_any_done=False)
+    # an evaluation of one env resets again after each episode, so it skips every other one of the rollout
+    alone = list(episodes(steps))[:5:2] if worlds is None else [next(iter(episodes(stream))) for stream in steps]
+    assert [len(episode) for episode in alone] == measured.lengths
+    assert min(measured.lengths) < 60  # the robot fell
+    for i, episode in enumerate(alone):
+        seen = episode["next", "observation"].double()
+        torch.testing.assert_close(measured.mean_observation[i], seen.mean(0), atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(measured.max_observation[i], seen.abs().amax(0), atol=1e-5, rtol=1e-4)
+    told = measured.observed(["theta", "theta_dot", "x", "v"])["v"]
+    assert told["mean"] == pytest.approx(float(measured.mean_observation[:, 3].mean()))
+    assert told["max_abs"] == pytest.approx(float(measured.max_observation[:, 3].max()))
+
+
+def test_an_evaluation_that_measures_nothing_has_no_statistics(cfg, actor):
+    assert evaluate(make_reality(cfg), actor, episodes=1).observed(["theta"]) == {}

@@ -4,7 +4,7 @@ Methods as in Agarwal et al., Deep Reinforcement Learning at the Edge of the Sta
 2108.13264.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,6 +95,24 @@ def interquartile_means(scores: Scores, reps: int, seed: int = 0) -> dict[str, I
         return lambda x: np.array([metrics.aggregate_iqm(spread(x))])
 
     return {name: _interval(runs, statistic(name), reps, seed) for name, runs in scores.runs.items()}
+
+
+def mean_of_runs(values: Sequence[float], reps: int, seed: int = 0) -> Interval:
+    """Mean of one method's runs, with a bootstrap interval over its seeds; of a single run, the interval is a point.
+
+    Args:
+        values: one per run.
+        reps: number of bootstrap samples.
+        seed: random seed of the bootstrap.
+
+    Example:
+        >>> mean_of_runs([1.0, 2.0, 3.0], reps=100).value
+        2.0
+    """
+    runs = np.array(values, dtype=float)[:, None]
+    if len(runs) == 1:
+        return Interval(*[float(runs[0, 0])] * 3)
+    return _interval(runs, lambda x: np.array([metrics.aggregate_mean(x)]), reps, seed)
 
 
 def improvements(scores: Scores, reps: int, seed: int = 0, base: str = BASE) -> dict[str, Interval]:

@@ -1,4 +1,4 @@
-"""Grids of runs for the paper's tables and figures. A run is a list of overrides of recipes/train.py.
+"""Grids of runs for the paper's tables and figures, and for our own. A run is a list of overrides of recipes/train.py.
 
 The paper is H2O+, Niu et al. (2023), arXiv 2309.12716.
 """
@@ -10,6 +10,7 @@ from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_h2o.comparison.data_size_grid import DataSizeGrid, chosen_data_sizes
 from torchrl_h2o.comparison.results_file import key_of
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.training.methods import METHODS
@@ -94,6 +95,7 @@ FIGURES = {
         variants=(("backbone=expectile",), ("backbone=sparse",)),
     ),
     "wheel_legged": Grid(SIX, tasks=("wheel_legged", "wheel_legged_forward")),
+    "data_size": DataSizeGrid(),  # not in the paper
 }
 
 
@@ -111,13 +113,17 @@ def group_name(cfg: DictConfig) -> str:
     return name
 
 
-def chosen_grid(cfg: DictConfig) -> Grid:
+def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid:
     """Build the requested grid. Options on the command line replace the paper's values.
 
     Raises:
         ValueError: for an unknown value, or an option that has no effect on these runs.
     """
     name = group_name(cfg)
+    if isinstance((TABLES | FIGURES)[name], DataSizeGrid):
+        return chosen_data_sizes(cfg)
+    if idle := [key for key in ("sizes", "log") if cfg[key] is not None]:
+        raise ValueError(f"only figure=data_size has amounts of real data: leave out {' and '.join(idle)}")
     lists = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
     for key, value in lists.items():
         if not OmegaConf.is_list(value):
@@ -150,7 +156,7 @@ def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
         ValueError: for such an override; the message gives the option to use instead.
     """
     selects = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
-    selects["seed"] = "seeds"
+    selects |= {"seed": "seeds", "data_seconds": "sizes", "mend": "methods"}
     of_runs = {key_of(override) for run in runs for override in run}
     if "gap" in of_runs:
         of_runs.add("gap_strength")  # runs without a gap would reject it

@@ -24,6 +24,9 @@ def shared_overrides(overrides: Iterable[str]) -> list[str]:
     return [override for override in overrides if override.partition("=")[0] not in GRID | {"results"}]
 
 
+NAMED = ("seed", "updates", "data_seconds", "mend")  # columns that a folder's name gives with their values
+
+
 class GridLauncher:
     """Launches the unfinished runs of a grid. A failed run does not stop the others and is retried.
 
@@ -111,7 +114,7 @@ class GridLauncher:
         """Return the run's folder inside the sweep's. It depends on the run only, so an interrupted run is found."""
         who = self.identity(run)
         others = who.pop("others")
-        names = [f"{key}_{value}" if key in ("seed", "updates") else value for key, value in who.items() if value]
+        names = [f"{key}_{value}" if key in NAMED else value for key, value in who.items() if value]
         if others:  # may exceed the length of a folder's name
             names.append(sha256(others.encode()).hexdigest()[:8])
         return f"{self.results.stem}/{'__'.join(names).replace('/', '-')}"

@@ -16,23 +16,41 @@ from omegaconf import DictConfig
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.training.run_folder import uninterrupted
 
-IDENTITY = ("method", "env", "data", "gap", "strength", "seed", "updates", "backbone", "mixing", "ratio", "others")
+IDENTITY = (
+    "method",
+    "env",
+    "data",
+    "data_seconds",  # s of real data; empty for all
+    "mend",  # value of the option; empty without
+    "gap",
+    "strength",
+    "seed",
+    "updates",
+    "backbone",
+    "mixing",
+    "ratio",
+    "others",
+)
 RESULT = (
     "return_mean",
     "return_std",
     "episodes",
-    "seconds",
+    "seconds",  # mean length of an episode
+    "mean_v",
+    "max_abs_x",
     "return_data",
     "updates_per_second",
     "versions",
     "command",
 )
 #: overrides not listed in the column ``others``: they have columns of their own, or affect results by rounding only
+#: columns of the results for quantities that the task observes, and their names in summary.json
+OBSERVED = {"mean_v": ("v", "mean"), "max_abs_x": ("x", "max_abs")}
 TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
 #: overrides of paper.py that choose runs
-GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "seeds", "retries"}
+GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "sizes", "log", "seeds", "retries"}
 EVALUATED = {"mean": "return_real", "std": "return_real_std"}
-CURVE = ("at", "return_mean", "return_std")
+CURVE = ("at", "return_mean", "return_std", "seconds")
 
 
 def identity(cfg: DictConfig) -> dict[str, str]:
@@ -43,6 +61,8 @@ def identity(cfg: DictConfig) -> dict[str, str]:
         "method": cfg.method,
         "env": cfg.env.name if task is None else f"{cfg.env.name}/{task}",
         "data": _short(cfg.data),
+        "data_seconds": "" if cfg.get("data_seconds") is None else f"{cfg.data_seconds:g}",
+        "mend": str(cfg.get("mend") or "").lower(),
         "gap": cfg.gap or "",
         "strength": "" if cfg.gap is None else str(float(_strength(cfg))),
         "seed": str(cfg.seed),
@@ -91,17 +111,27 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
         "return_std": _rounded(real["std"]),
         "episodes": real["episodes"],
         "seconds": _rounded(real["mean_length"] * cfg.env.seconds_per_step),
+        **{column: _observed(real, *where) for column, where in OBSERVED.items()},
         "return_data": _rounded(summary["return_data"]["mean"]),
         "updates_per_second": _rounded(summary["updates_per_second"]),
         "versions": " ".join(f"{name}={number}" for name, number in summary["versions"].items()),
         "command": repeating_command(cfg),
     }
     with open(directory / "metrics.csv", newline="") as file:
-        curve = [
-            who | {"at": row["updates"], **{f"return_{key}": _rounded(row[name]) for key, name in EVALUATED.items()}}
-            for row in csv.DictReader(file)
-        ]
+        curve = [who | _point(row, cfg.env.seconds_per_step) for row in csv.DictReader(file)]
     _append(path, result, curve)
+
+
+def _observed(real: Mapping, quantity: str, statistic: str) -> float | str:
+    """Return a statistic of an observed quantity, or an empty text if the task does not observe it."""
+    found = real.get("observed", {}).get(quantity)
+    return "" if found is None else _rounded(found[statistic])
+
+
+def _point(row: Mapping[str, str], seconds_per_step: float) -> dict[str, float | str]:
+    """Return the columns :data:`CURVE` of one evaluation from a row of metrics.csv."""
+    returns = {f"return_{key}": _rounded(row[name]) for key, name in EVALUATED.items()}
+    return {"at": row["updates"], **returns, "seconds": _rounded(float(row["length_real"]) * seconds_per_step)}
 
 
 def _append(path: Path, result: Mapping, curve: Iterable[Mapping]) -> None:
@@ -124,11 +154,17 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
     with open(path, "a+", newline="") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may finish at the same time
         file.seek(0)
-        if any(_key(row) == _key(who) for row in csv.DictReader(file)):
+        earlier = list(csv.DictReader(file))
+        if any(_key(row) == _key(who) for row in earlier):
             return
-        writer = csv.DictWriter(file, list(columns))
-        if file.seek(0, 2) == 0:
+        columns = list(columns)
+        if earlier and (unknown := sorted(earlier[0].keys() - set(columns))):
+            raise ValueError(f"{path} has the columns {', '.join(unknown)}, so it is no file of such results")
+        writer = csv.DictWriter(file, columns)
+        if not earlier or len(earlier[0]) < len(columns):  # the file is empty, or an earlier version wrote it
+            file.truncate(0)
             writer.writeheader()
+            writer.writerows(earlier)
         writer.writerows(rows)
 
 
@@ -150,9 +186,13 @@ def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
 
 
 def _is_group(path: Path) -> bool:
-    """Whether a CSV file has the columns of a results file; the folder may contain other CSV files."""
+    """Whether a CSV file has the columns of a results file; the folder may contain other CSV files.
+
+    Files of earlier versions have fewer columns: :func:`_key` takes missing ones as empty.
+    """
     with open(path, newline="", errors="replace") as file:
-        return next(csv.reader(file), None) == [*IDENTITY, *RESULT]
+        columns = set(next(csv.reader(file), ()))
+    return {"method", "seed", "others", "command"} <= columns <= {*IDENTITY, *RESULT}
 
 
 def curves_of(path: Path) -> Path:
@@ -174,7 +214,7 @@ def recorded(path: Path) -> set[tuple[str, ...]]:
 
 
 def _key(who: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(who[column] for column in IDENTITY)
+    return tuple(who.get(column, "") for column in IDENTITY)
 
 
 def _rounded(value: float | str) -> float:

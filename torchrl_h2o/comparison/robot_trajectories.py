@@ -19,7 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl_h2o.comparison.results_file import IDENTITY, identity
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
-from torchrl_h2o.training.environments import as_observed, make_reality, task_of
+from torchrl_h2o.training.environments import as_observed, make_reality, preprocessing_of, sim_capacity_of, task_of
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import SEED
 from torchrl_h2o.training.run_folder import checkpoint_folder, load_config
@@ -43,7 +43,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
     Returns:
         Arrays by the keys ``way <run>`` and ``states <run>``.
     """
-    asked = {tuple(row[key] for key in IDENTITY): _name(row) for row in told}
+    asked = {tuple(row.get(key, "") for key in IDENTITY): _name(row) for row in told}
     arrays = dict(np.load(path)) if path.exists() else {}
     for summary in sorted(runs.glob("*/summary.json")):
         cfg = load_config(summary.parent)
@@ -59,7 +59,7 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
 
 
 def _name(row: Mapping[str, str]) -> str:
-    return " ".join(row[key] or "-" for key in IDENTITY)
+    return " ".join(row.get(key) or "-" for key in IDENTITY)
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
@@ -79,8 +79,8 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     """Read pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
-    real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns))
-    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds")))
+    replay = HybridReplayBuffer(real, sim_capacity=sim_capacity_of(cfg, len(real)), batch_size=cfg.batch_size)
     title = METHODS[cfg.method].title
     latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
     Checkpoint(replay=replay).load(cast(Path, latest))  # a run with a summary has one
@@ -90,10 +90,7 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
 def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str]) -> torch.Tensor:
     """Select dimensions of the last frame of the learner's observations ``[*B, n]`` and undo their normalisation."""
     names = OBSERVATIONS[cfg.env.make.task]
-    last = observation[..., -len(names) :].double()
-    if cfg.observation_norm is not None:
-        last = last * torch.tensor(list(cfg.observation_norm.scale)) + torch.tensor(list(cfg.observation_norm.loc))
-    return last[..., [names.index(name) for name in wanted]]
+    return preprocessing_of(cfg).physical(observation)[..., [names.index(name) for name in wanted]]
 
 
 def counted(states: np.ndarray) -> np.ndarray:

@@ -63,6 +63,7 @@ def task_of(row: Row) -> Task:
     variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
     gap = f"{row['gap']} {float(row['strength']):g}" if row["gap"] else ""
     others = [row["others"]] if row.get("others") else []
+    others += [f"{name}={row[name]}" for name in ("data_seconds", "mend") if row.get(name)]
     return (row["env"], row["data"], gap, *variant, *others)
 
 
@@ -75,15 +76,20 @@ def placed(rows: Iterable[Row], variants: bool) -> list[Row]:
             If False, these columns are ignored.
     """
     rows = [dict(row) if variants else {**row, **dict.fromkeys(VARIANTS, "")} for row in rows]
-    gaps = {(row["env"], row["data"], row["others"], row["gap"], row["strength"]) for row in rows if row["gap"]}
+    gaps = {(*_data_of(row), row["gap"], row["strength"]) for row in rows if row["gap"]}
     read = []
     for row in rows:
-        present = [gap[3:] for gap in sorted(gaps) if gap[:3] == (row["env"], row["data"], row["others"])]
+        present = [gap[4:] for gap in sorted(gaps) if gap[:4] == _data_of(row)]
         if row["method"] in OFFLINE and not row["gap"] and present:
             read += [{**row, "gap": gap, "strength": strength} for gap, strength in present]
         else:
             read.append(row)
     return read
+
+
+def _data_of(row: Row) -> tuple[str, str, str, str]:
+    """Return what the run of an offline method depends on."""
+    return (row["env"], row["data"], row.get("data_seconds", ""), row["others"])
 
 
 def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:

@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from torchrl_h2o.comparison import data_size
 from torchrl_h2o.comparison.aggregates import BASE, Scores, common_scores, improvements, interquartile_means
+from torchrl_h2o.comparison.data_size_figure import draw_data_size
 from torchrl_h2o.comparison.figures import draw_aggregates, draw_curves
 from torchrl_h2o.comparison.results_file import curves_of, read_rows
 from torchrl_h2o.comparison.scores import (
@@ -16,6 +18,7 @@ from torchrl_h2o.comparison.scores import (
     markdown,
     placed,
 )
+from torchrl_h2o.comparison.seed_table import seed_tables
 from torchrl_h2o.training.methods import METHODS
 
 TITLES = {name: method.title for name, method in METHODS.items()}
@@ -77,6 +80,45 @@ def report(group: str, rows: list[Row], results: Path, to: Path, references: dic
     curves = [row for row in read_rows(curves_of(results / f"{group}.csv")) if row["updates"] in budget]
     if curves:
         draw_curves(to / f"{group}_curves.png", placed(curves, variants), TITLES)
+
+
+def report_data_size(rows: list[Row], to: Path, reps: int) -> None:
+    """Write data_size.md and data_size.png, and print the table.
+
+    Args:
+        rows: rows of the results file of ``figure=data_size``; any part of the grid.
+        to: folder to write to.
+        reps: number of bootstrap samples.
+
+    Raises:
+        MixedRunsError: if two runs differ in settings that the figure does not show.
+    """
+    points = data_size.points_of(rows)
+    if not points:
+        raise MixedRunsError("data_size.csv holds no run of the figure that uses real data")
+    budgets = " or ".join(f"{int(updates):,}" for updates in sorted({row["updates"] for row in rows}, key=int))
+    text = f"{data_size.markdown(points)}\nAfter {budgets} updates, with the last policy.\n"
+    to.mkdir(parents=True, exist_ok=True)
+    (to / "data_size.md").write_text(text)
+    print(f"\ndata_size\n\n{text}")
+    draw_data_size(to / "data_size.png", points, reps)
+
+
+def report_seeds(results: Path, group: str, to: Path, at: Sequence[int]) -> None:
+    """Write GROUP_by_seed.md, a number per seed and variant, and print it.
+
+    Args:
+        results: folder of the results files.
+        group: name of the results file.
+        to: folder to write to.
+        at: numbers of updates, to read the learning curves as well; empty for the final evaluations alone.
+    """
+    text = seed_tables(read_rows(results / f"{group}.csv"))
+    if at:
+        text += "\nDuring training:\n\n" + seed_tables(read_rows(curves_of(results / f"{group}.csv")), at)
+    to.mkdir(parents=True, exist_ok=True)
+    (to / f"{group}_by_seed.md").write_text(text)
+    print(f"\n{group} by seed\n\n{text}")
 
 
 def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:

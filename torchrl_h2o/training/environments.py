@@ -59,6 +59,12 @@ def simulator_maker(cfg: DictConfig) -> Callable[[], EnvBase]:
     return partial(task_of(cfg).make_simulator, cfg.num_worlds, preprocessing_of(cfg))
 
 
+def sim_capacity_of(cfg: DictConfig, num_real: int) -> int:
+    """Largest number of simulated transitions in the replay buffer of a run with ``num_real`` real transitions."""
+    # cfg.get, because configurations of earlier versions have no such entry.
+    return max(cfg.get("sim_capacity_min", 1), int(cfg.sim_capacity * num_real))
+
+
 def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
     """Applies the run's preprocessing to the real transitions."""
     return preprocessing_of(cfg).apply(real)

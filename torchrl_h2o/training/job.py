@@ -13,7 +13,7 @@ from torchrl_h2o.training.environments import measure_observation_norm, preproce
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.loop import Method, train
-from torchrl_h2o.training.real_data import RECORDED, behaviour_of
+from torchrl_h2o.training.real_data import behaviour_of, is_cut
 from torchrl_h2o.training.run_folder import save_config
 
 
@@ -41,11 +41,12 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
         task.make_simulator(1, preprocessing),
         policies,
         trainings,
-        behaviour_of(real, recorded=cfg.data == RECORDED),
+        behaviour_of(real, cut=is_cut(cfg)),
         directory,
         episodes=cfg.final_episodes,
         settings=run_settings(cfg, real),
         wall_s=wall_s,
+        preprocessing=preprocessing,
     )
     film = try_to_film(task, preprocessing, policies[methods[0].title], directory) if cfg.render else None
     tqdm.write(table_of_run(in_reality, directory, film, task.seconds_per_step))
@@ -56,7 +57,7 @@ def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
     task = task_of(cfg)
     task.make_simulator()
     check_collector(cfg)
-    real = task.read_real_data(cfg.data, cfg.columns)
+    real = task.read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds"))
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)
     return real

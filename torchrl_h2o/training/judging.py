@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
+from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
 
@@ -38,6 +39,7 @@ def judge(
     episodes: int,
     settings: Mapping[str, Any],
     wall_s: float,
+    preprocessing: Preprocessing,
 ) -> dict[str, Evaluation]:
     """Evaluates the policies and writes summary.json and learning_curve.png.
 
@@ -52,13 +54,18 @@ def judge(
         episodes: number of episodes in reality.
         settings: further entries of the summary, see :func:`run_settings`.
         wall_s: wall time of the run so far, in s.
+        preprocessing: that of both environments. With it the observations are measured in physical units, if the task
+            names them.
 
     Returns:
         The evaluations in reality by method, and ``behaviour`` under its own name.
     """
     start = time.perf_counter()
     main = next(iter(policies))
-    in_reality = {name: evaluate(reality, policy, episodes) for name, policy in policies.items()}
+    names = task.config.get("observations")
+    physical = None if names is None else preprocessing.physical
+    in_reality = {name: evaluate(reality, policy, episodes, physical=physical) for name, policy in policies.items()}
+    observed = {} if names is None else {"observed": in_reality[main].observed(names)}
     in_simulator = evaluate(simulator, policies[main], 1)
     draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, task)
     write_summary(
@@ -67,7 +74,7 @@ def judge(
             "method": main,
             **settings,
             "updates": trainings[main].updates,
-            "return_real": in_reality[main].summary(),
+            "return_real": in_reality[main].summary() | observed,
             "return_sim": in_simulator.summary(),
             "return_data": behaviour.summary(),
             "baselines": {name: in_reality[name].summary() for name in policies if name != main},
@@ -92,6 +99,7 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
         "gap": cfg.gap,
         "gap_fix": cfg.get("gap_fix"),
         "data": cfg.data,
+        "data_seconds": cfg.get("data_seconds"),
         "transitions": len(real),
         **({key: cfg[key] for key in of_h2o_plus} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
         "seed": cfg.seed,

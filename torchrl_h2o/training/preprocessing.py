@@ -86,6 +86,24 @@ class Preprocessing:
             real.names = None
         return real
 
+    def physical(self, observation: torch.Tensor) -> torch.Tensor:
+        """Recovers the latest observation in physical units, in float64.
+
+        Args:
+            observation: preprocessed observations, ``[*B, frames * n]``.
+
+        Returns:
+            The last of the stacked observations, not normalised, ``[*B, n]``.
+
+        Example:
+            >>> preprocessing = Preprocessing(loc=(1.0,), scale=(10.0,), frames=2)
+            >>> preprocessing.physical(torch.tensor([0.0, 0.5])).tolist()
+            [6.0]
+        """
+        latest = observation[..., -(observation.shape[-1] // self.frames) :].double()
+        norm = self._tensors()
+        return latest * norm["scale"] + norm["loc"] if norm else latest
+
     def reward(self, reward: torch.Tensor) -> torch.Tensor:
         """Computes the reward for the losses from the task's reward. Reported returns use the task's reward."""
         return self.reward_scale * (reward + self.reward_offset)

@@ -6,9 +6,10 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.utils import instantiate
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
@@ -45,6 +46,44 @@ def read_real_data(
     return real
 
 
+def first_seconds(real: TensorDictBase, seconds: float, seconds_per_step: float) -> TensorDictBase:
+    """Selects the first seconds of real data and marks the last transition as the end of its episode.
+
+    The rows do not depend on a seed, so all methods and seeds that use the same amount of data use the same rows.
+    Episodes that end within the selection keep their ends.
+
+    Args:
+        real: the measured transitions, ``[T]``.
+        seconds: duration of the selection, in s; rounded to whole control steps.
+        seconds_per_step: control step, in s.
+
+    Returns:
+        A new tensordict, ``[round(seconds / seconds_per_step)]``. Its last transition is done: truncated, unless the
+        episode terminates there.
+
+    Raises:
+        ValueError: if the data are shorter, or the selection has no transition.
+
+    Example:
+        >>> from torchrl_h2o.envs import WheelLeggedEnv
+        >>> real = WheelLeggedEnv(max_episode_steps=10).rollout(30, break_when_any_done=False)
+        >>> part = first_seconds(real, 0.12, seconds_per_step=0.005)
+        >>> part["next", "truncated"].flatten().nonzero().flatten().tolist()
+        [9, 19, 23]
+    """
+    rows = round(seconds / seconds_per_step)
+    if not 0 < rows <= len(real):
+        raise ValueError(
+            f"data_seconds={seconds:g} selects {rows} transitions of {seconds_per_step:g} s, but the real data have "
+            f"{len(real)}, {len(real) * seconds_per_step:g} s: choose at most that, or leave data_seconds out for all"
+        )
+    part = cast(TensorDictBase, real[:rows]).clone()
+    following = cast(TensorDictBase, part["next"])
+    following["truncated"][-1] |= ~following["terminated"][-1]
+    following["done"][-1] = True
+    return part
+
+
 def is_log(data: str) -> bool:
     """Whether ``data`` is the file of a log, which needs a description of its columns."""
     return Path(data).is_file() and Path(data).suffix not in (".hdf5", ".h5")
@@ -71,16 +110,21 @@ def _cache() -> Path:
     return Path(home) / "torchrl_h2o"
 
 
-def behaviour_of(real: TensorDictBase, *, recorded: bool) -> Evaluation:
+def is_cut(cfg: DictConfig) -> bool:
+    """Whether the real data stop after a number of transitions, whatever the state of the last episode."""
+    return cfg.data == RECORDED or cfg.get("data_seconds") is not None
+
+
+def behaviour_of(real: TensorDictBase, *, cut: bool) -> Evaluation:
     """Returns and lengths of the episodes in the data.
 
     Args:
         real: the measured transitions, ``[T]``.
-        recorded: whether the data come from ``data=recorded``. The recording stops after a number of transitions, so
-            its last episode is incomplete; it is left out unless it terminated or is the only one.
+        cut: whether the data stop after a number of transitions, see :func:`is_cut`. Their last episode is then
+            incomplete; it is left out unless it terminated or is the only one.
     """
     whole = list(episodes(real))
-    if recorded and len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:
+    if cut and len(whole) > 1 and not whole[-1]["next", "terminated"][-1]:
         whole.pop()
     returns = [float(episode["next", "reward"].sum()) for episode in whole]
     return Evaluation(returns, [len(episode) for episode in whole])

@@ -1,9 +1,10 @@
 """Returns of a policy over complete episodes with deterministic actions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -20,10 +21,15 @@ class Evaluation:
     Args:
         returns: one per episode, in units of the reward.
         lengths: one per episode, in control steps.
+        mean_observation: ``[episodes, n]``, mean of each observed quantity over the episode's steps; None if it was
+            not measured.
+        max_observation: ``[episodes, n]``, largest absolute value of each observed quantity in the episode.
     """
 
     returns: list[float]
     lengths: list[int]
+    mean_observation: torch.Tensor | None = None
+    max_observation: torch.Tensor | None = None
 
     @property
     def mean(self) -> float:
@@ -40,9 +46,31 @@ class Evaluation:
     def summary(self) -> dict:
         return {"mean": self.mean, "std": self.std, "episodes": len(self.returns), "mean_length": self.mean_length}
 
+    def observed(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Statistics of the observed quantities over all episodes.
+
+        Args:
+            names: name of each observed quantity, in the order of the observation.
+
+        Returns:
+            By name: ``mean``, the mean over episodes of the mean over an episode, and ``max_abs``, the largest absolute
+            value in any episode, both in the quantity's unit. Empty if the observations were not measured.
+        """
+        if self.mean_observation is None or self.max_observation is None:
+            return {}
+        means, largest = self.mean_observation.mean(0).tolist(), self.max_observation.amax(0).tolist()
+        return {
+            name: {"mean": mean, "max_abs": largest_of_it}
+            for name, mean, largest_of_it in zip(names, means, largest, strict=True)
+        }
+
 
 def evaluate(
-    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], episodes: int, seed: int = SEED
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: int,
+    seed: int = SEED,
+    physical: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> Evaluation:
     """Runs complete episodes without changing the state of torch's global generator.
 
@@ -51,31 +79,50 @@ def evaluate(
         policy: writes ``action``.
         episodes: number of episodes.
         seed: seed of the env and, during the evaluation, of torch.
+        physical: function from the env's observations to the quantities to measure, such as
+            :meth:`~torchrl_h2o.training.preprocessing.Preprocessing.physical`; None measures nothing but returns.
     """
-    returns, lengths = [], []
+    parts: list[_Episodes] = []
     with torch.random.fork_rng(devices=[]), set_exploration_type(ExplorationType.DETERMINISTIC):
         torch.manual_seed(seed)
         env.set_seed(seed)
-        while len(returns) < episodes:
-            of_each, length_of_each = _run_episodes(env, policy)
-            returns += of_each
-            lengths += length_of_each
-    return Evaluation(returns[:episodes], lengths[:episodes])
+        while sum(len(part.returns) for part in parts) < episodes:
+            parts.append(_run_episodes(env, policy, physical))
+    returns, lengths, total, largest = (torch.cat(column)[:episodes] for column in zip(*parts, strict=True))
+    measured = {} if physical is None else {"mean_observation": total / lengths[:, None], "max_observation": largest}
+    return Evaluation(returns.tolist(), lengths.tolist(), **measured)
+
+
+class _Episodes(NamedTuple):
+    """Returns and lengths of N episodes, ``[N]``, and sum and max |.| of their observations, ``[N, n]``."""
+
+    returns: torch.Tensor
+    lengths: torch.Tensor
+    total: torch.Tensor
+    largest: torch.Tensor
 
 
 @torch.no_grad()
-def _run_episodes(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> tuple[list[float], list[int]]:
-    """Runs one episode in each world. Worlds that finish early keep stepping; their further rewards are ignored."""
+def _run_episodes(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    physical: Callable[[torch.Tensor], torch.Tensor] | None,
+) -> _Episodes:
+    """Runs one episode in each world. Worlds that finish early keep stepping; their further steps are ignored."""
     returns = torch.zeros(env.batch_size, dtype=torch.float64)
     lengths = torch.zeros(env.batch_size, dtype=torch.int64)
     running = torch.ones(env.batch_size, dtype=torch.bool)
+    total = largest = returns.new_zeros((*env.batch_size, 1))
     current = env.reset()
     while running.any():
         stepped, current = env.step_and_maybe_reset(policy(current))
         returns += torch.where(running, stepped["next", "reward"].squeeze(-1), 0.0)
+        if physical is not None:
+            seen = torch.where(running[..., None], physical(stepped["next", "observation"]), 0.0)
+            total, largest = total + seen, torch.maximum(largest, seen.abs())
         lengths += running
         running &= ~stepped["next", "done"].squeeze(-1)
-    return returns.reshape(-1).tolist(), lengths.reshape(-1).tolist()
+    return _Episodes(returns.reshape(-1), lengths.reshape(-1), *(x.reshape(-1, x.shape[-1]) for x in (total, largest)))
 
 
 @torch.no_grad()

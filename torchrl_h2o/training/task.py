@@ -15,7 +15,7 @@ from torchrl_h2o.effects import Effect, paper_gap
 from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.training.preprocessing import Preprocessing
-from torchrl_h2o.training.real_data import read_real_data
+from torchrl_h2o.training.real_data import first_seconds, read_real_data
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,14 @@ class Task:
         """Builds an environment with the simulator's dynamics P̂; arguments as for :meth:`make_reality`."""
         return self._make(self.simulator, num_worlds, preprocessing, kwargs)
 
-    def read_real_data(self, data: str, columns: str | None = None) -> TensorDictBase:
-        """Reads the real transitions, ``[T]``; see :func:`~torchrl_h2o.training.real_data.read_real_data`."""
-        return read_real_data(self.config, self.make_reality(), data, columns)
+    def read_real_data(self, data: str, columns: str | None = None, seconds: float | None = None) -> TensorDictBase:
+        """Reads the real transitions, ``[T]``, or the first ``seconds`` of them.
+
+        See :func:`~torchrl_h2o.training.real_data.read_real_data` and
+        :func:`~torchrl_h2o.training.real_data.first_seconds`.
+        """
+        real = read_real_data(self.config, self.make_reality(), data, columns)
+        return real if seconds is None else first_seconds(real, seconds, self.seconds_per_step)
 
     def _make(
         self, effects: tuple[Effect, ...], num_worlds: int | None, preprocessing: Preprocessing | None, kwargs: dict

@@ -11,7 +11,7 @@ from torchrl_h2o.training.job import prepare
 from torchrl_h2o.training.judging import DATA, judge, run_settings, table_of_population, write_failure
 from torchrl_h2o.training.methods.h2o_plus import make_learner
 from torchrl_h2o.training.populations.loop import members_of, train_population
-from torchrl_h2o.training.real_data import RECORDED, behaviour_of
+from torchrl_h2o.training.real_data import behaviour_of, is_cut
 
 
 def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: Path) -> None:
@@ -37,7 +37,7 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
     members = members_of(cfg)  # again, because ``prepare`` has added the normalisation of the observations
     wall_s = time.perf_counter() - start
     outcomes = train_population(make_learner, cfg, members, real, directory)
-    behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
+    behaviour = behaviour_of(real, cut=is_cut(cfg))
     in_reality = {}
     for name, outcome in outcomes.items():
         own, folder = members[name], directory / name
@@ -57,5 +57,6 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
             episodes=own.final_episodes,
             settings=settings,
             wall_s=wall_s + outcome.seconds,
+            preprocessing=preprocessing,
         )["H2O+"]
     tqdm.write(table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step))

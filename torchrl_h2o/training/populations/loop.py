@@ -18,7 +18,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
 from torchrl_h2o.training.compiling import maybe_compiled
-from torchrl_h2o.training.environments import as_observed
+from torchrl_h2o.training.environments import as_observed, sim_capacity_of
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
@@ -120,7 +120,7 @@ def train_population(
         (directory / name).mkdir(parents=True, exist_ok=True)
         save_config(own, directory / name)
     real = as_observed(cfg, real)
-    capacity = int(cfg.sim_capacity * len(real))
+    capacity = sim_capacity_of(cfg, len(real))
     replay = PopulationReplay(
         real,
         capacity,
