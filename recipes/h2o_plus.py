@@ -3,7 +3,7 @@
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
-python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the corrected simulator
+python recipes/h2o_plus.py mend=true                                   # first adds what the simulator lacks to it
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
 
@@ -40,6 +40,7 @@ from torchrl_h2o.objectives import (
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.real_data import RECORDED, behaviour_of
@@ -67,6 +68,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Data: real transitions in TED, [T]; both streams have the same preprocessing of observations and rewards
     real = task.read_real_data(cfg.data, cfg.columns)
+    cfg.mended = find_missing_effects(cfg, task, real, folder)  # null unless mend=true or mend=posterior
+    task = task.mended(cfg.mended)
     behaviour = behaviour_of(real, recorded=cfg.data == RECORDED)
     preprocessing = Preprocessing.fit(
         real,
@@ -82,7 +85,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     replay = HybridReplayBuffer(shown, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
 
     # Environments: to collect, to evaluate during training, and for the evaluation at the end
-    simulator = task.make_simulator(cfg.num_worlds, preprocessing)
+    simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
     reality = task.make_reality(cfg.eval_episodes, preprocessing)
     trials = task.make_simulator(cfg.eval_episodes, preprocessing) if keeps_best(cfg) else None
     final_reality = task.make_reality(cfg.final_episodes, preprocessing)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import Judgement
@@ -14,6 +15,7 @@ from torchrl_h2o.residuals.report.contents import (
     FoundEffect,
     IndistinguishableGroup,
     Interval,
+    Intervals,
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
@@ -43,6 +45,7 @@ def compose_report(
     simulation, measured = evidence.simulation, judgement.measured
     names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
     words = partial(effect_words, names=names)
+    intervals = _intervals_by_effect(explanation)
     return Report(
         simulator=simulation.name,
         data=_data_summary(measured),
@@ -59,7 +62,13 @@ def compose_report(
         ),
         rejected=_rejected(explanation, judgement, words),
         indistinguishable=tuple(
-            IndistinguishableGroup(group.effects, group.errors, group.separated_by, tuple(map(words, group.effects)))
+            IndistinguishableGroup(
+                group.effects,
+                group.errors,
+                group.separated_by,
+                tuple(map(words, group.effects)),
+                tuple(intervals.get(effect, {}) for effect in group.effects),
+            )
             for group in judgement.alternatives
         ),
         two_sample=judgement.two_sample,
@@ -73,6 +82,13 @@ def compose_report(
 def inconclusive_report(simulation: Simulation, measured: Measured, reason: str) -> Report:
     """The report if the data or the simulator allow no conclusion."""
     return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
+
+
+def _intervals_by_effect(explanation: Explanation) -> dict[Effect, Intervals]:
+    """95 % intervals of the effects found and of their alternatives."""
+    attempts = (attempt for group in explanation.trace.groups for attempt in group)
+    found = {part.effect: part.ci95 for part in explanation.parts}
+    return {attempt.effect: attempt.fit.ci95(attempt.index) for attempt in attempts} | found
 
 
 def _data_summary(measured: Measured) -> DataSummary:
