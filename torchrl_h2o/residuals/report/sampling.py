@@ -10,6 +10,7 @@ from scipy.stats import truncnorm
 
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.report.contents import Intervals, ReportContents
+from torchrl_h2o.residuals.report.words import effect_name
 
 Explained = list[tuple[Effect, Intervals]]  # effects, each with the 95 % intervals of its parameters
 HALF_WIDTH = 1.96  # of a 95 % interval, in standard deviations of a normal distribution
@@ -35,7 +36,7 @@ def explanations_of(report: ReportContents) -> list[Explained]:
     explanations = [found]
     for group in report.indistinguishable:
         for index, (effect, _) in enumerate(found):
-            if effect == group.effects[0]:
+            if effect_name(effect) == effect_name(group.effects[0]):
                 others = zip(group.effects[1:], group.ci95[1:], strict=True)
                 explanations += [[*found[:index], other, *found[index + 1 :]] for other in others]
     return explanations
