@@ -14,13 +14,14 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from filelock import FileLock
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from torchrl_h2o import __version__
 from torchrl_h2o.effects import Effect, effect_to_dict
@@ -61,6 +62,7 @@ def cached_report(
     with FileLock(cached.with_suffix(".lock")):  # another process may be at the same search; its report is then read
         if not cached.exists():
             chosen = f"{len(rows)} of {len(real)} rows" if len(rows) < len(real) else f"all {len(real)} rows"
+            tqdm.write(f"mend: searching {chosen} for effects that the simulator lacks; this takes minutes")
             report = close_the_loop(simulator, rows, source=f"{source}, {chosen}", **SEARCH)
             write_whole(report, cached)
     copied = Path(tempfile.mkdtemp(dir=folder.parent)) / folder.name
@@ -86,7 +88,7 @@ def searched_rows(real: TensorDictBase) -> TensorDictBase:
     if len(real) <= MOST_ROWS:
         return real
     starts = np.linspace(0, len(real) - BLOCK, MOST_ROWS // BLOCK).round().astype(int)
-    return torch.cat([real[start : start + BLOCK] for start in starts])
+    return cast(TensorDictBase, torch.cat([real[start : start + BLOCK] for start in starts]))  # typed as a tensor
 
 
 def digest(make: Mapping[str, Any], effects: tuple[Effect, ...], rows: TensorDictBase) -> str:

@@ -90,7 +90,6 @@ def report_of_run(directory: Path) -> Report | None:
 
 def _search(task: Task, real: TensorDictBase, data: str, folder: Path) -> Report:
     source = Path(data).name if Path(data).exists() else data
-    tqdm.write("mend: searching the real data for effects that the simulator lacks; this takes minutes")
     try:
         return cached_report(task.make_simulator(), task.simulator, task.config["make"], real, source, folder)
     except Exception as error:  # of any kind, because training is possible without the result

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -85,8 +85,9 @@ class Task:
         """
         if found is None:
             return self
-        worlds = tuple((*self.simulator, *_effects(own)) for own in found["worlds"] or ())
-        return replace(self, simulator=(*self.simulator, *_effects(found["effects"])), worlds=worlds)
+        plain: Any = OmegaConf.to_container(found) if isinstance(found, DictConfig) else found
+        worlds = tuple((*self.simulator, *map(effect_from_dict, own)) for own in plain["worlds"] or ())
+        return replace(self, simulator=(*self.simulator, *map(effect_from_dict, plain["effects"])), worlds=worlds)
 
     @property
     def name(self) -> str:
@@ -159,7 +160,3 @@ def _effects_of_report(path: str) -> tuple[Effect, ...]:
     if not effects:
         raise ValueError(f"gap_fix={path}: this report contains no effects to add to the simulator; leave gap_fix out")
     return effects
-
-
-def _effects(entries: Sequence[Mapping[str, Any]]) -> tuple[Effect, ...]:
-    return tuple(map(effect_from_dict, cast("list[dict[str, Any]]", OmegaConf.to_container(OmegaConf.create(entries)))))
