@@ -12,10 +12,10 @@ from torchrl_h2o.residuals.measured.outside import DISTURBED
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
+    Fitted,
     FoundEffect,
     IndistinguishableGroup,
     Interval,
-    Intervals,
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
@@ -45,7 +45,7 @@ def compose_report(
     simulation, measured = evidence.simulation, judgement.measured
     names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
     words = partial(effect_words, names=names)
-    intervals = _intervals_by_effect(explanation)
+    together = _fitted_together(explanation)
     return Report(
         simulator=simulation.name,
         data=_data_summary(measured),
@@ -67,7 +67,7 @@ def compose_report(
                 group.errors,
                 group.separated_by,
                 tuple(map(words, group.effects)),
-                tuple(intervals.get(effect, {}) for effect in group.effects),
+                tuple(together.get(effect, ()) for effect in group.effects),
             )
             for group in judgement.alternatives
         ),
@@ -84,11 +84,17 @@ def inconclusive_report(simulation: Simulation, measured: Measured, reason: str)
     return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
 
 
-def _intervals_by_effect(explanation: Explanation) -> dict[Effect, Intervals]:
-    """95 % intervals of the effects found and of their alternatives."""
-    attempts = (attempt for group in explanation.trace.groups for attempt in group)
-    found = {part.effect: part.ci95 for part in explanation.parts}
-    return {attempt.effect: attempt.fit.ci95(attempt.index) for attempt in attempts} | found
+def _fitted_together(explanation: Explanation) -> dict[Effect, Fitted]:
+    """By alternative: the explanation that contains it, as fitted; empty if an undeclared force changed the values."""
+    trace, count = explanation.trace, len(explanation.trace.fit.effects)
+    if explanation.effects[:count] != trace.fit.effects:
+        return {}
+    further = tuple((part.effect, part.ci95) for part in explanation.parts[count:])
+    attempts = [attempt for group in trace.groups for attempt in group]
+    return {
+        attempt.effect: (*((e, attempt.fit.ci95(i)) for i, e in enumerate(attempt.fit.effects)), *further)
+        for attempt in attempts
+    }
 
 
 def _data_summary(measured: Measured) -> DataSummary:

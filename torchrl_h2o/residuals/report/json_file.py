@@ -79,11 +79,11 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
                             "name": effect_name(effect),
                             "words": words,
                             "error": error,
-                            "ci95": ci95,
                             "effect": effect_to_dict(effect),
+                            "together": [{"ci95": ci95, "effect": effect_to_dict(other)} for other, ci95 in together],
                         }
-                        for effect, error, words, ci95 in zip(
-                            group.effects, group.errors, group.words, group.ci95, strict=True
+                        for effect, error, words, together in zip(
+                            group.effects, group.errors, group.words, group.together, strict=True
                         )
                     ],
                     "separated_by": group.separated_by,
@@ -208,7 +208,11 @@ def _group(entry: Mapping[str, Any]) -> IndistinguishableGroup:
         errors=tuple(_float(member["error"]) for member in members),
         separated_by=entry["separated_by"],
         words=tuple(member["words"] for member in members if "words" in member),
-        ci95=tuple(_intervals(member.get("ci95", {})) for member in members),  # not in files of earlier versions
+        together=tuple(
+            tuple((effect_from_dict(other["effect"]), _intervals(other["ci95"])) for other in member["together"])
+            for member in members
+            if "together" in member  # not in files of earlier versions
+        ),
     )
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from scipy.stats import truncnorm
 
 from torchrl_h2o.effects import Effect
-from torchrl_h2o.residuals.report.contents import Intervals, ReportContents
+from torchrl_h2o.residuals.report.contents import Fitted, Intervals, ReportContents
 from torchrl_h2o.residuals.report.words import effect_name
 
-Explained = list[tuple[Effect, Intervals]]  # effects, each with the 95 % intervals of its parameters
 HALF_WIDTH = 1.96  # of a 95 % interval, in standard deviations of a normal distribution
 
 
@@ -27,19 +26,23 @@ def sample(report: ReportContents, n: int, *, seed: int = 0) -> list[tuple[Effec
     ]
 
 
-def explanations_of(report: ReportContents) -> list[Explained]:
+def explanations_of(report: ReportContents) -> list[Fitted]:
     """The report's explanation, then one for each alternative, in which the alternative replaces its effect.
 
     Two effects are never replaced at once: alternatives were compared with the data one at a time.
     """
-    found: Explained = [(part.effect, part.ci95) for part in report.found]
-    explanations = [found]
-    for group in report.indistinguishable:
-        for index, (effect, _) in enumerate(found):
-            if effect_name(effect) == effect_name(group.effects[0]):
-                others = zip(group.effects[1:], group.ci95[1:], strict=True)
-                explanations += [[*found[:index], other, *found[index + 1 :]] for other in others]
-    return explanations
+    found: Fitted = tuple((part.effect, part.ci95) for part in report.found)
+    alternatives = [
+        together or _replaced(found, group.effects[0], effect)
+        for group in report.indistinguishable
+        for effect, together in zip(group.effects[1:], group.together[1:], strict=True)
+    ]
+    return [found, *alternatives]
+
+
+def _replaced(found: Fitted, old: Effect, new: Effect) -> Fitted:
+    """The explanation with another effect in an effect's place, and the values of the others unchanged."""
+    return tuple((new, {}) if effect_name(effect) == effect_name(old) else (effect, ci95) for effect, ci95 in found)
 
 
 def _drawn(effect: Effect, intervals: Intervals, rng: np.random.Generator) -> Effect:
