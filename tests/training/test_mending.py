@@ -10,7 +10,7 @@ import torch
 from omegaconf import OmegaConf
 from torchrl.envs import GymEnv
 
-from tests.small_runs import ROOT, run
+from tests.small_runs import ROBOT, ROOT, SMALL, run
 from torchrl_h2o.effects import ActionDelay, Gravity
 from torchrl_h2o.envs import mujoco_model
 from torchrl_h2o.residuals import Report
@@ -248,11 +248,27 @@ def test_the_end_of_a_run_shows_what_was_found_and_then_the_returns(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_posterior_run_collects_in_its_draws_and_is_resumed_and_evaluated_like_any_other(command, tmp_path):
+    out = tmp_path / "out"
+    found(Gravity(0.5), others=(ActionDelay(0.01),)).save(out / "mended")
+    chosen = [*SMALL, *ROBOT, "updates=20", "gap=gravity", "mend=posterior", "hydra.run.dir=out"]
+    printed = run(command(*chosen))
+    assert f"num_worlds={POSTERIOR_WORLDS} instead of 4" in printed
+    assert printed.count("Your simulator lacks") == 2
+    saved = load_config(out)
+    assert len(saved.mended.worlds) == saved.num_worlds == POSTERIOR_WORLDS
+    assert "Your simulator lacks" in run(command("resume=out"))
+    assert load_config(out) == saved
+    assert "H2O+ in simulator" in run(
+        command("checkpoint=out", "in=simulator", "episodes=1", "film=null", script="evaluate.py")
+    )
+    assert json.loads((out / "summary.json").read_text())["mended"]["error"]["after"] == 0.1
+
+
+@pytest.mark.slow
 def test_one_command_mends_trains_and_reports_both(command, tmp_path):
     """The real log is too short for a conclusion, which is a result as well: the run trains and says so."""
-    small = ["updates=20", "updates_per_epoch=20", "steps_per_epoch=40", "eval_episodes=1", "final_episodes=1"]
-    small += ["num_cells=[8,8]", "batch_size=[8,8]", "discriminator_batch_size=[8,8]", "render=false", "threads=1"]
-    small += ["env.make.max_episode_steps=40", "env.recording.num_transitions=150", "mend=true"]
+    small = [*SMALL, *ROBOT, "updates=20", "env.recording.num_transitions=150", "mend=true"]
     for script, more in (("h2o_plus.py", []), ("train.py", ["method=sac"]), ("train.py", ["seeds=[0,1]"])):
         out = Path(script).stem + str(len(more) and more[0][0])
         printed = run(command(*small, *more, f"hydra.run.dir={out}", script=script))
