@@ -3,7 +3,7 @@
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
-python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the corrected simulator
+python recipes/h2o_plus.py mend=true                                   # first adds what the simulator lacks to it
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
 
@@ -41,6 +41,7 @@ from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import sim_capacity_of
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
@@ -69,6 +70,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Data: real transitions in TED, [T]; both streams have the same preprocessing of observations and rewards
     real = task.read_real_data(cfg.data, cfg.columns, cfg.data_seconds)
+    cfg.mended = find_missing_effects(cfg, task, real, folder)  # null unless mend=true or mend=posterior
+    task = task.mended(cfg.mended)
     behaviour = behaviour_of(real, cut=is_cut(cfg))
     preprocessing = Preprocessing.fit(
         real,
@@ -90,7 +93,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     )
 
     # Environments: to collect, to evaluate during training, and for the evaluation at the end
-    simulator = task.make_simulator(cfg.num_worlds, preprocessing)
+    simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
     reality = task.make_reality(cfg.eval_episodes, preprocessing)
     trials = task.make_simulator(cfg.eval_episodes, preprocessing) if keeps_best(cfg) else None
     final_reality = task.make_reality(cfg.final_episodes, preprocessing)

@@ -103,7 +103,7 @@ class OngoingMultiStep(MultiStepTransform):
         # The rows after the end only complete the windows; the end mark keeps them out of every sum.
         after = cast(TensorDictBase, ended[:1].expand(self.n_steps))
         fresh = OngoingMultiStep(self.n_steps, self.gamma)
-        rows = fresh.transform(torch.cat([ended, after]))
+        rows = fresh.transform(cast(TensorDictBase, torch.cat([ended, after])))
         return cast(TensorDictBase, rows)
 
     @property

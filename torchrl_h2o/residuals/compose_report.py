@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import Judgement
@@ -11,6 +12,7 @@ from torchrl_h2o.residuals.measured.outside import DISTURBED
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
+    Fitted,
     FoundEffect,
     IndistinguishableGroup,
     Interval,
@@ -43,6 +45,7 @@ def compose_report(
     simulation, measured = evidence.simulation, judgement.measured
     names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
     words = partial(effect_words, names=names)
+    together = _fitted_together(explanation)
     return Report(
         simulator=simulation.name,
         data=_data_summary(measured),
@@ -59,7 +62,13 @@ def compose_report(
         ),
         rejected=_rejected(explanation, judgement, words),
         indistinguishable=tuple(
-            IndistinguishableGroup(group.effects, group.errors, group.separated_by, tuple(map(words, group.effects)))
+            IndistinguishableGroup(
+                group.effects,
+                group.errors,
+                group.separated_by,
+                tuple(map(words, group.effects)),
+                tuple(together.get(effect, ()) for effect in group.effects),
+            )
             for group in judgement.alternatives
         ),
         two_sample=judgement.two_sample,
@@ -73,6 +82,19 @@ def compose_report(
 def inconclusive_report(simulation: Simulation, measured: Measured, reason: str) -> Report:
     """The report if the data or the simulator allow no conclusion."""
     return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
+
+
+def _fitted_together(explanation: Explanation) -> dict[Effect, Fitted]:
+    """By alternative: the explanation that contains it, as fitted; empty if an undeclared force changed the values."""
+    trace, count = explanation.trace, len(explanation.trace.fit.effects)
+    if explanation.effects[:count] != trace.fit.effects:
+        return {}
+    further = tuple((part.effect, part.ci95) for part in explanation.parts[count:])
+    attempts = [attempt for group in trace.groups for attempt in group]
+    return {
+        attempt.effect: (*((e, attempt.fit.ci95(i)) for i, e in enumerate(attempt.fit.effects)), *further)
+        for attempt in attempts
+    }
 
 
 def _data_summary(measured: Measured) -> DataSummary:

@@ -15,8 +15,9 @@ from torchrl_h2o.training.task import Task
 
 def task_of(cfg: DictConfig) -> Task:
     """Builds the task of a run; raises the errors of :meth:`Task.from_config`."""
-    # cfg.get, because configurations of earlier versions have no gap_fix.
-    return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.get("gap_fix"))
+    # cfg.get, because configurations of earlier versions have no gap_fix and no mended.
+    found = {"gap_fix": cfg.get("gap_fix"), "mended": cfg.get("mended")}
+    return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, **found)
 
 
 def preprocessing_of(cfg: DictConfig) -> Preprocessing:
@@ -56,7 +57,7 @@ def make_simulator(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool 
 
 def simulator_maker(cfg: DictConfig) -> Callable[[], EnvBase]:
     """Picklable factory of the run's simulator for worker processes; report files are read in this process."""
-    return partial(task_of(cfg).make_simulator, cfg.num_worlds, preprocessing_of(cfg))
+    return partial(task_of(cfg).make_training_simulator, cfg.num_worlds, preprocessing_of(cfg))
 
 
 def sim_capacity_of(cfg: DictConfig, num_real: int) -> int:

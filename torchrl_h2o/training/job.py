@@ -13,6 +13,7 @@ from torchrl_h2o.training.environments import measure_observation_norm, preproce
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.loop import Method, train
+from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.real_data import behaviour_of, is_cut
 from torchrl_h2o.training.run_folder import save_config
 
@@ -27,6 +28,8 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
     """
     start = time.perf_counter()
     real = prepare(cfg, directory)
+    cfg.mended = find_missing_effects(cfg, task_of(cfg), real, directory)
+    save_config(cfg, directory)
     wall_s = time.perf_counter() - start
 
     policies, trainings = {}, {}

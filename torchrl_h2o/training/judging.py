@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
+from torchrl_h2o.training.mending import lines_of_mending, summary_of_mending
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
@@ -98,6 +99,7 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
         "env": cfg.env.name,
         "gap": cfg.gap,
         "gap_fix": cfg.get("gap_fix"),
+        "mend": cfg.get("mend"),
         "data": cfg.data,
         "data_seconds": cfg.get("data_seconds"),
         "transitions": len(real),
@@ -107,11 +109,15 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
 
 
 def write_summary(directory: Path, summary: dict) -> None:
-    """Writes summary.json, and adds the versions of the packages and the command."""
-    summary = summary | {
-        "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
-        "command": shlex.join(["python", *sys.argv]),
-    }
+    """Writes summary.json, and adds the result of ``mend``, the versions of the packages and the command."""
+    summary = (
+        summary
+        | summary_of_mending(directory)
+        | {
+            "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
+            "command": shlex.join(["python", *sys.argv]),
+        }
+    )
     (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
 
 
@@ -130,7 +136,7 @@ def _commit() -> dict[str, str]:
 def table_of_run(
     in_reality: Mapping[str, Evaluation], directory: Path, film: Path | None, seconds_per_step: float
 ) -> str:
-    """Format mean return and length of the episodes in reality, one line per policy, and the names of the files.
+    """Format what ``mend`` found, returns and lengths of the episodes in reality by policy, and the names of the files.
 
     Args:
         in_reality: evaluations by the name of the policy.
@@ -140,6 +146,7 @@ def table_of_run(
     """
     folder = os.path.relpath(directory)
     lines = [
+        *lines_of_mending([directory]),
         *_lines(in_reality, seconds_per_step),
         f"\nresults    {folder}/summary.json, metrics.csv",
         f"look at    {folder}/learning_curve.png" + (f", {film.name}" if film else ""),
@@ -152,6 +159,7 @@ def table_of_population(in_reality: Mapping[str, Evaluation | None], directory: 
     """Format the same table for a population, one line per member; None stands for a member that failed."""
     folder = os.path.relpath(directory)
     lines = [
+        *lines_of_mending([directory / name for name in in_reality]),
         *_lines(in_reality, seconds_per_step),
         f"\nresults    {folder}/*/summary.json, metrics.csv, learning_curve.png",
         f"replay     python recipes/evaluate.py checkpoint={folder}/{next(iter(in_reality))}",

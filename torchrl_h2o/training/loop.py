@@ -68,7 +68,7 @@ class Trainee:
         self._open = ExitStack()
         self._collector = self._best = None
         if self.learner.simulates:
-            simulator = task.make_simulator(cfg.num_worlds, self._preprocessing)
+            simulator = task.make_training_simulator(cfg.num_worlds, self._preprocessing)
             self._collector = self._open.enter_context(collecting(cfg, simulator, self._actor, replay.stream_keys))
             self._rollouts = iter(self._collector)
             self.components["episodes"] = self._episodes = OngoingEpisodes(self._collector)

@@ -97,7 +97,7 @@ def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
         )
     made_of = [config[key] for key in ("make", "reality", "behaviour", "recording")]
     digest = hashlib.sha256(json.dumps([made_of, __version__], sort_keys=True).encode()).hexdigest()[:12]
-    folder = _cache() / f"{config['name']}_{digest}"
+    folder = cache_folder() / f"{config['name']}_{digest}"
     if not folder.exists():
         data = record(reality, instantiate(config["behaviour"]), **config["recording"])
         with contextlib.suppress(DataError):  # another run may have written the folder in the meantime
@@ -105,7 +105,8 @@ def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
     return read_ted(folder)
 
 
-def _cache() -> Path:
+def cache_folder() -> Path:
+    """Folder for what runs share: recordings, and the reports of ``mend``."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(home) / "torchrl_h2o"
 

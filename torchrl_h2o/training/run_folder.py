@@ -16,6 +16,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from torchrl_h2o.training.mending import check_mending
+
 KEEP = ("last", "best_in_simulator")
 
 
@@ -46,6 +48,7 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         cfg = load_config(directory)
     else:
         check_settings(cfg)
+        check_mending(cfg)
         resolve_paths(cfg)
         save_config(cfg, directory)
     torch.set_num_threads(cfg.threads)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 from hydra.utils import instantiate
@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 
-from torchrl_h2o.effects import Effect, paper_gap
+from torchrl_h2o.effects import Effect, effect_from_dict, paper_gap
 from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.training.preprocessing import Preprocessing
@@ -29,18 +29,28 @@ class Task:
         config: the resolved ``env`` section of a configuration: ``name``, ``make`` (target and arguments of one env),
             ``seconds_per_step``, and optionally ``batched``, ``reward``, ``columns``, ``behaviour``, ``recording``.
         reality: effects of the target dynamics P.
-        simulator: effects of the simulator P̂, including the dynamics gap and the correction by ``gap_fix``, if any.
+        simulator: effects of the simulator P̂, including the dynamics gap and the correction by ``gap_fix`` or
+            ``mend``, if any.
         gap: name of the paper's dynamics gap in the simulator, or None.
+        worlds: effects of each world in which transitions are collected, with ``mend=posterior``; empty if all have
+            those of the simulator.
     """
 
     config: Mapping[str, Any]
     reality: tuple[Effect, ...]
     simulator: tuple[Effect, ...]
     gap: str | None = None
+    worlds: tuple[tuple[Effect, ...], ...] = ()
 
     @classmethod
     def from_config(
-        cls, env: DictConfig, *, gap: str | None = None, gap_strength: float | None = None, gap_fix: str | None = None
+        cls,
+        env: DictConfig,
+        *,
+        gap: str | None = None,
+        gap_strength: float | None = None,
+        gap_fix: str | None = None,
+        mended: Mapping[str, Any] | None = None,
     ) -> Task:
         """Builds a task from a configuration.
 
@@ -49,6 +59,7 @@ class Task:
             gap: name of one of the paper's dynamics gaps, for the simulator.
             gap_strength: strength of the gap. Defaults to the paper's value.
             gap_fix: path of a ``report.json``, whose effects are added to the simulator after all others.
+            mended: effects that the run has found with ``mend``, see :meth:`mended`.
 
         Raises:
             ValueError: for an unknown gap, or a report without effects.
@@ -61,7 +72,22 @@ class Task:
             simulator.extend(_effects_of_report(gap_fix))
         reality = tuple(instantiate(effect) for effect in env.reality)
         config = cast(dict[str, Any], OmegaConf.to_container(env, resolve=True))
-        return cls(config, reality, tuple(simulator), gap)
+        return cls(config, reality, tuple(simulator), gap).mended(mended)
+
+    def mended(self, found: Mapping[str, Any] | None) -> Task:
+        """Returns the task with further effects in its simulator.
+
+        Args:
+            found: the entry ``mended`` of a run's configuration, see
+                :func:`~torchrl_h2o.training.mending.find_missing_effects`: ``effects``, a list of effects as
+                dictionaries, and ``worlds``, one such list for each world of the collection, or None for the same
+                effects in all worlds. None leaves the task unchanged.
+        """
+        if found is None:
+            return self
+        plain: Any = OmegaConf.to_container(found) if isinstance(found, DictConfig) else found
+        worlds = tuple((*self.simulator, *map(effect_from_dict, own)) for own in plain["worlds"] or ())
+        return replace(self, simulator=(*self.simulator, *map(effect_from_dict, plain["effects"])), worlds=worlds)
 
     @property
     def name(self) -> str:
@@ -97,6 +123,19 @@ class Task:
         """Builds an environment with the simulator's dynamics P̂; arguments as for :meth:`make_reality`."""
         return self._make(self.simulator, num_worlds, preprocessing, kwargs)
 
+    def make_training_simulator(self, num_worlds: int, preprocessing: Preprocessing | None = None) -> EnvBase:
+        """Builds the simulator in which transitions are collected.
+
+        With ``mend=posterior`` each world has its own effects; otherwise it equals :meth:`make_simulator`.
+
+        Raises:
+            ValueError: if there are effects for another number of worlds.
+        """
+        if not self.worlds:
+            return self.make_simulator(num_worlds, preprocessing)
+        env = BatchedMujocoEnv(instantiate(self.config["make"]), num_worlds, self.worlds)
+        return self._transformed(env, preprocessing)
+
     def read_real_data(self, data: str, columns: str | None = None, seconds: float | None = None) -> TensorDictBase:
         """Reads the real transitions, ``[T]``, or the first ``seconds`` of them.
 
@@ -112,6 +151,10 @@ class Task:
         env = TransformedEnv(instantiate(self.config["make"], **kwargs), DynamicsGap(*effects))
         if num_worlds is not None and self.config.get("batched", False):
             env = BatchedMujocoEnv(env, num_worlds)
+        return self._transformed(env, preprocessing)
+
+    @staticmethod
+    def _transformed(env: EnvBase, preprocessing: Preprocessing | None) -> EnvBase:
         shown = [] if preprocessing is None else preprocessing.transforms()
         transforms: list[Any] = [DoubleToFloat(), *shown]  # TorchRL annotates each one as a list
         return TransformedEnv(env, Compose(*transforms))

@@ -7,6 +7,9 @@ from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_words
 
+Intervals = Mapping[str, tuple[float, float]]  # 95 % interval of each parameter by name, in the parameter's unit
+Fitted = tuple[tuple[Effect, Intervals], ...]  # effects that were fitted together, each with its intervals
+
 
 @dataclass(frozen=True)
 class FoundEffect:
@@ -23,7 +26,7 @@ class FoundEffect:
 
     effect: Effect
     declared: bool
-    ci95: Mapping[str, tuple[float, float]]
+    ci95: Intervals
     error_after: float
     words: str = ""
 
@@ -75,21 +78,31 @@ class IndistinguishableGroup:
         errors: held-out error with each of them in place of the first, in the summary's unit.
         separated_by: description of the data that would tell them apart.
         words: description of each effect with units; by default those of the effects.
+        together: for each effect, all effects of the explanation with this one in the first's place, as they were
+            fitted together; entries are empty if unknown, as in files of earlier versions. The other effects' values
+            differ from those of the report, because they make up for the difference.
 
     Raises:
-        ValueError: if the numbers of effects and errors differ.
+        ValueError: if the numbers of effects, errors and explanations differ.
     """
 
     effects: tuple[Effect, ...]
     errors: tuple[float, ...]
     separated_by: str
     words: tuple[str, ...] = ()
+    together: tuple[Fitted, ...] = ()
 
     def __post_init__(self):
         if len(self.effects) != len(self.errors):
             raise ValueError(f"a group of {len(self.effects)} effects has {len(self.errors)} errors; give one for each")
         if not self.words:
             object.__setattr__(self, "words", tuple(map(effect_words, self.effects)))
+        if not self.together:
+            object.__setattr__(self, "together", ((),) * len(self.effects))
+        if len(self.effects) != len(self.together):
+            raise ValueError(
+                f"a group of {len(self.effects)} effects has {len(self.together)} explanations; give one for each"
+            )
 
 
 @dataclass(frozen=True)

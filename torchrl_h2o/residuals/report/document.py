@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.report.json_file import entries_from_json, read_json, report_to_json, write_json
 from torchrl_h2o.residuals.report.page import write_page
+from torchrl_h2o.residuals.report.sampling import sample
 from torchrl_h2o.residuals.report.sentence import sentence
 
 
@@ -38,6 +40,37 @@ class Report(ReportContents):
     def sentence(self) -> str:
         """The whole report in one sentence."""
         return sentence(self)
+
+    def sample(self, n: int, *, seed: int = 0) -> list[tuple[Effect, ...]]:
+        """Draws lists of effects from what the data leave open, for domain randomisation.
+
+        Each draw chooses an explanation: the effects found, or those with one of them replaced by an alternative, as
+        they were fitted together. All explanations have the same weight, because the search's test found none of them
+        worse than the first at its level; a likelihood computed from their errors would treat successive rows as
+        independent and decide by differences that are smaller than the scatter between blocks of the data. Then each
+        parameter with a 95 % interval is drawn from a normal distribution around the fitted value with this interval,
+        truncated to the parameter's bounds. Parameters are drawn independently, because a report has no covariances; a
+        parameter without an interval keeps its value.
+
+        Args:
+            n: number of draws.
+            seed: the same seed gives the same draws; the first draws do not depend on n.
+
+        Returns:
+            n tuples of effects, each for one simulator; empty tuples if the report contains no effects.
+
+        Raises:
+            ValueError: for a negative n.
+
+        Examples:
+            >>> from torchrl_h2o.effects import Gravity
+            >>> from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
+            >>> found = FoundEffect(Gravity(0.5), declared=True, ci95={"scale": (0.45, 0.55)}, error_after=0.004)
+            >>> report = Report(simulator="pendulum.xml", data=DataSummary("swing.csv", 5000, 1500), found=(found,))
+            >>> [0.4 < gravity.scale < 0.6 for (gravity,) in report.sample(3)]
+            [True, True, True]
+        """
+        return sample(self, n, seed=seed)
 
     def to_json(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become None."""

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,8 +75,16 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "indistinguishable": [
                 {
                     "effects": [
-                        {"name": effect_name(effect), "words": words, "error": error, "effect": effect_to_dict(effect)}
-                        for effect, error, words in zip(group.effects, group.errors, group.words, strict=True)
+                        {
+                            "name": effect_name(effect),
+                            "words": words,
+                            "error": error,
+                            "effect": effect_to_dict(effect),
+                            "together": [{"ci95": ci95, "effect": effect_to_dict(other)} for other, ci95 in together],
+                        }
+                        for effect, error, words, together in zip(
+                            group.effects, group.errors, group.words, group.together, strict=True
+                        )
                     ],
                     "separated_by": group.separated_by,
                 }
@@ -185,9 +193,12 @@ def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
 
 def _found(entry: Mapping[str, Any]) -> FoundEffect:
     effect = effect_from_dict(entry["effect"])
-    intervals = {name: parameter["ci95"] for name, parameter in entry["parameters"].items()}
-    ci95 = {name: (_float(ends[0]), _float(ends[1])) for name, ends in intervals.items() if ends is not None}
+    ci95 = _intervals({name: parameter["ci95"] for name, parameter in entry["parameters"].items()})
     return _read(FoundEffect, entry, effect=effect, ci95=ci95)
+
+
+def _intervals(entries: Mapping[str, Sequence[float | None] | None]) -> dict[str, tuple[float, float]]:
+    return {name: (_float(ends[0]), _float(ends[1])) for name, ends in entries.items() if ends is not None}
 
 
 def _group(entry: Mapping[str, Any]) -> IndistinguishableGroup:
@@ -197,6 +208,11 @@ def _group(entry: Mapping[str, Any]) -> IndistinguishableGroup:
         errors=tuple(_float(member["error"]) for member in members),
         separated_by=entry["separated_by"],
         words=tuple(member["words"] for member in members if "words" in member),
+        together=tuple(
+            tuple((effect_from_dict(other["effect"]), _intervals(other["ci95"])) for other in member["together"])
+            for member in members
+            if "together" in member  # not in files of earlier versions
+        ),
     )
 
 

@@ -9,6 +9,7 @@ from tqdm import tqdm
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.job import prepare
 from torchrl_h2o.training.judging import DATA, judge, run_settings, table_of_population, write_failure
+from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.methods.h2o_plus import make_learner
 from torchrl_h2o.training.populations.loop import members_of, train_population
 from torchrl_h2o.training.real_data import behaviour_of, is_cut
@@ -35,6 +36,9 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
         task_of(own).make_simulator()  # fails before the data are loaded if a gap does not fit the model
     real = prepare(cfg, directory)
     members = members_of(cfg)  # again, because ``prepare`` has added the normalisation of the observations
+    for name, own in members.items():
+        (directory / name).mkdir(parents=True, exist_ok=True)
+        own.mended = find_missing_effects(own, task_of(own), real, directory / name)
     wall_s = time.perf_counter() - start
     outcomes = train_population(make_learner, cfg, members, real, directory)
     behaviour = behaviour_of(real, cut=is_cut(cfg))

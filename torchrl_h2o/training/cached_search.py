@@ -1,0 +1,102 @@
+"""Reports of closing the loop, cached by the data, the simulator and the settings of the search.
+
+A search takes minutes, and the runs of a grid share their data and simulators: the first run searches, the others wait
+for its report. The cache is in the folder of the recordings, see :func:`~torchrl_h2o.training.real_data.cache_folder`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from filelock import FileLock
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from torchrl_h2o import __version__
+from torchrl_h2o.effects import Effect, effect_to_dict
+from torchrl_h2o.residuals import LoopSettings, Report, close_the_loop
+from torchrl_h2o.training.real_data import cache_folder
+
+MOST_ROWS = 20_000  # a search fits and judges a few thousand windows; more rows cost time and add little precision
+BLOCK = 1_000  # rows in sequence, of data that are longer
+SEARCH = {"held_out": 0.3, "seed": 0}
+READ = ("observation", "action", ("next", "observation"), ("next", "done"), "time")  # by the search, if there
+
+
+def cached_report(
+    simulator: EnvBase,
+    effects: tuple[Effect, ...],
+    make: Mapping[str, Any],
+    real: TensorDictBase,
+    source: str,
+    folder: Path,
+) -> Report:
+    """Closes the loop, or reads the report of the same search from the cache, and copies its files into a folder.
+
+    Args:
+        simulator: the simulator, with observations in physical units.
+        effects: effects of the simulator.
+        make: target and arguments of the simulator's env without effects.
+        real: the measured transitions, ``[T]``, in physical units.
+        source: name of the data in the report.
+        folder: folder for ``report.json`` and ``report.html``; must not exist. It appears with all files or not at all.
+
+    Raises:
+        DataError: if the data do not fit the simulator.
+        ValueError: if the simulator's state cannot be computed from its observations.
+    """
+    rows = searched_rows(real)
+    cached = cache_folder() / "mended" / digest(make, effects, rows)
+    cached.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(cached.with_suffix(".lock")):  # another process may be at the same search; its report is then read
+        if not cached.exists():
+            chosen = f"{len(rows)} of {len(real)} rows" if len(rows) < len(real) else f"all {len(real)} rows"
+            tqdm.write(f"mend: searching {chosen} for effects that the simulator lacks; this takes minutes")
+            report = close_the_loop(simulator, rows, source=f"{source}, {chosen}", **SEARCH)
+            write_whole(report, cached)
+    copied = Path(tempfile.mkdtemp(dir=folder.parent)) / folder.name
+    shutil.copytree(cached, copied)
+    os.replace(copied, folder)
+    copied.parent.rmdir()
+    return Report.load(folder)
+
+
+def write_whole(report: Report, folder: Path) -> None:
+    """Writes a report such that the folder appears with all its files or not at all."""
+    partial = Path(tempfile.mkdtemp(dir=folder.parent))
+    report.save(partial)
+    os.replace(partial, folder)
+
+
+def searched_rows(real: TensorDictBase) -> TensorDictBase:
+    """The transitions that a search uses: all of them, or of longer data evenly spaced blocks of successive rows.
+
+    Returns:
+        At most ``MOST_ROWS`` transitions, in their order.
+    """
+    if len(real) <= MOST_ROWS:
+        return real
+    starts = np.linspace(0, len(real) - BLOCK, MOST_ROWS // BLOCK).round().astype(int)
+    return cast(TensorDictBase, torch.cat([real[start : start + BLOCK] for start in starts]))  # typed as a tensor
+
+
+def digest(make: Mapping[str, Any], effects: tuple[Effect, ...], rows: TensorDictBase) -> str:
+    """Identifies a search by the simulator, the data's values, the settings and the library's version."""
+    settings = [make, [*map(effect_to_dict, effects)], asdict(LoopSettings()), SEARCH, __version__]
+    total = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for key in READ:
+        if (values := rows.get(key, None)) is not None:
+            total.update(f"{key} {values.dtype} {tuple(values.shape)}".encode())
+            total.update(values.contiguous().numpy().tobytes())
+    return total.hexdigest()[:16]

@@ -1,0 +1,140 @@
+"""The option ``mend``: a run closes the loop between its real data and its simulator, then trains in the mended one."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tqdm import tqdm
+
+from torchrl_h2o.effects import Effect, effect_to_dict
+from torchrl_h2o.residuals import Report
+from torchrl_h2o.residuals.report.contents import DataSummary
+from torchrl_h2o.training.cached_search import cached_report, write_whole
+from torchrl_h2o.training.task import Task
+
+FOLDER = "mended"
+POSTERIOR = "posterior"
+POSTERIOR_WORLDS = 10  # smallest number of worlds with mend=posterior; each of them has one draw for the whole run
+
+
+def check_mending(cfg: DictConfig) -> None:
+    """Checks the option ``mend``, and raises ``num_worlds`` in place to the number that ``mend=posterior`` needs.
+
+    Raises:
+        ValueError: for an unknown value, together with ``gap_fix``, or for ``mend=posterior`` with a task that is not
+            batched or steps per epoch that its worlds cannot share equally.
+    """
+    mend = cfg.get("mend")
+    if mend not in (None, False, True, POSTERIOR):
+        raise ValueError(f"mend={mend}: choose null, true or {POSTERIOR}")
+    if not mend:
+        return
+    if cfg.get("gap_fix") is not None:
+        raise ValueError(
+            f"gap_fix={cfg.gap_fix} mend={mend}: gap_fix takes the effects from a report, mend searches for them in "
+            "the run's own data; leave one of them out"
+        )
+    if mend != POSTERIOR:
+        return
+    if not cfg.env.get("batched", False):
+        raise ValueError(
+            f"mend={POSTERIOR} gives each world of a batched simulator its own effects, and env={cfg.env.name} is not "
+            "batched: use mend=true, or set env.batched=true for a Gymnasium MuJoCo task"
+        )
+    if cfg.num_worlds < POSTERIOR_WORLDS:
+        tqdm.write(f"mend={POSTERIOR}: num_worlds={POSTERIOR_WORLDS} instead of {cfg.num_worlds}, one draw per world")
+        cfg.num_worlds = POSTERIOR_WORLDS
+    if cfg.steps_per_epoch % cfg.num_worlds:
+        raise ValueError(
+            f"mend={POSTERIOR} num_worlds={cfg.num_worlds}: the worlds share the steps of an epoch equally; make "
+            f"steps_per_epoch={cfg.steps_per_epoch} a multiple of {cfg.num_worlds}"
+        )
+
+
+def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, directory: Path) -> dict[str, Any] | None:
+    """Closes the loop between the real data and the simulator if ``mend`` is set, and writes ``mended/report.json``.
+
+    A run that is resumed reads the report in its folder. A search that fails does not end the run: the report then
+    contains the reason and no effects.
+
+    Args:
+        cfg: the run's configuration.
+        task: the task without the effects.
+        real: the measured transitions, ``[T]``, in physical units.
+        directory: the run's folder.
+
+    Returns:
+        The effects for :meth:`Task.mended` and the entry ``mended`` of the configuration: ``effects``, and ``worlds``
+        for ``mend=posterior``; None if the simulator stays as it is.
+    """
+    if not cfg.get("mend") or cfg.get("mended") is not None:
+        return cfg.get("mended")
+    report = report_of_run(directory) or _search(task, real, cfg.data, directory / FOLDER)
+    unchanged = "" if report.found else " The run trains in the unchanged simulator."
+    tqdm.write(f"mend={str(cfg.mend).lower()}: {report.sentence()}{unchanged}")
+    if not report.found:
+        return None
+    draws = _draws(report, task, cfg.num_worlds, cfg.seed) if cfg.mend == POSTERIOR else None
+    return {"effects": _entries(report.effects), "worlds": draws and [_entries(effects) for effects in draws]}
+
+
+def report_of_run(directory: Path) -> Report | None:
+    """Reads the report in a run's folder; None if the run has none."""
+    return Report.load(directory / FOLDER) if (directory / FOLDER).exists() else None
+
+
+def _search(task: Task, real: TensorDictBase, data: str, folder: Path) -> Report:
+    source = Path(data).name if Path(data).exists() else data
+    try:
+        return cached_report(task.make_simulator(), task.simulator, task.config["make"], real, source, folder)
+    except Exception as error:  # of any kind, because training is possible without the result
+        reason = f"the search failed ({type(error).__name__}: {' '.join(str(error).split())})"
+        report = Report(simulator=task.name, data=DataSummary(source, len(real), 0), conclusion=reason)
+        write_whole(report, folder)
+        return report
+
+
+def _draws(report: Report, task: Task, num_worlds: int, seed: int) -> list[tuple[Effect, ...]]:
+    """One draw per world. A draw that the model rejects, such as negative damping, is replaced by the best values."""
+    return [draw if _fits(task, draw) else report.effects for draw in report.sample(num_worlds, seed=seed)]
+
+
+def _fits(task: Task, effects: Sequence[Effect]) -> bool:
+    try:
+        task.mended({"effects": _entries(effects), "worlds": None}).make_simulator()
+    except ValueError:
+        return False
+    return True
+
+
+def _entries(effects: Sequence[Effect]) -> list[dict[str, Any]]:
+    return [effect_to_dict(effect) for effect in effects]
+
+
+def summary_of_mending(directory: Path) -> dict[str, Any]:
+    """The entry ``mended`` of summary.json: what was found, and the simulator's error; empty without ``mend``."""
+    report = report_of_run(directory)
+    if report is None:
+        return {}
+    entries = report.to_json()
+    error = entries["error"] and {key: entries["error"][key] for key in ("metric", "unit", "before", "after", "floor")}
+    effects = [{key: effect[key] for key in ("name", "words", "parameters")} for effect in entries["effects"]]
+    kept = {key: entries[key] for key in ("sentence", "conclusion", "two_sample", "data", "wall_s")}
+    return {"mended": {**kept, "effects": effects, "error": error}}
+
+
+def lines_of_mending(directories: Sequence[Path]) -> list[str]:
+    """Lines for the end of a run: each different result of ``mend`` in the folders, and the file of its report."""
+    first: dict[str, Path] = {}  # by sentence: members of a population often have the same result
+    for directory in directories:
+        if (report := report_of_run(directory)) is not None:
+            first.setdefault(report.sentence(), directory)
+    return [
+        f"\n{sentence}\nreport     {os.path.relpath(directory / FOLDER)}/report.html"
+        for sentence, directory in first.items()
+    ]
