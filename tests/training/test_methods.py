@@ -59,6 +59,25 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
     assert trained(tmp_path / "parts", folder) == trained(tmp_path / "whole", folder)
 
 
+@pytest.mark.parametrize("name", sorted(METHODS.keys() - {"darc"}))  # darc also counts its reward correction n times
+def test_the_discount_of_each_method_is_that_of_the_steps_of_a_row(compose, name):
+    def loss_qvalue(gamma, steps):
+        cfg, real = compose(f"method={name}", f"gamma={gamma}", "n_steps=1")
+        real = as_observed(cfg, real)
+        replay = HybridReplayBuffer(real, 100, (8, 8))
+        replay.extend(real[:50])
+        learner = METHODS[name].make_learner(cfg, 4, make_reality(cfg).action_spec_unbatched, replay)
+        torch.manual_seed(1)
+        batches = learner.sample()
+        for batch in batches:
+            batch["steps_to_next_obs"] = torch.full((len(batch), 1), steps)
+        torch.manual_seed(2)
+        return learner.terms_of(*batches)["loss_qvalue"].item()
+
+    assert loss_qvalue(0.8, steps=3) == pytest.approx(loss_qvalue(0.8**3, steps=1), rel=1e-5)
+    assert loss_qvalue(0.8, steps=3) != pytest.approx(loss_qvalue(0.8, steps=1), rel=1e-3)
+
+
 def method_policy(method, cfg, real, directory):
     """The method's initial policy: training with a learning rate of zero."""
     still = cfg.copy()

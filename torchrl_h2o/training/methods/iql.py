@@ -1,10 +1,12 @@
 """IQL on the real data only, with TorchRL's loss. It uses no simulator, so the dynamics gap does not affect it."""
 
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.data.multi_step import STEPS
 from torchrl_h2o.objectives import make_value
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
@@ -16,8 +18,16 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     value = make_value(observation_dim, cfg.num_cells)
     loss = IQLLoss(actor, qvalues, value, loss_function="l2", **cfg.iql)
     loss.make_value_estimator(gamma=cfg.gamma)
+    # The loss keeps only the entries below "next" for its target, so the number of steps is moved there.
+    loss.value_estimator.set_keys(steps_to_next_obs=("next", STEPS))
+
+    def terms_of(batch: TensorDictBase) -> TensorDictBase:
+        if (steps := batch.get(STEPS, None)) is not None:
+            batch["next", STEPS] = steps
+        return loss(batch)
+
     targets = SoftUpdate(loss, tau=cfg.tau)
-    return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [(sum(cfg.batch_size), 0)], loss)
+    return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [(sum(cfg.batch_size), 0)], terms_of)
 
 
 IQL = Method("IQL", make_learner)
