@@ -5,6 +5,7 @@ selects the reader.
 """
 
 from torchrl_h2o.data.hybrid_replay import HybridReplayBuffer
+from torchrl_h2o.data.paired_transitions import PairedTransitions
 from torchrl_h2o.data.readers.d4rl import read_d4rl
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.load import load
@@ -19,6 +20,7 @@ __all__ = [
     "Column",
     "DataError",
     "HybridReplayBuffer",
+    "PairedTransitions",
     "LogColumns",
     "check_specs",
     "episodes",
