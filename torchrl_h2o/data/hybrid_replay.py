@@ -25,6 +25,7 @@ from torchrl.data import (
     TensorStorage,
 )
 
+from torchrl_h2o.data.multi_step import STEPS, OngoingMultiStep, multi_step_keys, original_key
 from torchrl_h2o.data.readers.memory_map import load_memory_map
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 
@@ -49,6 +50,12 @@ class HybridReplayBuffer:
             device.
         sim_capacity: largest number of simulated transitions; then the oldest are overwritten.
         batch_size: numbers of real and simulated rows in a batch.
+        n_steps: n of n-step targets. With n > 1 both streams pass through TorchRL's ``MultiStepTransform``: the reward
+            is the discounted sum of up to n rewards, the next state is that after these steps, and a batch also has
+            ``steps_to_next_obs`` [real + simulated, 1] and the one-step next state ``("next",
+            "original_observation")``. The sums stop where ``("next", "done")`` is true. Real data that have
+            ``steps_to_next_obs`` are taken as n-step rows already.
+        gamma: discount factor of the sums; the same as that of the losses.
         keys: the entries of a batch. Both streams must have them; other entries of the streams are ignored.
         device: device of the data and the batches.
         scratch_dir: folder for memory-mapped simulated data, for capacities beyond the memory.
@@ -57,6 +64,10 @@ class HybridReplayBuffer:
 
     Raises:
         ValueError: if the real data lack an entry of ``keys``; the message gives a remedy.
+
+    Attributes:
+        next_observation: the entry of the one-step next state, which discriminators read: ``("next", "observation")``,
+            or ``("next", "original_observation")`` if ``n_steps`` is above 1.
 
     Example:
         >>> import torch
@@ -77,6 +88,8 @@ class HybridReplayBuffer:
         sim_capacity: int,
         batch_size: tuple[int, int] = (128, 128),
         *,
+        n_steps: int = 1,
+        gamma: float = 0.99,
         keys: Sequence[NestedKey] = TRANSITION_KEYS,
         device: torch.device | str = "cpu",
         scratch_dir: str | Path | None = None,
@@ -87,8 +100,14 @@ class HybridReplayBuffer:
         if real.ndim != 1 or not len(real):
             raise ValueError(f"the real data have the batch size {list(real.batch_size)}, expected [T], T > 0")
         self.batch_size = _require_sizes(batch_size)
-        self.keys = [unravel_key(key) for key in keys]
+        self._stream_keys = [unravel_key(key) for key in keys]
         self.device = torch.device(device)
+        self._multi_step = OngoingMultiStep(n_steps, gamma) if n_steps > 1 else None
+        self.keys, self.next_observation = self._stream_keys, ("next", "observation")
+        if self._multi_step is not None:
+            self.keys = multi_step_keys(self._stream_keys)
+            self.next_observation = original_key(self.next_observation)
+            real = real if STEPS in real.keys() else self._multi_step.whole(_select(real, self._stream_keys, "real"))
         real = _select(real, self.keys, "real").to(self.device)
         self.real = ReplayBuffer(storage=TensorStorage(real, device=self.device), writer=ImmutableDatasetWriter())
         if sim_memory is not None:
@@ -116,12 +135,19 @@ class HybridReplayBuffer:
         """Add simulated transitions.
 
         Args:
-            transitions: transitions of any batch size, such as a collector's [N, T].
+            transitions: transitions of any batch size, such as a collector's [N, T]. With ``n_steps`` above 1, time is
+                the last dimension and each call continues the N runs of the call before; a run that does not go on
+                ends with ``("next", "done")``. The last n rows of each run then wait for the next call.
 
         Raises:
             ValueError: if an entry is missing or its shape differs from that of the real data.
         """
-        rows = _select(transitions.reshape(-1), self.keys, "simulated")
+        rows = _select(transitions, self._stream_keys, "simulated")
+        if self._multi_step is not None:
+            rows = self._multi_step.transform(rows)
+            if rows is None:
+                return
+        rows = _select(rows.reshape(-1), self.keys, "simulated")
         for key, like in zip(self.keys, self._real_rows, strict=True):
             value = rows.get(key)
             if value.shape[1:] != like.shape[1:]:
@@ -174,6 +200,7 @@ class HybridReplayBuffer:
             "cursor": self.sim.writer.state_dict(),
             # clones, because a view would be saved together with the whole storage
             "rows": [rows.clone() for rows in self._sim_rows],
+            "waiting": [rows.clone() for rows in self._waiting_rows()],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -192,6 +219,7 @@ class HybridReplayBuffer:
                     f"for {self.sim.storage.max_size}: use the capacity of the saved buffer"
                 )
             self.sim.extend(TensorDict(dict(zip(self.keys, state["rows"], strict=True)), [count]))
+        self._restore_waiting_rows(state.get("waiting", []))  # states of earlier versions have none
         # the cursor is restored too, so that a restored generator draws the same rows
         self.sim.writer.load_state_dict(state["cursor"])
         self._find_sim_rows()
@@ -210,6 +238,9 @@ class HybridReplayBuffer:
             if self._sim_rows:
                 rows = TensorDict(dict(zip(self.keys, self._sim_rows, strict=True)), [len(self.sim)])
                 rows.cpu().memmap(cast("str", folder / "rows"), copy_existing=True)  # as in write_ted
+            if waiting := self._waiting_rows():
+                rows = TensorDict(dict(zip(self._stream_keys, waiting, strict=True)), waiting[0].shape[:-1])
+                rows.cpu().memmap(cast("str", folder / "waiting"), copy_existing=True)
 
     def loads(self, path: str | Path) -> None:
         """Read a folder written by :meth:`dumps` into a buffer with the same real data and keys.
@@ -223,11 +254,24 @@ class HybridReplayBuffer:
         folder = Path(path)
         state = json.loads((folder / "stream.json").read_text(encoding="utf-8"))
         self._require_same_real(state["real"])
-        state["rows"] = []
-        if (folder / "rows").is_dir():
-            rows = load_memory_map(folder / "rows")
-            state["rows"] = [rows.get(key) for key in self.keys]
+        for name, keys in (("rows", self.keys), ("waiting", self._stream_keys)):
+            state[name] = []
+            if (folder / name).is_dir():
+                rows = load_memory_map(folder / name)
+                state[name] = [rows.get(key) for key in keys]
         self.load_state_dict(state)
+
+    def _waiting_rows(self) -> list[torch.Tensor]:
+        """Return the simulated rows whose successors are not known yet, one tensor [*B, T, n] per entry."""
+        waiting = None if self._multi_step is None else self._multi_step.waiting
+        return [] if waiting is None else [waiting.get(key) for key in self._stream_keys]
+
+    def _restore_waiting_rows(self, waiting: list[torch.Tensor]) -> None:
+        if self._multi_step is None:
+            return
+        # All entries of a transition have one dimension after those of the batch.
+        entries = dict(zip(self._stream_keys, waiting, strict=True)) if waiting else {}
+        self._multi_step.waiting = TensorDict(entries, waiting[0].shape[:-1]) if waiting else None
 
     def _draw(self, rows: list[torch.Tensor], count: int, generator: torch.Generator | None) -> torch.Tensor:
         return torch.randint(len(rows[0]), (count,), device=self.device, generator=generator)

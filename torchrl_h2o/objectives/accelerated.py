@@ -28,8 +28,8 @@ Module = TypeVar("Module", bound=nn.Module)
 def accelerate(module: Module) -> Module:
     """Run the perceptrons of all losses of this package in a module as plain matrix products.
 
-    Losses and gradients stay the same to rounding. Other networks (with convolutions, normalisation layers or hooks)
-    are still called as modules.
+    Losses and gradients stay the same to rounding. Layer normalisation after a hidden layer is included. Other networks
+    (with convolutions, batch normalisation or hooks) are still called as modules.
 
     Measured speed-up, the ratio of H2O+ updates per CPU second with and without it (one thread, torch 2.13, batches of
     128 + 128 and 256 + 256 rows): with hidden layers 64-64, 1.42 to 1.48 compiled and 1.15 to 1.16 uncompiled; with
@@ -106,9 +106,11 @@ def _flat(module: nn.Module, path: Path) -> Iterator[tuple[Path, nn.Module]]:
 
 
 def _is_plain(layer: nn.Module) -> bool:
-    """Whether a layer is linear, or acts on the last axis without parameters."""
+    """Whether a layer is linear, normalises the last axis, or acts on it without parameters."""
     if _is_hooked(layer):
         return False
+    if type(layer) is nn.LayerNorm:
+        return len(layer.normalized_shape) == 1 and layer.elementwise_affine and layer.bias is not None
     return type(layer) in (nn.Linear, *_ELEMENTWISE) or (
         type(layer) is GaussianParameters and not any(True for _ in layer.parameters())
     )
@@ -132,11 +134,13 @@ def _perceptron(
         x = relu_perceptron(x, *zip(*linear, strict=True))
         layers = layers[2 * depth - 1 :]
     for path, layer in layers:
-        if type(layer) is not nn.Linear:
+        if type(layer) not in (nn.Linear, nn.LayerNorm):
             x = relu(x) if compiling and type(layer) is nn.ReLU else layer(x)
             continue
         weight, bias = _weight_and_bias(params, path, frozen)
-        if weight.ndim == 2:
+        if type(layer) is nn.LayerNorm:
+            x = _layer_norm(x, layer, weight, cast(Tensor, bias))
+        elif weight.ndim == 2:
             x = F.linear(x, weight, bias)
         else:
             x = x.expand(weight.shape[0], *x.shape[-2:])
@@ -144,6 +148,14 @@ def _perceptron(
     if isinstance(x, tuple):
         return tuple(part.reshape(*params.batch_size, *batch_size, part.shape[-1]) for part in x)
     return x.reshape(*params.batch_size, *batch_size, x.shape[-1])
+
+
+def _layer_norm(x: Tensor, layer: nn.LayerNorm, weight: Tensor, bias: Tensor) -> Tensor:
+    """Normalise ``[B, width]``, or ``[N, B, width]`` with the parameters ``[N, width]`` of each network."""
+    if weight.ndim == 1:
+        return F.layer_norm(x, layer.normalized_shape, weight, bias, layer.eps)
+    normalised = F.layer_norm(x, layer.normalized_shape, eps=layer.eps)
+    return torch.addcmul(bias.unsqueeze(1), normalised, weight.unsqueeze(1))
 
 
 def _depth_with_relu(layers: list[tuple[Path, nn.Module]]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import cast, overload
 
 import torch
 from tensordict import NestedKey
@@ -18,8 +18,11 @@ from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 HIDDEN = (256, 256)
 
 
-def _mlp(in_features: int, out_features: int, num_cells: Sequence[int]) -> MLP:
-    network = MLP(in_features, out_features, num_cells=list(num_cells), activation_class=nn.ReLU)
+def _mlp(in_features: int, out_features: int, num_cells: Sequence[int], layer_norm: bool = False) -> MLP:
+    norm = {}
+    if layer_norm:
+        norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in num_cells]}
+    network = MLP(in_features, out_features, num_cells=list(num_cells), activation_class=nn.ReLU, **norm)
     last = cast(nn.Linear, network[-1])
     nn.init.xavier_uniform_(last.weight, gain=1e-2)
     nn.init.zeros_(last.bias)
@@ -114,7 +117,27 @@ def make_actor(
     )
 
 
-def make_qvalue(observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN) -> ValueOperator:
+@overload
+def make_qvalue(
+    observation_dim: int,
+    action_dim: int,
+    num_cells: Sequence[int] = ...,
+    *,
+    layer_norm: bool = ...,
+    ensemble: None = ...,
+) -> ValueOperator: ...
+@overload
+def make_qvalue(
+    observation_dim: int, action_dim: int, num_cells: Sequence[int] = ..., *, layer_norm: bool = ..., ensemble: int
+) -> list[ValueOperator]: ...
+def make_qvalue(
+    observation_dim: int,
+    action_dim: int,
+    num_cells: Sequence[int] = HIDDEN,
+    *,
+    layer_norm: bool = False,
+    ensemble: int | None = None,
+) -> ValueOperator | list[ValueOperator]:
     """Build Q(s, a), which writes ``state_action_value`` ``[*B, 1]``.
 
     Args:
@@ -122,12 +145,36 @@ def make_qvalue(observation_dim: int, action_dim: int, num_cells: Sequence[int] 
         action_dim (int): size of ``action``.
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
 
+    Keyword Args:
+        layer_norm (bool, optional): whether each hidden layer is normalised before its ReLU. It bounds Q outside of the
+            data and makes training stable. Defaults to ``False``, as in the authors' code.
+        ensemble (int, optional): number of networks with independent initial parameters. Defaults to ``None``: one
+            network, not a list.
+
+    Returns:
+        A network, or a list of ``ensemble`` networks. :class:`~torchrl_h2o.objectives.MixedBellmanLoss` and TorchRL's
+        losses accept both, and take the minimum over the list.
+
+    Raises:
+        ValueError: if ``ensemble`` is below 1.
+
+    Source:
+        Layer normalisation: RLPD (Ball et al., 2023, https://arxiv.org/abs/2302.02948).
+
     Examples:
         >>> import torch
         >>> make_qvalue(4, 1)(observation=torch.zeros(5, 4), action=torch.zeros(5, 1)).shape
         torch.Size([5, 1])
+        >>> len(make_qvalue(4, 1, layer_norm=True, ensemble=2))
+        2
     """
-    return ValueOperator(_mlp(observation_dim + action_dim, 1, num_cells), in_keys=["observation", "action"])
+    if ensemble is not None and ensemble < 1:
+        raise ValueError(f"ensemble is {ensemble}: at least one network, or None for a network that is not in a list.")
+    networks = [
+        ValueOperator(_mlp(observation_dim + action_dim, 1, num_cells, layer_norm), in_keys=["observation", "action"])
+        for _ in range(1 if ensemble is None else ensemble)
+    ]
+    return networks[0] if ensemble is None else networks
 
 
 def make_value(observation_dim: int, num_cells: Sequence[int] = HIDDEN) -> ValueOperator:
