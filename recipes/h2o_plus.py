@@ -4,6 +4,7 @@ python recipes/h2o_plus.py                                             # the whe
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/h2o_plus.py gap_fix=outputs/close_the_loop/.../report.json     # in the corrected simulator
+python recipes/h2o_plus.py ratio_estimator=pairs                       # another estimator of the dynamics ratio
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
 
@@ -24,7 +25,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
-    DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
@@ -32,7 +32,6 @@ from torchrl_h2o.objectives import (
     SparseValueLoss,
     accelerate,
     make_actor,
-    make_dynamics_ratio_estimator,
     make_qvalue,
     make_value,
     total_loss,
@@ -42,6 +41,7 @@ from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
+from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 from torchrl_h2o.training.real_data import RECORDED, behaviour_of
 from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
@@ -96,7 +96,6 @@ def train(cfg: DictConfig, folder: Path) -> None:
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
     qvalues = [make_qvalue(observation_dim, action_dim, cfg.num_cells) for _ in range(2)]
     value = make_value(observation_dim, cfg.num_cells)
-    estimator = make_dynamics_ratio_estimator(observation_dim, action_dim, cfg.num_cells)
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     if cfg.backbone == "expectile":
@@ -105,7 +104,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
         value_loss = {"sparse": SparseValueLoss, "exponential": ExponentialValueLoss}[cfg.backbone](
             value, cfg.value_alpha
         )
-    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay)
+    pairs_replay = make_pairs(cfg, task, real, preprocessing, replay) or replay  # trains the discriminators
     loss = H2OPlusLoss(
         MixedBellmanLoss(actor, qvalues, value, mixing=cfg.mixing),
         value_loss,
@@ -150,7 +150,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         # Update
         for _ in training.epoch_updates():
             batch = replay.sample(cfg.batch_size)
-            pairs = replay.sample(cfg.discriminator_batch_size)
+            pairs = pairs_replay.sample(cfg.discriminator_batch_size)
             losses = loss_fn(batch, pairs)
             optimiser.zero_grad()
             total_loss(losses).backward()
@@ -167,7 +167,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
                 return_real=in_reality.mean,
                 return_real_std=in_reality.std,
                 length_real=in_reality.mean_length,
-                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
+                ratio_of_sim=float(ratio_loss.estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
                 **{name: term.item() for name, term in losses.items()},
             )
     collector.shutdown()

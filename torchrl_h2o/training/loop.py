@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,6 +23,7 @@ from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
+from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import keeps_best
 
@@ -64,6 +66,7 @@ class Trainee:
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
         self._actor = self.learner.actor if replay.device.type == "cpu" else deepcopy(self.learner.actor).cpu()
         self.components = self.learner.components
+        self.make_pairs = partial(make_pairs, cfg, task, preprocessing=self._preprocessing, replay=replay)
         self._open = ExitStack()
         self._collector = self._best = None
         if self.learner.simulates:
@@ -143,10 +146,12 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     Returns:
         The policy selected by ``keep``, and the training with its metrics.
     """
-    real = preprocessing_of(cfg).apply(real)
-    replay = HybridReplayBuffer(real, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
+    shown = preprocessing_of(cfg).apply(real)
+    replay = HybridReplayBuffer(shown, sim_capacity=int(cfg.sim_capacity * len(real)), batch_size=cfg.batch_size)
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
+    if learner.trains_discriminators:
+        learner.pairs = trainee.make_pairs(real)
     compiled = cfg.get("compiled", False)  # configurations of earlier versions have no such entry
     learner.terms_of = maybe_compiled(learner.terms_of, compiled, cfg.updates, pays=learner.pays_to_compile)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
