@@ -50,7 +50,7 @@ def make_loss(name: str, system: System, cfg: DictConfig) -> DynamicsRatioLoss:
         "paper": {},
         "noise_on_next": {"logit_bound": (None, 2.0)},
         "change": {"logit_bound": (None, 2.0), "change_scale": scale},
-        "pairs": {"logit_bound": None, "change_scale": scale, "with_sa_network": False},
+        "pairs": {"logit_bound": cfg.ratio_logit_bound, "change_scale": scale, "with_sa_network": False},
     }[name]
     estimator = make_dynamics_ratio_estimator(*sizes, **options)
     if name == "pairs":

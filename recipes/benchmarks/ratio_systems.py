@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
+import hydra
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -126,9 +125,7 @@ class Mujoco:
 
 
 def _configuration(env: str):
-    folder = str(Path(__file__).parents[1] / "config")
-    with initialize_config_dir(folder, version_base=None):
-        cfg = compose("h2o_plus", [f"env={env}"])
+    cfg = hydra.compose("h2o_plus", [f"env={env}"])
     OmegaConf.set_struct(cfg, False)
     return cfg
 

@@ -107,7 +107,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         self.sa_network = sa_network
         self.sas_network = sas_network
         self.logit_bound = logit_bound
-        self._bounds = dict(zip(("sa_network", "sas_network"), bounds, strict=True))
+        self._bounds: dict[str, Bound] = {"sa_network": bounds[0], "sas_network": bounds[1]}
         self.residual = residual
         self.detach_residual = detach_residual
         self.clamp = clamp
@@ -325,7 +325,7 @@ class DynamicsRatioLoss(HybridLoss):
         if self.weight_penalty:
             terms["loss_ratio_sa"] = terms["loss_ratio_sa"] + self._penalty("sa_network")
             terms["loss_ratio_sas"] = terms["loss_ratio_sas"] + self._penalty("sas_network")
-        return self._output({name: terms[name] for name in self._written_keys()}, tensordict)
+        return self._output({name: term for name, term in terms.items() if name in self._written_keys()}, tensordict)
 
     def _noisy(self, inputs: TensorDictBase) -> TensorDictBase:
         """Add the noise of each entry, in the order of the entries in ``inputs``."""

@@ -51,7 +51,7 @@ def make_ratio_loss(
         *sizes,
         next_observation=following,
         with_sa_network=False,
-        logit_bound=None,
+        logit_bound=cfg.ratio_logit_bound,
         change_scale=fit_change_scale(replay.real[:], next_observation=following),
     )
     noise: dict[NestedKey, float] = {following: cfg.change_noise}

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_h2o.data import PairedTransitions
@@ -96,4 +96,4 @@ class PopulationLearner:
             cast(PairedTransitions, learner.pairs).sample(sizes[1], generator)
             for learner, generator in zip(self.learners, generators, strict=True)
         ]
-        return [self.replay.sample(sizes[0], self.generators), cast(TensorDictBase, torch.stack(pairs))]
+        return [self.replay.sample(sizes[0], self.generators), TensorDict.stack(pairs)]
