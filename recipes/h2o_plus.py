@@ -4,6 +4,7 @@ python recipes/h2o_plus.py                                             # the whe
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/h2o_plus.py mend=true                                   # first adds what the simulator lacks to it
+python recipes/h2o_plus.py ratio_estimator=pairs                       # another estimator of the dynamics ratio
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
 
@@ -23,7 +24,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
-    DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
@@ -31,7 +31,6 @@ from torchrl_h2o.objectives import (
     SparseValueLoss,
     accelerate,
     make_actor,
-    make_dynamics_ratio_estimator,
     make_qvalue,
     make_value,
     total_loss,
@@ -45,6 +44,7 @@ from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
+from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 from torchrl_h2o.training.real_data import behaviour_of, is_cut
 from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
@@ -109,9 +109,6 @@ def train(cfg: DictConfig, folder: Path) -> None:
         observation_dim, action_dim, cfg.num_cells, layer_norm=cfg.layer_norm, ensemble=cfg.num_qvalue_nets
     )
     value = make_value(observation_dim, cfg.num_cells)
-    estimator = make_dynamics_ratio_estimator(
-        observation_dim, action_dim, cfg.num_cells, next_observation=replay.next_observation
-    )
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     if cfg.backbone == "expectile":
@@ -120,7 +117,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
         value_loss = {"sparse": SparseValueLoss, "exponential": ExponentialValueLoss}[cfg.backbone](
             value, cfg.value_alpha
         )
-    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay)
+    pairs_replay = make_pairs(cfg, task, real, preprocessing, replay) or replay  # trains the discriminators
     loss = H2OPlusLoss(
         MixedBellmanLoss(actor, qvalues, value, mixing=cfg.mixing),
         value_loss,
@@ -166,7 +164,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         # Update
         for _ in training.epoch_updates():
             batch = replay.sample(cfg.batch_size)
-            pairs = replay.sample(cfg.discriminator_batch_size)
+            pairs = pairs_replay.sample(cfg.discriminator_batch_size)
             losses = loss_fn(batch, pairs)
             optimiser.zero_grad()
             total_loss(losses).backward()
@@ -183,7 +181,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
                 return_real=in_reality.mean,
                 return_real_std=in_reality.std,
                 length_real=in_reality.mean_length,
-                ratio_of_sim=float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
+                ratio_of_sim=float(ratio_loss.estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
                 **{name: term.item() for name, term in losses.items()},
             )
     collector.shutdown()

@@ -10,11 +10,14 @@ from torchrl.objectives import SoftUpdate
 from tests.objectives import reference
 from tests.objectives.conftest import ACTION_DIM, Parts, make_batch
 from torchrl_h2o.objectives import (
+    DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
     MixedBellmanLoss,
     SparseValueLoss,
+    make_dynamics_ratio_estimator,
+    total_loss,
 )
 
 OWNERS = {
@@ -233,3 +236,25 @@ def test_an_automatic_target_entropy_needs_the_action_s_spec(parts):
     actor = ProbabilisticActor(parts.actor[0], in_keys=["loc", "scale"], distribution_class=TanhNormal)
     with pytest.raises(ValueError, match="spec"):
         H2OPlusLoss(MixedBellmanLoss(actor, parts.qvalues, mixing=0.0))
+
+
+def test_mean_ratio_and_effective_sample_size_are_those_of_the_simulated_rows(parts, batch):
+    losses = parts.h2o_plus()(batch)
+    estimated = parts.estimator(batch.copy())
+    ratio, weight = (estimated[~batch["real"]][key] for key in ("log_dynamics_ratio", "dynamics_ratio"))
+    assert losses["unclamped_ratio"].item() == pytest.approx(ratio.exp().mean().item())
+    size = weight.sum() ** 2 / weight.square().sum() / len(weight)
+    assert losses["effective_sample_size"].item() == pytest.approx(size.item())
+    only_real = parts.h2o_plus()(batch[batch["real"]])
+    assert only_real["effective_sample_size"] == only_real["unclamped_ratio"] == 0.0
+
+
+def test_one_classifier_trained_on_pairs_takes_the_place_of_two(parts, batch):
+    estimator = make_dynamics_ratio_estimator(3, 2, (8, 8), with_sa_network=False).double()
+    bellman = MixedBellmanLoss(parts.actor, parts.qvalues, parts.value)
+    loss = H2OPlusLoss(bellman, ExpectileValueLoss(parts.value), DynamicsRatioLoss(estimator))
+    pairs = batch.select("observation", "action", "real", ("next", "observation"))
+    losses = loss(batch, pairs)
+    assert set(losses.keys()) == set(loss.out_keys)
+    total_loss(losses).backward()
+    assert all(p.grad.any() for p in loss.ratio_loss.parameters())

@@ -8,7 +8,15 @@ from tensordict import TensorDict
 
 from tests.objectives import reference
 from tests.objectives.conftest import CELLS, OBSERVATION_DIM, Parts, make_batch
-from torchrl_h2o.objectives import DynamicsRatioEstimator, DynamicsRatioLoss, make_dynamics_ratio_estimator
+from torchrl_h2o.objectives import (
+    DynamicsDivergence,
+    DynamicsRatioEstimator,
+    DynamicsRatioLoss,
+    DynamicsRewardCorrection,
+    accelerate,
+    fit_change_scale,
+    make_dynamics_ratio_estimator,
+)
 
 
 def log_odds(p):
@@ -80,6 +88,113 @@ def test_input_noise_has_the_asked_standard_deviation(parts):
         assert (seen[0][key] - batch[key]).std().item() == pytest.approx(0.3, rel=0.05)
 
 
+NEXT = ("next", "observation")
+
+
+def seen_by_sas_network(estimator, batch, **kwargs):
+    seen = []
+    estimator.sas_network.register_forward_pre_hook(lambda module, args: seen.append(args[0].clone()))
+    DynamicsRatioLoss(estimator, **kwargs)(batch)
+    return seen[0]
+
+
+def test_noise_named_for_one_entry_leaves_the_others_alone(parts):
+    batch = make_batch(4000, 4000)
+    seen = seen_by_sas_network(parts.estimator, batch, input_noise={NEXT: 0.3})
+    assert (seen[NEXT] - batch[NEXT]).std().item() == pytest.approx(0.3, rel=0.05)
+    assert (seen["observation"] == batch["observation"]).all()
+    assert (seen["action"] == batch["action"]).all()
+
+
+def test_change_is_normalised_and_its_noise_is_in_the_same_unit():
+    batch, scale = make_batch(4000, 4000), torch.tensor([0.5, 1.0, 20.0], dtype=torch.float64)
+    change = (batch[NEXT] - batch["observation"]) / scale
+    for noise in (None, {NEXT: 0.3}):
+        estimator = make_dynamics_ratio_estimator(OBSERVATION_DIM, 2, CELLS, change_scale=scale).double()
+        seen = seen_by_sas_network(estimator, batch, input_noise=noise)
+        if noise is None:
+            torch.testing.assert_close(seen[NEXT], change)
+        else:
+            spread = (seen[NEXT] - change).std(0)
+            torch.testing.assert_close(spread, torch.full_like(spread, 0.3), rtol=0.05, atol=0.0)
+
+
+def test_each_network_has_a_bound_of_its_own(parts):
+    networks, batch = (parts.estimator.sa_network, parts.estimator.sas_network), make_batch()
+    with torch.no_grad():
+        for network in networks:
+            network.module[-1].weight.mul_(100.0)
+    free, both = (
+        DynamicsRatioEstimator(*networks, logit_bound=bound, residual=False).log_odds(batch)
+        for bound in ((None, 0.5), 0.5)
+    )
+    assert free[0].abs().max() > 5.0
+    assert free[1].abs().max() <= 1.0
+    assert both[0].abs().max() <= 1.0
+
+
+def test_one_classifier_gives_its_log_odds_as_the_log_ratio(batch):
+    estimator = make_dynamics_ratio_estimator(OBSERVATION_DIM, 2, CELLS, with_sa_network=False).double()
+    loss = DynamicsRatioLoss(estimator)
+    assert loss.out_keys == ["loss_ratio_sas", "accuracy"]
+    assert set(loss(batch).keys()) == {"loss_ratio_sas", "accuracy"}
+    logits = estimator.sas_network(batch.copy())["sas_logits"]
+    expected = (2.0 * torch.tanh(logits)).diff(dim=-1).neg().squeeze(-1)
+    torch.testing.assert_close(estimator(batch)["log_dynamics_ratio"], expected.detach())
+
+
+@pytest.mark.parametrize("with_sa_network", [True, False])
+def test_next_observation_under_another_key_gives_the_same_ratio_and_corrections(batch, with_sa_network):
+    key, scale = ("next", "original_observation"), torch.full((OBSERVATION_DIM,), 0.5, dtype=torch.float64)
+    moved = batch.clone().set(key, batch[NEXT])
+    moved[NEXT] = torch.full_like(batch[NEXT], float("nan"))  # the state n steps later, which no discriminator reads
+    results = []
+    for name, rows in ((NEXT, batch), (key, moved)):
+        torch.manual_seed(0)
+        estimator = make_dynamics_ratio_estimator(
+            OBSERVATION_DIM, 2, CELLS, next_observation=name, change_scale=scale, with_sa_network=with_sa_network
+        ).double()
+        loss = DynamicsRatioLoss(estimator, input_noise={name: 0.1})
+        torch.manual_seed(1)
+        results.append(
+            [
+                *loss(rows).values(),
+                *accelerate(loss).eval()(rows).values(),
+                estimator(rows.clone())["dynamics_ratio"],
+                DynamicsDivergence(estimator, noise=1.0)(rows.clone())["dynamics_divergence"],
+                DynamicsRewardCorrection(estimator)(rows.clone())["next", "reward"],
+            ]
+        )
+    for of_next, of_original in zip(*results, strict=True):
+        torch.testing.assert_close(of_next, of_original)
+
+
+def test_scale_of_a_constant_entry_is_one():
+    rows = TensorDict(
+        observation=torch.zeros(3, 2), next=TensorDict(observation=torch.tensor([[0.0, 1], [0, 3], [0, 5]]))
+    )
+    assert fit_change_scale(rows.auto_batch_size_()).tolist() == [1.0, 2.0]
+
+
+def test_weight_penalty_is_half_the_squared_weights_times_lambda(parts, batch):
+    plain, penalised = (
+        DynamicsRatioLoss(parts.estimator, input_noise=None, weight_penalty=penalty)(batch) for penalty in (0.0, 0.4)
+    )
+    for name in ("sa", "sas"):
+        network = getattr(parts.estimator, f"{name}_network")
+        weights = sum(p.square().sum() for key, p in network.named_parameters() if key.endswith("weight"))
+        added = penalised[f"loss_ratio_{name}"] - plain[f"loss_ratio_{name}"]
+        assert added.item() == pytest.approx(0.2 * weights.item(), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"input_noise": {"nothing": 0.1}}, {"input_noise": {NEXT: -0.1}}, {"weight_penalty": -1.0}]
+)
+def test_noise_and_penalties_that_cannot_be_are_refused(parts, bad):
+    with pytest.raises(ValueError, match=r"input_noise|weight_penalty"):
+        DynamicsRatioLoss(parts.estimator, **bad)
+
+
 def test_ratio_is_a_constant(parts, batch):
     assert not parts.estimator(batch)["log_dynamics_ratio"].requires_grad
 
@@ -148,7 +263,7 @@ def test_a_discriminator_without_two_logits_is_refused(batch):
         DynamicsRatioEstimator(one, one)(batch)
 
 
-@pytest.mark.parametrize("bad", [{"logit_bound": 0.0}, {"clamp": (1.0, 0.5)}])
+@pytest.mark.parametrize("bad", [{"logit_bound": 0.0}, {"logit_bound": (None, -1.0)}, {"clamp": (1.0, 0.5)}])
 def test_bounds_that_cannot_be_are_refused(bad):
     with pytest.raises(ValueError, match=r"logit_bound|clamp"):
         make_dynamics_ratio_estimator(OBSERVATION_DIM, 1, CELLS, **bad)

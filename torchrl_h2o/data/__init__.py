@@ -5,6 +5,7 @@ selects the reader.
 """
 
 from torchrl_h2o.data.hybrid_replay import HybridReplayBuffer
+from torchrl_h2o.data.paired_transitions import PairedTransitions
 from torchrl_h2o.data.readers.d4rl import read_d4rl
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.load import load
@@ -20,6 +21,7 @@ __all__ = [
     "DataError",
     "HybridReplayBuffer",
     "LogColumns",
+    "PairedTransitions",
     "check_specs",
     "episodes",
     "load",

@@ -13,7 +13,7 @@ from torchrl_h2o.objectives.networks import (
     make_qvalue,
     make_value,
 )
-from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss
+from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss, fit_change_scale
 from torchrl_h2o.objectives.reward_correction import DynamicsRewardCorrection
 from torchrl_h2o.objectives.value import (
     ExpectileValueLoss,
@@ -38,6 +38,7 @@ __all__ = [
     "MixedBellmanLoss",
     "SparseValueLoss",
     "accelerate",
+    "fit_change_scale",
     "make_actor",
     "make_dynamics_ratio_estimator",
     "make_qvalue",

@@ -81,7 +81,7 @@ class DynamicsDivergence(TensorDictModuleBase):
         self.clamp = clamp
         self.in_keys = list(estimator.in_keys)
         self.out_keys = list(out_keys)
-        self._next_keys = [key for key in self.in_keys if key not in estimator.sa_network.in_keys]
+        self._next_keys = list(estimator.next_keys)
 
     @dispatch()
     @torch.no_grad()

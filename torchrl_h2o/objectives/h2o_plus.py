@@ -50,7 +50,9 @@ class H2OPlusLoss(LossWrapper):
     ``loss(batch)`` trains the discriminators on the same batch. ``loss(batch, pairs)`` trains them on the second batch,
     as the authors do (``batch`` with 128 + 128 rows, ``pairs`` with 256 + 256). Reads the inputs of its parts. Returns
     the losses above and values for logging: ``alpha`` and ``entropy``; with a ``ratio_loss`` also ``accuracy_sa`` and
-    ``accuracy``; if weighted also ``dynamics_ratio``, the mean over the simulated rows.
+    ``accuracy``; if weighted also, of the simulated rows, ``dynamics_ratio``, the mean clamped ratio (the mean weight),
+    ``unclamped_ratio``, the mean ratio without clamp (1 for a correct ratio), and ``effective_sample_size``, (Σ w)² /
+    Σ w² of the weights w as a fraction of the rows.
 
     The ratio is computed with the discriminators' parameters before this step's update, so that all losses share one
     backward pass and compile to one graph. The authors' code computes it after the discriminators' update. To reproduce
@@ -188,8 +190,10 @@ class H2OPlusLoss(LossWrapper):
         if self.ratio_loss is not None:
             yield from self.ratio_loss.out_keys
             if self.weighted:
-                yield "dynamics_ratio"
+                yield from ("dynamics_ratio", "unclamped_ratio")
         if self.reduction != "none":
+            if self.ratio_loss is not None and self.weighted:
+                yield "effective_sample_size"
             yield from ("alpha", "entropy")
 
     @dispatch(source="_dispatch_keys")
@@ -234,11 +238,26 @@ class H2OPlusLoss(LossWrapper):
             )
         terms = dict(self.ratio_loss(batch if pairs is None else pairs).items())
         if self.weighted:
-            ratio = self.ratio_loss.dynamics_ratio(batch)
+            log_ratio, ratio = self.ratio_loss.log_and_clamped_ratio(batch)
             batch.set(key, ratio)
-            mean = self._expectation(ratio, rows, rows.sim, reduction="mean", prioritised=False)
-            terms["dynamics_ratio"] = ratio if self.reduction == "none" else mean
+            terms |= self._ratio_figures(log_ratio, ratio, rows)
         return terms
+
+    def _ratio_figures(self, log_ratio: Tensor, ratio: Tensor, rows: Rows) -> dict[str, Tensor]:
+        """Compute the logged values of the ratio of the simulated rows."""
+        if self.reduction == "none":
+            return {"dynamics_ratio": ratio, "unclamped_ratio": log_ratio.exp()}
+
+        def mean_of_sim(values: Tensor) -> Tensor:
+            return self._expectation(values, rows, rows.sim, reduction="mean", prioritised=False)
+
+        mean, mean_square = mean_of_sim(ratio), mean_of_sim(ratio.square())
+        return {
+            "dynamics_ratio": mean,
+            "unclamped_ratio": mean_of_sim(log_ratio.exp()),
+            # 0 without simulated rows
+            "effective_sample_size": mean.square() / torch.where(mean_square > 0, mean_square, 1.0),
+        }
 
     def _value_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
         """Compute the loss of V, Eq. (4): regress V on the target Q at the actions in the data."""

@@ -198,9 +198,10 @@ def make_dynamics_ratio_estimator(
     num_cells: Sequence[int] = HIDDEN,
     *,
     next_observation: NestedKey = ("next", "observation"),
+    with_sa_network: bool = True,
     **kwargs,
 ) -> DynamicsRatioEstimator:
-    """Build the two discriminators of Eq. (9).
+    """Build the two discriminators of Eq. (9), or the one for transitions that differ in s' alone.
 
     Args:
         observation_dim (int): size of ``observation``.
@@ -208,9 +209,12 @@ def make_dynamics_ratio_estimator(
         num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
 
     Keyword Args:
-        next_observation (NestedKey, optional): the entry of the one-step next state. In n-step batches it is
+        next_observation (NestedKey, optional): the entry of the one-step next state s'. In n-step batches it is
             ``("next", "original_observation")``; see
             :attr:`~torchrl_h2o.data.HybridReplayBuffer.next_observation`. Defaults to ``("next", "observation")``.
+        with_sa_network (bool, optional): whether to build the network on (s, a). Leave it out to train on pairs with
+            the same (s, a); the network on (s, a, s') then has small initial outputs, so that the ratio is near 1
+            where the pairs give no evidence. Defaults to ``True``.
         **kwargs: keyword arguments of :class:`DynamicsRatioEstimator`.
 
     Examples:
@@ -219,9 +223,12 @@ def make_dynamics_ratio_estimator(
     """
     keys = ["observation", "action", next_observation]
     sa_dim, sas_dim = observation_dim + action_dim, 2 * observation_dim + action_dim
-    hidden = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
-    return DynamicsRatioEstimator(
-        TensorDictModule(MLP(sa_dim, 2, **hidden), in_keys=keys[:2], out_keys=["sa_logits"]),
-        TensorDictModule(MLP(sas_dim, 2, **hidden), in_keys=keys, out_keys=["sas_logits"]),
-        **kwargs,
-    )
+    sa = None
+    if with_sa_network:
+        hidden = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
+        sa = TensorDictModule(MLP(sa_dim, 2, **hidden), in_keys=keys[:2], out_keys=["sa_logits"])
+        network = MLP(sas_dim, 2, **hidden)
+    else:
+        network = _mlp(sas_dim, 2, num_cells)
+    sas = TensorDictModule(network, in_keys=keys, out_keys=["sas_logits"])
+    return DynamicsRatioEstimator(sa, sas, next_observation=next_observation, **kwargs)

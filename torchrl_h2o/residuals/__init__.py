@@ -9,6 +9,7 @@ from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.measured.initial_states import estimate_states, smoothed_states
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.simulated_transitions import simulate_transitions
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import LoopSettings
@@ -36,6 +37,7 @@ __all__ = [
     "outside_intervals",
     "outside_rows",
     "residuals",
+    "simulate_transitions",
     "smoothed_states",
     "trace_effects",
     "two_sample_auc",

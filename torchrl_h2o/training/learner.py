@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, SoftUpdate
 
-from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
 from torchrl_h2o.objectives import make_actor, make_qvalue, total_loss
 
 
@@ -29,6 +29,7 @@ class Learner:
         terms_of: maps these batches to terms named ``loss_*``, which are summed, and values to log.
         figures: maps the same batches to further values to log, computed at evaluations only.
         pays_to_compile: whether ``terms_of`` is faster when compiled.
+        pairs: source of the second batch, which trains the discriminators; the replay buffer if None.
         batches: the batches of the last update.
     """
 
@@ -41,11 +42,15 @@ class Learner:
     terms_of: Callable[..., dict[str, torch.Tensor]]
     figures: Callable[..., dict[str, float]] = lambda *batches: {}
     pays_to_compile: bool = True
+    pairs: PairedTransitions | None = None
     batches: list[TensorDictBase] = field(default_factory=list)
 
     def sample(self) -> list[TensorDictBase]:
         """Draws the batches of one update."""
-        return [self.replay.sample(size) for size in self.batch_sizes]
+        if self.pairs is None:
+            return [self.replay.sample(size) for size in self.batch_sizes]
+        first, second = self.batch_sizes
+        return [self.replay.sample(first), self.pairs.sample(second)]
 
     def update(self) -> dict[str, torch.Tensor]:
         """Makes one update of all networks and returns the terms."""
@@ -61,6 +66,11 @@ class Learner:
     def simulates(self) -> bool:
         """Whether any batch has simulated rows."""
         return any(sim for _, sim in self.batch_sizes)
+
+    @property
+    def trains_discriminators(self) -> bool:
+        """Whether a second batch trains the discriminators of the dynamics ratio."""
+        return len(self.batch_sizes) > 1
 
     @property
     def components(self) -> dict:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +24,7 @@ from torchrl_h2o.training.environments import preprocessing_of, sim_capacity_of,
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
+from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy, evaluate
 from torchrl_h2o.training.run_folder import keeps_best
 
@@ -65,6 +67,7 @@ class Trainee:
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
         self._actor = self.learner.actor if replay.device.type == "cpu" else deepcopy(self.learner.actor).cpu()
         self.components = self.learner.components
+        self.make_pairs = partial(make_pairs, cfg, task, preprocessing=self._preprocessing, replay=replay)
         self._open = ExitStack()
         self._collector = self._best = None
         if self.learner.simulates:
@@ -145,9 +148,9 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     Returns:
         The policy selected by ``keep``, and the training with its metrics.
     """
-    real = preprocessing_of(cfg).apply(real)
+    shown = preprocessing_of(cfg).apply(real)
     replay = HybridReplayBuffer(
-        real,
+        shown,
         sim_capacity=sim_capacity_of(cfg, len(real)),
         batch_size=cfg.batch_size,
         n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
@@ -155,6 +158,8 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     )
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
+    if learner.trains_discriminators:
+        learner.pairs = trainee.make_pairs(real)
     compiled = cfg.get("compiled", False)  # configurations of earlier versions have no such entry
     learner.terms_of = maybe_compiled(learner.terms_of, compiled, cfg.updates, pays=learner.pays_to_compile)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)

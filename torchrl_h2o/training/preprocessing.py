@@ -104,6 +104,22 @@ class Preprocessing:
         norm = self._tensors()
         return latest * norm["scale"] + norm["loc"] if norm else latest
 
+    def next_observation(self, preprocessed: TensorDictBase, following: torch.Tensor) -> torch.Tensor:
+        """Preprocesses other next observations of real transitions, such as those of the simulator.
+
+        Args:
+            preprocessed: the real transitions, ``[T]``, as :meth:`apply` returns them.
+            following: the other next observations in physical units, ``[T, n]``.
+
+        Returns:
+            ``[T, frames * n]``; the earlier frames are those of the real transitions.
+        """
+        if self.loc is not None:
+            norm = self._tensors()
+            following = (following - norm["loc"]) / norm["scale"]
+        earlier = preprocessed["next", "observation"][:, : -following.shape[1]]
+        return torch.cat([earlier, following], -1)
+
     def reward(self, reward: torch.Tensor) -> torch.Tensor:
         """Computes the reward for the losses from the task's reward. Reported returns use the task's reward."""
         return self.reward_scale * (reward + self.reward_offset)

@@ -12,23 +12,20 @@ from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
     ConservativeLoss,
     DynamicsDivergence,
-    DynamicsRatioLoss,
     H2OPlusLoss,
     MixedBellmanLoss,
     accelerate,
-    make_dynamics_ratio_estimator,
 )
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
+from torchrl_h2o.training.ratio import make_ratio_loss
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Build H2O, Eq. (1): a conservative term added to SAC on both streams."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
-    estimator = make_dynamics_ratio_estimator(
-        observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
-    )
-    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
+    estimator = ratio_loss.estimator
     num_real, _ = cfg.batch_size
     spread = replay.real[:]["observation"].std(0)
     divergence = DynamicsDivergence(estimator, noise=spread, num_samples=cfg.h2o.num_samples)

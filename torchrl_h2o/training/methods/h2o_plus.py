@@ -7,7 +7,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import (
-    DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
@@ -15,25 +14,24 @@ from torchrl_h2o.objectives import (
     MixedBellmanLoss,
     SparseValueLoss,
     accelerate,
-    make_dynamics_ratio_estimator,
     make_value,
 )
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
+from torchrl_h2o.training.ratio import make_ratio_loss
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Build H2O+: one loss, one optimiser, and two batches per update, the second for the discriminators."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     value_loss = make_value_loss(cfg, observation_dim)
-    estimator = make_dynamics_ratio_estimator(
-        observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
-    )
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
+    estimator = ratio_loss.estimator
 
     loss = H2OPlusLoss(
         MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing),
         value_loss=value_loss,
-        ratio_loss=DynamicsRatioLoss(estimator, input_noise=cfg.input_noise),
+        ratio_loss=ratio_loss,
         weighted=cfg.ratio,
         target_entropy=cfg.target_entropy,
     )

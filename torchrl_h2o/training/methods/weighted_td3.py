@@ -10,21 +10,20 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import DynamicsRatioLoss, ImportanceWeightedLoss, make_dynamics_ratio_estimator
+from torchrl_h2o.objectives import ImportanceWeightedLoss
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
+from torchrl_h2o.training.ratio import make_ratio_loss
 
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's TD3 loss, weighted row by row."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
-    estimator = make_dynamics_ratio_estimator(
-        observation_dim, action_spec.shape[-1], cfg.num_cells, next_observation=replay.next_observation
-    )
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
+    estimator = ratio_loss.estimator
     td3 = TD3Loss(actor, qvalues, action_spec=action_spec, loss_function="l2", reduction="none")
     td3.make_value_estimator(gamma=cfg.gamma)
     loss = ImportanceWeightedLoss(td3, terms=["loss_qvalue"])
-    ratio_loss = DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
 
     def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict:
         ratio_losses = ratio_loss(pairs)

@@ -4,9 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from torchrl_h2o.data import PairedTransitions
 from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.populations.population import Population
@@ -87,4 +88,12 @@ class PopulationLearner:
 
     def sample(self) -> list[TensorDictBase]:
         """Draw the batches of one update of all members, ``[N, B]`` each."""
-        return [self.replay.sample(size, self.generators) for size in self.learners[0].batch_sizes]
+        sizes = self.learners[0].batch_sizes
+        if self.learners[0].pairs is None:
+            return [self.replay.sample(size, self.generators) for size in sizes]
+        generators = self.generators or [None] * len(self.learners)
+        pairs = [
+            cast(PairedTransitions, learner.pairs).sample(sizes[1], generator)
+            for learner, generator in zip(self.learners, generators, strict=True)
+        ]
+        return [self.replay.sample(sizes[0], self.generators), TensorDict.stack(pairs)]

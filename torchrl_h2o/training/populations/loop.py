@@ -119,10 +119,9 @@ def train_population(
     for name, own in members.items():
         (directory / name).mkdir(parents=True, exist_ok=True)
         save_config(own, directory / name)
-    real = as_observed(cfg, real)
     capacity = sim_capacity_of(cfg, len(real))
     replay = PopulationReplay(
-        real,
+        as_observed(cfg, real),
         capacity,
         cfg.batch_size,
         len(members),
@@ -134,6 +133,11 @@ def train_population(
         name: Trainee(make_learner, own, buffer)
         for (name, own), buffer in zip(members.items(), replay.buffers, strict=True)
     }
+    pairs = {}  # of each dynamics gap
+    for name, own in members.items():
+        if own.gap not in pairs:
+            pairs[own.gap] = trainees[name].make_pairs(real)
+        trainees[name].learner.pairs = pairs[own.gap]
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
     # pays=False: on a CPU, compiled losses of stacked networks are slower.
     learner.losses_of = maybe_compiled(learner.losses_of, cfg.get("compiled", False), cfg.updates, pays=False)
