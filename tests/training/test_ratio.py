@@ -27,7 +27,7 @@ def test_paper_has_two_networks_and_no_pairs(compose):
 
 def test_an_unknown_estimator_is_refused(compose):
     cfg, real = compose("ratio_estimator=best", config="train")
-    with pytest.raises(ValueError, match="choose paper or pairs"):
+    with pytest.raises(ValueError, match="choose paper, change or pairs"):
         pairs_of(cfg, real)
 
 

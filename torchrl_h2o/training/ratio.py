@@ -1,14 +1,15 @@
 """The estimator of the dynamics ratio that ``ratio_estimator`` names, its loss, and the pairs that train it.
 
-``paper``: the authors' two discriminators, trained on the batches of the replay buffer. ``pairs``: one discriminator,
-trained on the real transitions and on what the run's simulator makes of the same states and actions.
+``paper``: the authors' two discriminators, trained on the batches of the replay buffer. ``change``: the same with the
+normalised change s' - s as input, noise on this change only, and unbounded logits given (s, a). ``pairs``: one
+discriminator, trained on the real transitions and on what the run's simulator makes of the same states and actions.
 """
 
 from __future__ import annotations
 
 import torch
 from omegaconf import DictConfig
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 
 from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
 from torchrl_h2o.objectives import DynamicsRatioLoss, fit_change_scale, make_dynamics_ratio_estimator
@@ -16,7 +17,8 @@ from torchrl_h2o.residuals import Simulation, simulate_transitions
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.task import Task
 
-PAPER, PAIRS = "paper", "pairs"
+PAPER, CHANGE, PAIRS = "paper", "change", "pairs"
+CHANGE_NOISE = {CHANGE: 1.0, PAIRS: 0.05}  # change_noise=auto
 
 
 def ratio_estimator_of(cfg: DictConfig) -> str:
@@ -26,8 +28,8 @@ def ratio_estimator_of(cfg: DictConfig) -> str:
         ValueError: for an unknown name.
     """
     name = cfg.get("ratio_estimator", PAPER)
-    if name not in (PAPER, PAIRS):
-        raise ValueError(f"ratio_estimator={name}: choose {PAPER} or {PAIRS}")
+    if name not in (PAPER, CHANGE, PAIRS):
+        raise ValueError(f"ratio_estimator={name}: choose {PAPER}, {CHANGE} or {PAIRS}")
     return name
 
 
@@ -47,15 +49,18 @@ def make_ratio_loss(
     if ratio_estimator_of(cfg) == PAPER:
         estimator = make_dynamics_ratio_estimator(*sizes, next_observation=following)
         return DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
+    change = {
+        "next_observation": following,
+        "change_scale": fit_change_scale(replay.real[:], next_observation=following),
+    }
+    noise = CHANGE_NOISE[ratio_estimator_of(cfg)] if cfg.change_noise == "auto" else cfg.change_noise
+    if ratio_estimator_of(cfg) == CHANGE:
+        estimator = make_dynamics_ratio_estimator(*sizes, **change, logit_bound=(None, cfg.ratio_logit_bound))
+        return DynamicsRatioLoss(estimator, input_noise={following: noise})
     estimator = make_dynamics_ratio_estimator(
-        *sizes,
-        next_observation=following,
-        with_sa_network=False,
-        logit_bound=cfg.ratio_logit_bound,
-        change_scale=fit_change_scale(replay.real[:], next_observation=following),
+        *sizes, **change, with_sa_network=False, logit_bound=cfg.ratio_logit_bound
     )
-    noise: dict[NestedKey, float] = {following: cfg.change_noise}
-    return DynamicsRatioLoss(estimator, input_noise=noise, weight_penalty=cfg.ratio_weight_penalty)
+    return DynamicsRatioLoss(estimator, input_noise={following: noise}, weight_penalty=cfg.ratio_weight_penalty)
 
 
 def make_pairs(
@@ -73,12 +78,12 @@ def make_pairs(
         replay: gives the entry that holds the next observation, and the device.
 
     Returns:
-        The pairs, or None for the paper's estimator.
+        The pairs, or None for an estimator that is trained on the replay buffer.
 
     Raises:
         ValueError: if the state of the simulator cannot be set from the task's observation.
     """
-    if ratio_estimator_of(cfg) == PAPER:
+    if ratio_estimator_of(cfg) != PAIRS:
         return None
     simulation = Simulation.from_env(task.make_simulator())
     following = simulate_transitions(simulation, real)

@@ -92,8 +92,9 @@ class PopulationLearner:
         if self.learners[0].pairs is None:
             return [self.replay.sample(size, self.generators) for size in sizes]
         generators = self.generators or [None] * len(self.learners)
+        first = self.replay.sample(sizes[0], self.generators)  # before the pairs, as in a single run
         pairs = [
             cast(PairedTransitions, learner.pairs).sample(sizes[1], generator)
             for learner, generator in zip(self.learners, generators, strict=True)
         ]
-        return [self.replay.sample(sizes[0], self.generators), TensorDict.stack(pairs)]
+        return [first, TensorDict.stack(pairs)]
