@@ -66,7 +66,17 @@ class MixedBellmanLoss(HybridLoss):
     Reads observation, action, ``real`` ``[*B]``, ``("next", ...)`` observation, reward ``[*B, 1]`` and terminated
     ``[*B, 1]``. Reads if present: ``dynamics_ratio`` ``[*B]`` (default 1), ``priority_weight`` ``[*B]`` and
     ``steps_to_next_obs`` ``[*B, 1]``, the number of steps n of an n-step transition, as written by
-    ``MultiStepTransform``; the discount is then γⁿ. Returns ``loss_qvalue``, the sum over the ensemble. Writes
+    ``MultiStepTransform``. Its reward is the discounted sum of n rewards, and Eq. (7) becomes
+
+    .. math::
+        \sum_{k<n}\gamma^k r_{t+k}+\gamma^n\big[\lambda V(s_{t+n})
+          +(1-\lambda)E_{a'\sim\pi}[\hat Q(s_{t+n},a')-\beta\log\pi(a'|s_{t+n})]\big]
+
+    The n - 1 actions after the first are those in the batch, not the policy's. This off-policy bias grows with n and
+    with the distance between the policy and the batch; it is not corrected (Munos et al., 2016,
+    https://arxiv.org/abs/1606.02647, give a correction). With short control steps it costs less than one-step targets,
+    in which the effect of one action is lost in the error of Q (Tallec et al., 2019, https://arxiv.org/abs/1901.09732).
+    Returns ``loss_qvalue``, the sum over the ensemble. Writes
     ``td_error`` ``[*B]``, the largest absolute error of the ensemble, into the input, as TorchRL's losses do.
 
     Source:

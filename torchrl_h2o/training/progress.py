@@ -1,7 +1,7 @@
 """Training of one method inside a run: epochs, progress bar, metrics and checkpoints.
 
-Every epoch has its own random stream, seeded from the run's seed and the epoch's number, and starts with new simulator
-episodes. A run that is resumed from a checkpoint therefore draws the same random numbers as an uninterrupted one.
+Every epoch has its own random stream, seeded from the run's seed and the epoch's number. A run that is resumed from a
+checkpoint therefore draws the same random numbers as an uninterrupted one.
 """
 
 from __future__ import annotations
