@@ -13,6 +13,7 @@ SMALL = [
     "updates_per_epoch=20",
     "steps_per_epoch=40",
     "n_steps=3",
+    "ratio_estimator=paper",
     "eval_every=1",
     "checkpoint_every=1",
     "eval_episodes=1",
