@@ -73,7 +73,7 @@ def test_a_population_of_another_method_is_refused(command):
 @pytest.mark.slow
 @pytest.mark.parametrize("interruption", [signal.SIGKILL, signal.SIGINT])
 def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption):
-    small = [*SMALL, *ROBOT, "updates=100"]
+    small = [*SMALL, *ROBOT, "updates=300"]  # long enough that the signal comes before the end
     run(command(*small, "hydra.run.dir=unbroken"))
 
     broken = tmp_path / "broken"
