@@ -79,7 +79,7 @@ def test_a_member_trained_on_pairs_learns_what_a_single_run_learns(compose, tmp_
 
 @pytest.mark.slow
 def test_the_recipe_trains_with_pairs(command, tmp_path):
-    run(command("ratio_estimator=pairs", *SMALL, *ROBOT, "hydra.run.dir=out"))
+    run(command(*SMALL, *ROBOT, "ratio_estimator=pairs", "hydra.run.dir=out"))
     last = rows(tmp_path / "out")[-1]
     assert 0.0 < float(last["effective_sample_size"]) <= 1.0
     assert "loss_ratio_sa" not in last

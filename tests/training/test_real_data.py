@@ -73,7 +73,7 @@ def test_the_poor_controller_falls_within_five_seconds():
     with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
         poor, good = (hydra.compose("train", [f"env={env}"]) for env in ("wheel_legged_poor", "wheel_legged"))
     assert poor.env.reality == good.env.reality
-    assert poor.updates == good.updates == 24_000
+    assert poor.updates == good.updates == 16_000
     assert poor.env.name == "wheel_legged_poor"
     task = task_of(poor)
     real = record(task.make_reality(), instantiate(task.config["behaviour"]), 960, seed=0, progress=False)
