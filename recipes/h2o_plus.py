@@ -23,24 +23,14 @@ from torch.optim.lr_scheduler import LinearLR
 from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import (
-    ExpectileValueLoss,
-    ExponentialValueLoss,
-    H2OPlusLoss,
-    MixedBellmanLoss,
-    SparseValueLoss,
-    accelerate,
-    make_actor,
-    make_qvalue,
-    make_value,
-    total_loss,
-)
+from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate, make_actor, make_qvalue, total_loss
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import sim_capacity_of
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.mending import find_missing_effects
+from torchrl_h2o.training.methods.h2o_plus import make_value_loss
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
@@ -61,8 +51,6 @@ def main(cfg: DictConfig) -> None:
 def train(cfg: DictConfig, folder: Path) -> None:
     """Trains, evaluates in reality, and writes summary.json, metrics.csv, learning_curve.png and a film."""
     start = time.perf_counter()
-    if cfg.backbone not in ("expectile", "sparse", "exponential"):
-        raise ValueError(f"backbone={cfg.backbone}: choose expectile, sparse or exponential")
 
     # Task: the target dynamics (reality), and a simulator with the dynamics gap
     task = Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.gap_fix)
@@ -108,19 +96,13 @@ def train(cfg: DictConfig, folder: Path) -> None:
     qvalues = make_qvalue(
         observation_dim, action_dim, cfg.num_cells, layer_norm=cfg.layer_norm, ensemble=cfg.num_qvalue_nets
     )
-    value = make_value(observation_dim, cfg.num_cells)
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
-    if cfg.backbone == "expectile":
-        value_loss = ExpectileValueLoss(value, cfg.expectile)
-    else:
-        value_loss = {"sparse": SparseValueLoss, "exponential": ExponentialValueLoss}[cfg.backbone](
-            value, cfg.value_alpha
-        )
+    value_loss = make_value_loss(cfg, observation_dim)  # with V; expectile, sparse or exponential
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay)
     pairs_replay = make_pairs(cfg, task, real, preprocessing, replay) or replay  # trains the discriminators
     loss = H2OPlusLoss(
-        MixedBellmanLoss(actor, qvalues, value, mixing=cfg.mixing),
+        MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing),
         value_loss,
         ratio_loss,
         weighted=cfg.ratio,

@@ -5,7 +5,11 @@ import subprocess
 import zipfile
 from pathlib import Path
 
+import pytest
 from torchrl.checkpoint import CheckpointRotation
+
+from torchrl_h2o.training.loop import train
+from torchrl_h2o.training.progress import Training
 
 ROOT = Path(__file__).parents[1]
 SMALL = [
@@ -52,3 +56,16 @@ def interrupt_at(epoch, log):
         log(self, current, **metrics)
 
     return interrupted
+
+
+def assert_resumed_equals_whole(method, cfg, real, directory, monkeypatch):
+    """Trains in one go and with an interruption, compares the checkpoints; returns policy and training in one go."""
+    policy, training = train(method, cfg, real, directory / "whole")
+    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
+    with pytest.raises(KeyboardInterrupt):
+        train(method, cfg, real, directory / "parts")
+    monkeypatch.undo()
+    train(method, cfg, real, directory / "parts")
+    (folder,) = [path.name for path in (directory / "whole" / "checkpoints").iterdir()]
+    assert trained(directory / "parts", folder) == trained(directory / "whole", folder)
+    return policy, training

@@ -263,7 +263,7 @@ def test_training_runs_in_the_mended_simulator(tmp_path):
     report(Gravity(0.5)).save(tmp_path)
     small = ["updates=20", "updates_per_epoch=20", "steps_per_epoch=40", "eval_episodes=1", "final_episodes=1"]
     small += ["num_cells=[8,8]", "batch_size=[8,8]", "discriminator_batch_size=[8,8]", "render=false"]
-    small += ["env.make.max_episode_steps=40", "env.recording.num_transitions=200", "threads=1"]
+    small += ["env.make.max_episode_steps=40", "env.recording.num_transitions=200", "threads=1", "n_steps=3"]
     done = command(tmp_path, *small, "gap=gravity", "gap_fix=report.json", "hydra.run.dir=out", script="h2o_plus.py")
     assert done.returncode == 0, done.stdout
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["gap_fix"].endswith("report.json")

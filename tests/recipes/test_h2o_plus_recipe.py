@@ -128,10 +128,11 @@ def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(co
         (["resume=nowhere"], "not the folder of a run"),
     ],
 )
-def test_what_cannot_be_is_said_with_what_to_do(command, overrides, said):
+def test_what_cannot_be_is_said_with_what_to_do(command, tmp_path, overrides, said):
     done = subprocess.run(**command(*overrides), text=True, check=False)
     assert done.returncode != 0
     assert said in done.stdout
+    assert not (tmp_path / "nowhere").exists()
 
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the measured data are not there: {DATA}")

@@ -35,20 +35,6 @@ def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [H2O_PLUS, SAC])
-def test_training_on_from_a_checkpoint_is_training_in_one_go(compose, tmp_path, method, monkeypatch):
-    cfg, real = compose("updates=60", "lr_end_factor=0.1")
-    train(method, cfg, real, tmp_path / "whole")
-    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
-    with pytest.raises(KeyboardInterrupt):
-        train(method, cfg, real, tmp_path / "parts")
-    monkeypatch.undo()
-    train(method, cfg, real, tmp_path / "parts")
-    (name,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
-    assert trained(tmp_path / "parts", name) == trained(tmp_path / "whole", name)
-
-
-@pytest.mark.slow
 def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
     cfg, real = compose("updates=100", "keep=best_in_simulator", "lr=0.01", "seed=2")
     policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")

@@ -7,12 +7,11 @@ import subprocess
 import pytest
 import torch
 
-from tests.small_runs import ROBOT, SMALL, interrupt_at, rows, run, trained
+from tests.small_runs import ROBOT, SMALL, assert_resumed_equals_whole, rows, run
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.environments import as_observed, make_reality
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
-from torchrl_h2o.training.progress import Training
 from torchrl_h2o.training.trained_policy import load_policy
 
 methods = pytest.mark.parametrize("name", METHODS)
@@ -44,19 +43,11 @@ def test_a_method_that_there_is_not_is_said(command):
 def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=60", "lr_end_factor=0.1", config="train")
     method = METHODS[name]
-    policy, training = train(method, cfg, real, tmp_path / "whole")
+    policy, training = assert_resumed_equals_whole(method, cfg, real, tmp_path, monkeypatch)
     assert len(training.rows) == 3
     assert all(torch.isfinite(torch.tensor(value)) for row in training.rows for value in list(row.values())[1:])
     first = method_policy(method, cfg, real, tmp_path / "first")
     assert all((p != q).any() for p, q in zip(policy.parameters(), first.parameters(), strict=True))
-
-    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
-    with pytest.raises(KeyboardInterrupt):
-        train(method, cfg, real, tmp_path / "parts")
-    monkeypatch.undo()
-    train(method, cfg, real, tmp_path / "parts")
-    (folder,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
-    assert trained(tmp_path / "parts", folder) == trained(tmp_path / "whole", folder)
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - {"darc"}))  # darc also counts its reward correction n times

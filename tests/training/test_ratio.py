@@ -3,13 +3,12 @@
 import pytest
 import torch
 
-from tests.small_runs import ROBOT, SMALL, interrupt_at, rows, run, trained
+from tests.small_runs import ROBOT, SMALL, assert_resumed_equals_whole, rows, run
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.environments import as_observed, preprocessing_of, task_of
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.populations.loop import members_of, train_population
-from torchrl_h2o.training.progress import Training
 from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 
 
@@ -52,16 +51,8 @@ def mean_difference(pairs):
 @pytest.mark.parametrize("name", ["h2o_plus", "h2o", "darc", "td3"])
 def test_methods_train_and_resume_with_pairs(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=60", "ratio_estimator=pairs", config="train")
-    method = METHODS[name]
-    _, training = train(method, cfg, real, tmp_path / "whole")
+    _, training = assert_resumed_equals_whole(METHODS[name], cfg, real, tmp_path, monkeypatch)
     assert all(torch.isfinite(torch.tensor(value)) for row in training.rows for value in list(row.values())[1:])
-    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
-    with pytest.raises(KeyboardInterrupt):
-        train(method, cfg, real, tmp_path / "parts")
-    monkeypatch.undo()
-    train(method, cfg, real, tmp_path / "parts")
-    (folder,) = [path.name for path in (tmp_path / "whole" / "checkpoints").iterdir()]
-    assert trained(tmp_path / "parts", folder) == trained(tmp_path / "whole", folder)
 
 
 @pytest.mark.slow

@@ -80,7 +80,13 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     """Read pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
     real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds")))
-    replay = HybridReplayBuffer(real, sim_capacity=sim_capacity_of(cfg, len(real)), batch_size=cfg.batch_size)
+    replay = HybridReplayBuffer(
+        real,
+        sim_capacity=sim_capacity_of(cfg, len(real)),
+        batch_size=cfg.batch_size,
+        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
+        gamma=cfg.gamma,
+    )
     title = METHODS[cfg.method].title
     latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
     Checkpoint(replay=replay).load(cast(Path, latest))  # a run with a summary has one

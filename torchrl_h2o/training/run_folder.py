@@ -19,6 +19,7 @@ from tqdm import tqdm
 from torchrl_h2o.training.mending import check_mending
 
 KEEP = ("last", "best_in_simulator")
+BACKBONES = ("expectile", "sparse", "exponential")
 
 
 def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
@@ -41,6 +42,8 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         if others:
             raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
+        if not any(directory.iterdir()):
+            directory.rmdir()  # Hydra has made it; a mistyped name shall not leave a folder
         cfg = load_config(directory)
     elif (directory / "config.yaml").exists():
         if not go_on:
@@ -64,6 +67,8 @@ def check_settings(cfg: DictConfig) -> None:
     """
     if cfg.updates < 1:
         raise ValueError(f"updates={cfg.updates}: train for at least one")
+    if cfg.backbone not in BACKBONES:
+        raise ValueError(f"backbone={cfg.backbone}: choose {', '.join(BACKBONES[:-1])} or {BACKBONES[-1]}")
     if cfg.get("keep", "last") not in KEEP:
         raise ValueError(f"keep={cfg.keep}: choose {' or '.join(KEEP)}")
     if cfg.get("compiled") not in (None, "auto", True, False):
