@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import ForceEffect, parameter
-from torchrl_h2o.residuals import Measured, Simulation, StateMap
+from torchrl_h2o.residuals import Measured, Simulation, Split, StateMap
 
 XML = """
 <mujoco model="pendulum">
@@ -41,6 +41,13 @@ class UnknownForce(ForceEffect):
         return lambda qpos, qvel, ctrl, time: self.size * self.law(qpos, qvel, time[:, None])
 
 
+def three_parts(rows):
+    """The split, (T), of one run: half for fits, a fifth for selection, the rest for the report."""
+    return np.select(
+        [np.arange(rows) < 0.5 * rows, np.arange(rows) < 0.7 * rows], [Split.FIT, Split.SELECTION], Split.REPORT
+    )
+
+
 def pendulum() -> Simulation:
     state_map = StateMap.of_coordinates(("elbow", "elbow_velocity"), ("rad", "rad/s"), (0, 1), num_states=2)
     return Simulation(lambda: mujoco.MjSpec.from_string(XML), 2, state_map, name="pendulum")
@@ -65,7 +72,7 @@ def recorded(real: Simulation, transitions: int = 1500, noise: float = 0.0, seed
         run=np.zeros(transitions, int),
         time=rows * real.control_step,
         usable=np.ones(transitions, bool),
-        held_out=rows >= 0.7 * transitions,
+        split=three_parts(transitions),
         left_out={},
         source="pendulum",
     )

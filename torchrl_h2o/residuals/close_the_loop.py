@@ -6,7 +6,7 @@ Each stage takes the results of earlier stages and returns a new one; no stage c
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_re
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -34,19 +34,20 @@ def close_the_loop(
     catalogue: Sequence[CatalogueEntry] | None = None,
     *,
     source: str = "transitions",
-    held_out: float = 0.3,
+    held_out: float | Collection[int] = HELD_OUT,
     seed: int = 0,
     progress: bool = True,
     settings: LoopSettings = DEFAULTS,
 ) -> Report:
-    """Finds what a simulator lacks from measured data, and judges it on data that no fit has used.
+    """Finds what a simulator lacks from measured data, and judges it on data that neither a fit nor a choice has used.
 
     Args:
         simulator: a TorchRL env of a Gymnasium MuJoCo task, with its gaps, or a :class:`Simulation`.
         data: transitions (T,) in TED, as the readers of :mod:`torchrl_h2o.data` return them, or :class:`Measured`.
         catalogue: effects to try; those of :meth:`Simulation.catalogue` by default.
         source: name of the data in the report.
-        held_out: share of the transitions, taken from the end, that is reserved for the judgement.
+        held_out: share of the transitions, taken from the end, on which errors are reported, or the indices of the
+            logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
         settings: thresholds and budgets of all stages.
@@ -85,7 +86,11 @@ def close_the_loop(
 
 
 def read_measured(
-    data: TensorDictBase | Measured, simulation: Simulation, source: str, held_out: float, settings: LoopSettings
+    data: TensorDictBase | Measured,
+    simulation: Simulation,
+    source: str,
+    held_out: float | Collection[int],
+    settings: LoopSettings,
 ) -> Measured:
     """Measured transitions, checked against the simulation, with the sampling of the settings."""
     if isinstance(data, Measured):

@@ -14,6 +14,10 @@ class MeasuredSettings:
 
     min_transitions: int = 200
     """Usable transitions below which no conclusion is drawn: no test could distinguish an effect from chance."""
+    selection: float = 0.27
+    """Share of the transitions that are not reported on, by which effects are chosen; a fifth of all by default."""
+    border_moves: float = 0.1
+    """Share of the transitions by which a border between two parts of the data moves to the end of a run."""
     max_windows: int = 3500
     """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
     max_diverged: float = 0.1
@@ -106,16 +110,18 @@ class FitSettings:
 class HorizonSettings:
     """The choice of the window length for the search."""
 
-    horizons: tuple[int, ...] = (1, 5, 20)
-    """Window lengths to choose from, in control steps, ascending."""
-    windows: int = 60
-    """Number of windows screened at each length; longer windows are considered only if there are as many."""
-    entries_followed: int = 60
-    """Number of most promising entries that are screened again at the next length."""
-    clear_promise: float = 0.5
-    """Promise of the best entry, as a share of the loss, beyond which windows of greater length are not tried."""
-    longer_gain: float = 1.3
-    """Factor by which the promise must grow to justify longer windows, which cost more and amplify contact errors."""
+    seconds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+    """Window lengths to choose from, in s, ascending; one control step is always among them."""
+    windows: int = 100
+    """Largest number of windows by which a length is judged."""
+    min_fitted: int = 20
+    """Smallest number of windows for fits that a length must leave."""
+    min_selected: int = 8
+    """Smallest number of windows for the selection of effects that a length must leave."""
+    stands_out: float = 10.0
+    """Median error over the median error that sensor noise alone causes, beyond which no longer windows are tried."""
+    longer_gain: float = 1.2
+    """Factor by which this ratio must grow to justify longer windows, which cost more and amplify contact errors."""
 
 
 @dataclass(frozen=True)
@@ -136,11 +142,11 @@ class TraceSettings:
     """Largest number of rounds of growing and simplifying."""
     screened_steps: int = 400
     """Control steps, over all windows, on which entries are screened."""
-    min_screened: int = 100
+    min_screened: int = 60
     """Smallest number of windows on which entries are screened."""
     fitted_steps: int = 1200
     """Control steps, over all windows, in a fit during the search."""
-    min_fitted: int = 200
+    min_fitted: int = 120
     """Smallest number of windows in a fit during the search."""
     leads_combined: int = 60
     """Number of most promising leads from which sets are formed."""

@@ -14,6 +14,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.grow import grow
 from torchrl_h2o.residuals.trace.outcome import Trace
+from torchrl_h2o.residuals.trace.per_joint import divide_by_element
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.simplify import simplify
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -41,7 +42,7 @@ def trace_effects(
     Returns:
         The effects found, the other effects tried, and equivalent alternatives.
     """
-    horizon = choose_horizon(simulation, measured, catalogue, rng, settings)
+    horizon = choose_horizon(simulation, measured, rng, settings)
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     state = SearchState.begin(problem, catalogue, rng, settings)
     for _ in range(settings.trace.rounds):
@@ -52,7 +53,7 @@ def trace_effects(
         # a further round helps only where a simpler effect has replaced one with many parameters
         if state.exact or state.entries == grown.entries:
             break
-    return _outcome(_fitted_to_all(state))
+    return _outcome(_fitted_to_all(divide_by_element(state)))
 
 
 def _fitted_to_all(state: SearchState) -> SearchState:
