@@ -6,7 +6,7 @@ Each stage takes the results of earlier stages and returns a new one; no stage c
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +122,21 @@ def explain(
     trace = trace_effects(simulation, measured, catalogue, rng=rng, progress=progress, settings=settings)
     progress.set_description("looking for undeclared forces")
     declared = Explanation.of(trace)
-    with_force = add_undeclared_force(simulation, measured, declared, rng=rng, settings=settings)
+    with_force = _tried(
+        declared,
+        "an undeclared force",
+        lambda: add_undeclared_force(simulation, measured, declared, rng=rng, settings=settings),
+    )
     progress.set_description("looking for action noise")
-    return add_action_noise(simulation, measured, with_force, settings)
+    return _tried(with_force, "action noise", lambda: add_action_noise(simulation, measured, with_force, settings))
+
+
+def _tried(before: Explanation, what: str, search: Callable[[], Explanation]) -> Explanation:
+    """The result of a search, or the explanation before it with the search recorded as failed.
+
+    Data without variety, such as a constant action or collinear terms, may make the equations of a search singular.
+    """
+    try:
+        return search()
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return before.with_failure(f"the search for {what} failed: {error}")

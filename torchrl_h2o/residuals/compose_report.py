@@ -76,6 +76,8 @@ def compose_report(
         stop_test=stop_test(settings),
         wall_s=wall_s,
         trace=judgement.trace,
+        verdict=judgement.verdict,
+        failures=judgement.failures,
     )
 
 

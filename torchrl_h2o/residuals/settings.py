@@ -268,6 +268,14 @@ class JudgeSettings:
 
     horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     """Control steps ahead at which errors are reported."""
+    headline_seconds: tuple[float, ...] = (0.1, 0.2, 0.5, 1.0)
+    """Times ahead, in s, from which that of the report's sentence is chosen."""
+    headline_windows: int = 8
+    """Smallest number of held-out windows for such a time."""
+    headline_stands_out: float = 3.0
+    """Median error over the median error by sensor noise at which the sentence's time is chosen."""
+    noise_windows: int = 100
+    """Largest number of windows by which this is decided."""
     max_rejected: int = 30
     """Largest number of rejected effects in the report."""
     rounding: float = 1e-5
@@ -296,6 +304,34 @@ class JudgeSettings:
     """Difference of predictions, in spreads, below which they count as equal."""
     separation_factor: float = 1.5
     """Factor by which a coordinate must differ from its usual size to be named in the description."""
+
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """The tests of whether something is missing, and of whether an explanation should be used."""
+
+    auc: float = 0.65
+    """Held-out AUC above which a classifier tells measured from simulated; noise and contacts alone give up to 0.56."""
+    autocorrelation: float = 0.2
+    """Rank correlation of successive residuals above which they are not noise."""
+    far_windows: int = 8
+    """Smallest number of windows by which the error far ahead is judged."""
+    far_ratio: float = 2.0
+    """Median error far ahead, in multiples of the median error by sensor noise, above which something is missing."""
+    far_negligible: float = 0.01
+    """Median error far ahead, in spreads, that is negligible without sensor noise."""
+    small_rest: float = 0.1
+    """Share of the error ahead below which what remains is not worth a word."""
+    level: float = 0.01
+    """Significance level of the decrease of the error on the report's data."""
+    auc_near_one: float = 0.95
+    """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
+    much_lower: float = 0.5
+    """Share of the error ahead below which an explanation counts in spite of such an AUC."""
+    extreme_factor: float = 20.0
+    """Factor on a property of the model beyond which the value is reported as implausible."""
+    blocks: int = 10
+    """Blocks of the report's data in which the largest residual is looked for."""
 
 
 @dataclass(frozen=True)
@@ -331,6 +367,8 @@ class LoopSettings:
     """Action noise."""
     judge: JudgeSettings = JudgeSettings()
     """Held-out errors and the report."""
+    verdict: VerdictSettings = VerdictSettings()
+    """The verdict."""
 
 
 DEFAULTS = LoopSettings()

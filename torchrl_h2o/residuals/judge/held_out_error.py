@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_h2o.residuals.judge.floor import explainable_floor
+from torchrl_h2o.residuals.judge.headline import headline_error, headline_horizon
 from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
@@ -28,6 +29,7 @@ def error_summary(
     """
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
+    ahead = headline_horizon(simulation, measured, settings)
     floor = explainable_floor(mended, measured, settings=settings)
     whiteness = autocorrelation(mended, measured, settings)
     columns = (values.tolist() for values in (before, after, floor, whiteness))
@@ -39,6 +41,7 @@ def error_summary(
         floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
         per_dimension=tuple(map(DimensionError, names, units, *columns)),
         horizons=_horizons(simulation, mended, measured, settings),
+        headline=None if ahead is None else headline_error(simulation, mended, measured, ahead),
     )
 
 
