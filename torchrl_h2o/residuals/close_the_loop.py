@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -122,16 +123,13 @@ def explain(
     trace = trace_effects(simulation, measured, catalogue, rng=rng, progress=progress, settings=settings)
     progress.set_description("looking for undeclared forces")
     declared = Explanation.of(trace)
-    with_force = _tried(
-        declared,
-        "an undeclared force",
-        lambda: add_undeclared_force(simulation, measured, declared, rng=rng, settings=settings),
-    )
+    add_force = partial(add_undeclared_force, rng=rng, settings=settings)
+    with_force = _tried("an undeclared force", declared, lambda: add_force(simulation, measured, declared))
     progress.set_description("looking for action noise")
-    return _tried(with_force, "action noise", lambda: add_action_noise(simulation, measured, with_force, settings))
+    return _tried("action noise", with_force, lambda: add_action_noise(simulation, measured, with_force, settings))
 
 
-def _tried(before: Explanation, what: str, search: Callable[[], Explanation]) -> Explanation:
+def _tried(what: str, before: Explanation, search: Callable[[], Explanation]) -> Explanation:
     """The result of a search, or the explanation before it with the search recorded as failed.
 
     Data without variety, such as a constant action or collinear terms, may make the equations of a search singular.
