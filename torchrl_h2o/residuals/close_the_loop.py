@@ -15,8 +15,8 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report, unfinished_report
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
@@ -38,6 +38,8 @@ def close_the_loop(
     held_out: float | Collection[int] = HELD_OUT,
     seed: int = 0,
     progress: bool = True,
+    known: Sequence[Effect] = (),
+    so_far: Callable[[Report], object] = lambda report: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Report:
     """Finds what a simulator lacks from measured data, and judges it on data that neither a fit nor a choice has used.
@@ -51,6 +53,8 @@ def close_the_loop(
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
+        known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
+        so_far: called with an unfinished report whenever an effect has been found and after each stage.
         settings: thresholds and budgets of all stages.
 
     Returns:
@@ -79,7 +83,16 @@ def close_the_loop(
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
         evidence = gather_evidence(simulation, measured, settings)
-        explanation = explain(evidence, entries, rng=np.random.default_rng(seed), progress=bar, settings=settings)
+        explanation = explain(
+            evidence,
+            entries,
+            rng=np.random.default_rng(seed),
+            progress=bar,
+            known=known,
+            so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
+            settings=settings,
+        )
+        so_far(unfinished_report(evidence, explanation, "the errors before and after were computed"))
         bar.set_description("reporting")
         judgement = judge(evidence, explanation, seed=seed, settings=settings)
         wall_s = time.perf_counter() - start
@@ -105,6 +118,8 @@ def explain(
     *,
     rng: np.random.Generator,
     progress: tqdm,
+    known: Sequence[Effect] = (),
+    so_far: Callable[[Explanation, str], object] = lambda explanation, stage: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Explanation:
     """Explains the residual: effects of the catalogue, then a force outside it, then action noise.
@@ -114,17 +129,30 @@ def explain(
         catalogue: effects that the simulator may lack.
         rng: generator for screened windows and synthetic noise.
         progress: bar that counts screened entries and names the stage.
+        known: effects from which the search begins.
+        so_far: called with a preliminary explanation, and what was going on, as it grows.
         settings: thresholds and budgets.
 
     Returns:
         The explanation, without any parts if nothing is missing.
     """
     simulation, measured = evidence.simulation, evidence.undisturbed
-    trace = trace_effects(simulation, measured, catalogue, rng=rng, progress=progress, settings=settings)
-    progress.set_description("looking for undeclared forces")
+    trace = trace_effects(
+        simulation,
+        measured,
+        catalogue,
+        rng=rng,
+        progress=progress,
+        known=known,
+        found=lambda trace: so_far(Explanation.of(trace), "effects of the catalogue were tried"),
+        settings=settings,
+    )
     declared = Explanation.of(trace)
+    so_far(declared, "undeclared forces were looked for")
+    progress.set_description("looking for undeclared forces")
     add_force = partial(add_undeclared_force, rng=rng, settings=settings)
     with_force = _tried("an undeclared force", declared, lambda: add_force(simulation, measured, declared))
+    so_far(with_force, "action noise was looked for")
     progress.set_description("looking for action noise")
     return _tried("action noise", with_force, lambda: add_action_noise(simulation, measured, with_force, settings))
 

@@ -120,6 +120,8 @@ class HorizonSettings:
     """Smallest number of windows for the selection of effects that a length must leave."""
     stands_out: float = 10.0
     """Median error over the median error that sensor noise alone causes, beyond which no longer windows are tried."""
+    least_ratio: float = 1.5
+    """Smallest such ratio of windows longer than one step; a smaller one is chance."""
     longer_gain: float = 1.2
     """Factor by which this ratio must grow to justify longer windows, which cost more and amplify contact errors."""
 

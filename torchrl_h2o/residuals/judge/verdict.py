@@ -125,9 +125,8 @@ def reasons_against(
 ) -> tuple[str, ...]:
     """Reasons against putting effects into a simulator for training; empty if there are none."""
     rules, reasons = settings.verdict, []
-    if any(not effect.random for effect in effects) and not _lowers_the_error(
-        simulation, mended, measured, error, settings
-    ):
+    acting = [effect for effect in effects if not effect.random]
+    if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
     halved = head is not None and head.after < rules.much_lower * head.before
@@ -152,7 +151,7 @@ def _lowers_the_error(
             missed = residuals(which, measured, starts, steps)[:, -1] / spread
             sizes.append(np.nan_to_num(np.abs(missed), nan=settings.residual.worst).mean(1))
         level = settings.verdict.level / len(ahead)
-        if len(starts) >= 2 and p_value_of_losses(*sizes, settings.significance) < level:
+        if len(starts) >= 2 and p_value_of_losses(sizes[0], sizes[1], settings.significance) < level:
             return True
     return False
 

@@ -12,6 +12,7 @@ from torchrl_h2o.residuals.report.contents import (
     FoundEffect,
     HeadlineError,
     ReportContents,
+    Verdict,
 )
 from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
 
@@ -22,23 +23,32 @@ def sentence(report: ReportContents) -> str:
     """The whole report in one sentence."""
     if report.conclusion is not None:
         return f"No conclusion: {report.conclusion.rstrip('. ')}."
-    error, kind = _error_words(report.error) if report.error else "", report.verdict and report.verdict.kind
-    unknown = ""
-    if report.verdict is not None and report.verdict.kind in (EXPLAINED_IN_PART, NOT_EXPLAINED):
-        unknown = _listed_with(
-            "; ", *report.verdict.reasons, report.verdict.where and f"it shows {report.verdict.where}"
+    if report.unfinished is not None:
+        so_far = (
+            f"so far the simulator lacks {_listed(_found_words(report))}" if report.found else "nothing was found yet"
         )
+        return f"Unfinished, when {report.unfinished}: {so_far}."
+    error = _error_words(report.error) if report.error else ""
+    words = _listed(_found_words(report)) if report.found else ""
+    kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
     if kind == NOT_EXPLAINED:
-        attempt = report.found and f"the best attempt, {_listed(_found_words(report))}, is not recommended"
-        return f"{NOT_IN_CATALOGUE}: {_listed_with('; ', unknown, attempt, error)}."
+        attempt = words and f"the best attempt, {words}, is not recommended"
+        return f"{NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."
     if report.found:
         rest = unknown and f"something else is missing that this catalogue does not explain: {unknown}"
-        return f"Your simulator lacks: {_listed_with('; ', _listed(_found_words(report)), error, rest)}."
-    return f"Nothing is missing: {_listed_with('; ', 'the effects tried explain no more than chance', error)}."
+        return f"Your simulator lacks: {_joined(words, error, rest)}."
+    return f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
 
 
-def _listed_with(separator: str, *parts: str) -> str:
-    return separator.join(part for part in parts if part)
+def _unknown_words(verdict: Verdict) -> str:
+    """Why something is missing and where it shows; empty if the effects found explain everything."""
+    if verdict.kind not in (EXPLAINED_IN_PART, NOT_EXPLAINED):
+        return ""
+    return _joined(*verdict.reasons, verdict.where and f"it shows {verdict.where}")
+
+
+def _joined(*parts: str) -> str:
+    return "; ".join(part for part in parts if part)
 
 
 def _found_words(report: ReportContents) -> list[str]:

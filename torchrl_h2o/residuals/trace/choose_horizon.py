@@ -40,7 +40,7 @@ def choose_horizon(
     for horizon in possible_horizons(simulation, measured, rules):
         starts = thinned(measured.fitted(horizon), rules.windows)
         ratio = float(error_over_noise(simulation, measured, starts, horizon, sensor_std, rng).max())
-        if ratio > rules.longer_gain * most:
+        if horizon == 1 or ratio > max(rules.longer_gain * most, rules.least_ratio):
             best, most = horizon, ratio
         if ratio > rules.stands_out:
             break
