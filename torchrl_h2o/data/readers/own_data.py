@@ -62,11 +62,11 @@ def require_own_data(
         >>> from torchrl_h2o.data.readers.own_data import require_own_data
         >>> path = tempfile.mkdtemp() + "/a.hdf5"
         >>> with h5py.File(path, "w") as file:
-        ...     file["rewards"] = h5py.ExternalLink("/etc/other.hdf5", "rewards")
+        ...     file["rewards"] = h5py.ExternalLink("other.hdf5", "rewards")
         ...     require_own_data(file, ["rewards"], source="a.hdf5")
         Traceback (most recent call last):
         ...
-        torchrl_h2o.data.readers.error.DataError: a.hdf5, column 'rewards': it is a link to the file /etc/other.hdf5; ...
+        torchrl_h2o.data.readers.error.DataError: a.hdf5, column 'rewards': it is a link to the file other.hdf5; ...
     """
     import h5py
 

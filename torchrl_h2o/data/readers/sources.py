@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +40,7 @@ def sources_of(source: Source) -> tuple[str | Path, ...]:
     if not isinstance(source, str | Path):
         if not len(source):
             raise DataError("the list of data is empty", "name at least one file", source="data")
-        return tuple(dict.fromkeys(one for part in source for one in sources_of(part)))
+        return unique([one for part in source for one in sources_of(part)])
     path = Path(source).expanduser()
     if path.is_dir():
         return _in_folder(path)
@@ -47,8 +48,16 @@ def sources_of(source: Source) -> tuple[str | Path, ...]:
         found = sorted(Path(name) for name in glob.glob(str(path), recursive=True))
         if not found:
             raise DataError("no file has such a name", "check the path", source=source)
-        return tuple(dict.fromkeys(one for part in found for one in sources_of(part)))
+        return unique([one for part in found for one in sources_of(part)])
     return (source,)
+
+
+def unique(sources: Sequence[str | Path]) -> tuple[str | Path, ...]:
+    """Return the sources without repetitions: ``a.csv`` and ``./a.csv`` are the same."""
+    first: dict[str, str | Path] = {}
+    for one in sources:
+        first.setdefault(os.path.abspath(one), one)
+    return tuple(first.values())
 
 
 def is_data_set(folder: Path) -> bool:

@@ -15,7 +15,7 @@ from torchrl_h2o.data.readers.formats.text import read_text
 if TYPE_CHECKING:
     from torchrl_h2o.data.readers.log_columns import LogColumns
 
-_TEXT = {suffix: read_text for suffix in (".csv", ".txt", ".tsv", ".dat", ".log")}
+_TEXT = dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".log"), read_text)
 FORMATS = {**_TEXT, ".npz": read_npz, ".mat": read_mat, ".parquet": read_parquet, ".mcap": read_mcap}
 """Reader of a file by its suffix; a file with any other suffix is read as text."""
 

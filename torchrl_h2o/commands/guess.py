@@ -1,0 +1,4 @@
+GUESS = "--guess"
+
+
+def guess_columns(a): ...
