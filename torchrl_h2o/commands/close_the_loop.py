@@ -123,7 +123,8 @@ def expanded(argument: str) -> list[str]:
 def run() -> None:
     """Entry point of the console command ``close-the-loop``."""
     if GUESS in sys.argv[1:]:
-        return guess_columns(sys.argv[1:])
+        guess_columns(sys.argv[1:])
+        return
     sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()
 

@@ -183,7 +183,9 @@ class LogColumns:
 
     def _check_places(self) -> None:
         indices = [column.index for column in self.in_file]
-        if len(set(indices)) < len(indices) and indices != [None] * len(indices):
+        if not indices:
+            raise ValueError("all columns have derivative_of; describe those of the file")
+        if set(indices) != {None} and (None in indices or len(set(indices)) < len(indices)):
             raise ValueError("two columns have the same index, or only some have one; give all or none an index")
         positions = [name for name in self._names("observation") if name not in self.derivatives]
         for name, position in self.derivatives.items():

@@ -7,7 +7,7 @@ The messages of one topic are the rows. Columns of other topics, such as command
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,7 +79,8 @@ def read_mcap(path: Path, layout: LogColumns | None) -> RawTable:
         columns |= {f"{other}:{column}": partial(_held, content, column, last) for column in content.names}
     if len(rows) < 2:
         raise DataError(f"there are {len(rows)} messages of {name}", "a transition needs two", source=path)
-    return table_of(columns, len(rows), path, layout)
+    several = sum(topic.kind == _JOINTS for topic in topics.values()) > 1
+    return replace(table_of(columns, len(rows), path, layout), topic=name if several else None)
 
 
 def _seconds(stamps: np.ndarray, first: int) -> np.ndarray:
@@ -107,11 +108,6 @@ def _main_topic(topics: dict[str, _Topic], layout: LogColumns | None, path: Path
         )
         raise DataError(problem, f"set topic: to one of {', '.join(joints)}", source=path)
     return chosen
-
-
-def joint_topics(path: Path) -> dict[str, int]:
-    """Return the topics of joint states in a bag and their numbers of messages."""
-    return {name: len(topic.rows) for name, topic in _topics(path).items() if topic.kind == _JOINTS}
 
 
 def _topics(path: Path) -> dict[str, _Topic]:

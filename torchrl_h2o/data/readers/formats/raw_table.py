@@ -29,6 +29,7 @@ class RawTable:
         rows: number of each row for errors, counted from 1; the line number in text files, (rows,).
         numbers: ``numbers(indices, names) -> (rows, len(indices))``, float64: the values of columns; the names are for
             errors.
+        topic: the topic whose messages are the rows of a bag, if several have joint states.
     """
 
     source: Path
@@ -36,6 +37,7 @@ class RawTable:
     width: int
     rows: np.ndarray
     numbers: Callable[[Sequence[int], Sequence[str]], np.ndarray]
+    topic: str | None = None
 
 
 def table_of(
