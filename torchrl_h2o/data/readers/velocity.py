@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 _HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 12, 15, 18, 22, 27, 33, 40, 50, 60, 75, 90)  # rows; odd windows of 7 to 181
+_DIFFERENCES = (3, 4, 5, 6)  # orders of the differences that show noise
+_CERTAIN = 0.1  # share of the noise's own square by which a difference counts as motion
 _SHORTEST_RUN = 2 * _HALF_WIDTHS[0] + 2
 
 
@@ -82,8 +84,9 @@ def estimate_velocity(
 def _noise(parts: Sequence[np.ndarray], widths: Sequence[int]) -> float:
     """Standard deviation of white noise in the positions.
 
-    It is the scatter about the cubic with the smallest error of leave-one-out prediction. Positions that are rounded
-    have at least the noise of rounding, the step divided by √12, also while they rest.
+    It is the scatter about the cubic with the smallest error of leave-one-out prediction, or the noise in differences
+    of high order if that is smaller: a cubic takes a vibration for noise. Positions that are rounded have at least the
+    noise of rounding, the step divided by √12, also while they rest.
     """
     best, variance = math.inf, 0.0
     for width in widths:
@@ -92,6 +95,9 @@ def _noise(parts: Sequence[np.ndarray], widths: Sequence[int]) -> float:
         scatter, own = float(np.mean(np.concatenate(squares))), smooth[width]
         if (left_out := scatter / (1.0 - own) ** 2) < best:
             best, variance = left_out, scatter / (1.0 - 2.0 * own + float(smooth @ smooth))
+    for order in _DIFFERENCES:
+        squares = np.concatenate([np.diff(part, order) ** 2 for part in parts])
+        variance = min(variance, float(squares.mean()) / math.comb(2 * order, order))
     steps = np.abs(np.concatenate([np.diff(part) for part in parts]))
     # steps below a millionth of the largest are rounding of the numbers, not of the sensor
     moved = steps[steps > 1e-6 * steps.max()] if len(steps) and steps.max() > 0 else np.zeros(1)
@@ -110,12 +116,18 @@ def _is_rounded(moved: np.ndarray) -> bool:
 def _error(parts: Sequence[np.ndarray], width: int, noise: float, dt: float) -> float:
     """Standard deviation of the velocity's error with a window.
 
-    What the window cuts off is estimated by the difference to polynomials of the fifth degree, less its noise.
+    What the window cuts off is estimated by the difference to a polynomial of the fifth degree, in the same window and
+    in the shortest one, less the noise of that difference.
     """
-    cubic, fifth = _kernels(width, 3)[1], _kernels(width, 5)[1]
-    differences = [np.correlate(part, fifth - cubic, "valid") for part in _long(parts, width)]
-    cut = float(np.mean(np.concatenate(differences) ** 2)) - noise**2 * float((fifth - cubic) @ (fifth - cubic))
-    return math.sqrt(noise**2 * float(cubic @ cubic) + max(0.0, cut)) / dt
+    cubic = _kernels(width, 3)[1]
+    cut = 0.0
+    for other, certain in ((width, 0.0), (_HALF_WIDTHS[0], _CERTAIN)):
+        fifth = np.pad(_kernels(other, 5)[1], width - other)
+        squares = np.concatenate([np.correlate(part, fifth - cubic, "valid") ** 2 for part in _long(parts, width)])
+        own = noise**2 * float((fifth - cubic) @ (fifth - cubic))
+        if (more := float(squares.mean()) - own) > certain * own:
+            cut = max(cut, more)
+    return math.sqrt(noise**2 * float(cubic @ cubic) + cut) / dt
 
 
 def _long(parts: Sequence[np.ndarray], width: int) -> list[np.ndarray]:

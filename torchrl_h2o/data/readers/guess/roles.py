@@ -90,10 +90,10 @@ def _guess(name: str, numbers: np.ndarray | None) -> Guess:
     words = _words(plain)
     kind = _kind(words, numbers)
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
+    if kind == "time":
+        return Guess(name, kind, *_unit_of_time(numbers, unit))
     if unit is not None:
         return Guess(name, kind, unit, stem)
-    if kind == "time":
-        return Guess(name, kind, *_unit_of_time(numbers))
     unit, note = _unit_of(kind, words, numbers)
     return Guess(name, kind, unit, stem, note)
 
@@ -130,9 +130,9 @@ def _without_unit(name: str) -> tuple[str, str | None]:
     return name, None
 
 
-def _unit_of_time(numbers: np.ndarray) -> tuple[str, str, str]:
+def _unit_of_time(numbers: np.ndarray, unit: str | None) -> tuple[str, str, str]:
     step = float(np.median(np.diff(numbers)))
-    unit = next(unit for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5), ("ns", np.inf)) if step <= most)
+    unit = unit or next(unit for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5), ("ns", np.inf)) if step <= most)
     seconds = step * UNITS[unit][1]
     rate = f", {1 / seconds:.4g} Hz" if seconds > 0 else ""
     return unit, "", f"check: the median step is {step:.4g}, which is {seconds:.4g} s{rate}"
