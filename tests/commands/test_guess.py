@@ -63,7 +63,7 @@ def test_a_first_layout_is_written_and_can_be_read(folder, capsys, monkeypatch):
 def test_a_file_is_never_overwritten(folder):
     guess_columns(["--guess", "data=log.csv", "columns=mine.yaml"])
     (folder / "mine.yaml").write_text("corrected")
-    with pytest.raises(DataError, match="mine.yaml: the file exists and is not overwritten; remove it"):
+    with pytest.raises(DataError, match=r"mine\.yaml: the file exists and is not overwritten; remove it"):
         guess_columns(["--guess", "data=log.csv", "columns=mine.yaml"])
     assert (folder / "mine.yaml").read_text() == "corrected"
 

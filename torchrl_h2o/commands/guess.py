@@ -27,7 +27,7 @@ def guess_columns(arguments: Sequence[str]) -> None:
         ValueError: for missing or other arguments, or a file that is not a model.
         torchrl_h2o.data.DataError: if the log cannot be read as a table, or the file to write exists.
     """
-    given = dict(argument.partition("=")[::2] for argument in arguments if argument != GUESS)
+    given = {name: value for name, _, value in (argument.partition("=") for argument in arguments if argument != GUESS)}
     unknown = [name for name in given if name not in ("data", "simulator", "columns")]
     if unknown or "data" not in given:
         problem = f"{unknown[0]} is not an option of --guess" if unknown else "the log is missing"

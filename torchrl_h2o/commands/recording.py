@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import cast
 
 import hydra
 import mujoco
@@ -199,14 +200,15 @@ def _selected(
     """Selects ``transitions`` consecutive rows of each log from ``first_row`` on; also returns the largest range."""
     first, parts, most = cfg.first_row, [], 0
     for index, log in enumerate(logs):
-        rows = transitions[transitions["log"] == index]
+        rows = cast("TensorDictBase", transitions[transitions["log"] == index])
         last = len(rows) if cfg.transitions is None else min(len(rows), first + cfg.transitions)
         if not 0 <= first < last:
             raise ValueError(
                 f"first_row={first} transitions={cfg.transitions} select none of the {len(rows)} rows of {log}"
             )
-        part, most = rows[first:last], max(most, last)
-        part["next", "truncated"][-1] |= ~part["next", "terminated"][-1]
-        part["next", "done"][-1] = True
+        part, most = cast("TensorDictBase", rows[first:last]), max(most, last)
+        following = cast("TensorDictBase", part["next"])
+        following["truncated"][-1] |= ~following["terminated"][-1]
+        following["done"][-1] = True
         parts.append(part)
-    return torch.cat(parts), (first, most)
+    return cast("TensorDictBase", torch.cat(parts)), (first, most)

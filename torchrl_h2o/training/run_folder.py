@@ -96,7 +96,7 @@ def resolve_paths(cfg: DictConfig) -> None:
 
 
 def _absolute(name: str) -> str:
-    """The absolute name of a file, a folder or a glob with matches; any other name, such as that of a data set, as is."""
+    """The absolute name of a file, a folder or a glob with matches; any other name, such as a data set's, as is."""
     path = Path(name)
     is_glob = not path.exists() and not path.is_absolute() and any(glob.iglob(name, recursive=True))
     return str(path.resolve()) if path.exists() else str(Path.cwd() / path) if is_glob else name

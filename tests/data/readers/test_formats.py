@@ -165,7 +165,7 @@ def test_a_file_that_is_cut_off_is_refused(log, share):
 def test_a_column_that_is_missing_or_not_described_is_named(tmp_path, name):
     columns = FORMATS[name](tmp_path / name)
     renamed = LogColumns(**{**vars(columns), "columns": (*columns.columns[:-1], Column("tau", "action")), "action": ()})
-    with pytest.raises(DataError, match="the column is missing; the header is .*") as caught:
+    with pytest.raises(DataError, match="the column is missing; the header is ") as caught:
         load(tmp_path / name, columns=renamed)
     assert caught.value.column == "tau"
     if name in ("log.parquet", "log.mcap"):

@@ -92,7 +92,7 @@ def _entries(group: h5py.Group, names: Iterable[str], source: str | Path) -> Ite
             raise DataError(f"it is a link to {link.path}", _REMEDY, source=source, column=path)
         entry = parent[name]
         if isinstance(entry, h5py.Group):
-            address = h5py.h5o.get_info(entry.id).addr
+            address = cast("Any", h5py).h5o.get_info(entry.id).addr
             if address in seen:
                 continue
             seen.add(address)

@@ -103,9 +103,9 @@ def _hdf5_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
 
     try:
         with h5py.File(path, "r") as file:
-            names = [name for name in file if not name.startswith("#")]
+            names = [name for name in map(str, file) if not name.startswith("#")]
             require_own_data(file, names, source=path)
-            stack = [(name, file[name]) for name in names]
+            stack: list[tuple[str, Any]] = [(name, file[name]) for name in names]
             while stack:
                 name, entry = stack.pop(0)
                 if isinstance(entry, h5py.Group):
