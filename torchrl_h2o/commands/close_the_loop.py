@@ -4,6 +4,7 @@ close-the-loop                                           # the wheel-legged robo
 close-the-loop data=standing_still.txt                   # the same simulator with the real robot's log
 close-the-loop simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
 close-the-loop simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
+close-the-loop --guess data=log.csv simulator=robot.xml                # writes a first log.yaml for you to correct
 """
 
 import os
@@ -18,6 +19,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
+from torchrl_h2o.commands.guess import GUESS, guess_columns
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.effects import CatalogueEntry, paper_gap
 from torchrl_h2o.envs import DynamicsGap
@@ -74,12 +76,13 @@ def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
     simulation = make_simulation(cfg, recording)
+    recording = recording.for_model(simulation.model)
     report = close_the_loop(
         simulation,
         recording.transitions,
         chosen_entries(cfg, simulation),
         source=recording.source,
-        held_out=cfg.held_out,
+        held_out=recording.reported_on,
         seed=cfg.seed,
     )
     report.save(directory)
@@ -119,6 +122,9 @@ def expanded(argument: str) -> list[str]:
 
 def run() -> None:
     """Entry point of the console command ``close-the-loop``."""
+    if GUESS in sys.argv[1:]:
+        guess_columns(sys.argv[1:])
+        return
     sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()
 
