@@ -262,6 +262,14 @@ class JudgeSettings:
 
     horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     """Control steps ahead at which errors are reported."""
+    shown_seconds: float = 0.1
+    """Time ahead, in s, of the windows that the report shows."""
+    shown_steps: int = 5
+    """Smallest number of control steps in these windows."""
+    shown_quantities: int = 4
+    """Largest number of quantities shown of a window, those with the largest errors."""
+    max_runs: int = 200
+    """Largest number of runs whose errors are listed."""
     max_rejected: int = 30
     """Largest number of rejected effects in the report."""
     rounding: float = 1e-5

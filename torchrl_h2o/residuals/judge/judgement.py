@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import Effect, is_negligible
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
+from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import separated_by
+from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -16,6 +18,7 @@ from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import ErrorSummary, TwoSample
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.outcome import Attempt
@@ -49,6 +52,8 @@ class Judgement:
         alternatives: an entry for each part that has alternatives.
         two_sample: AUC of a classifier before and after.
         trace: the residual over time.
+        windows: worst, median and best window, measured against simulated.
+        runs: error of each run.
     """
 
     measured: Measured
@@ -59,6 +64,8 @@ class Judgement:
     alternatives: tuple[Alternatives, ...]
     two_sample: TwoSample
     trace: ResidualTrace
+    windows: tuple[ShownWindow, ...]
+    runs: tuple[RunError, ...]
 
 
 def judge(
@@ -92,6 +99,8 @@ def judge(
         ),
         two_sample=_two_sample(simulation, mended, measured, seed, settings),
         trace=_residual_trace(simulation, mended, measured),
+        windows=shown_windows(simulation, mended, measured, settings=settings.judge),
+        runs=run_errors(simulation, mended, measured, settings=settings.judge),
     )
 
 
@@ -112,7 +121,8 @@ def _rejected(
 ) -> tuple[tuple[Attempt, float], ...]:
     trace = explanation.trace
     found = {entry.name for entry in trace.entries}
-    listed = [attempt for attempt in trace.attempts[: settings.judge.max_rejected] if attempt.entry.name not in found]
+    sized = [attempt for attempt in trace.attempts if not is_negligible(attempt.effect, attempt.entry.trials)]
+    listed = [attempt for attempt in sized[: settings.judge.max_rejected] if attempt.entry.name not in found]
     return tuple((attempt, overall_error(simulation.with_effects(attempt.effect), measured)) for attempt in listed)
 
 
