@@ -13,12 +13,12 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
@@ -71,7 +71,7 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
     return [entry for entry in entries if any(fnmatchcase(names[entry.name], pattern) for pattern in patterns)]
 
 
-@hydra.main(config_path="../config", config_name="close_the_loop", version_base=None)
+@hydra_main("../config", "close_the_loop")
 def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
@@ -101,7 +101,9 @@ def print_report(report: Report, directory: Path) -> None:
             unit = "" if symbol == "1" else f" {symbol}"
             low, high = found.ci95.get(name, (float("nan"), float("nan")))
             label = found.name if row == 0 else ""
-            print(f"{label:<48}{quantity_name(name, symbol):<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}")
+            print(
+                f"{label:<48}{quantity_name(name, symbol):<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}"
+            )
     if report.error is not None:
         print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
         for dimension in report.error.per_dimension:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 
-from torchrl_h2o.effects.action.play import ActionSaturation
+from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation
 from torchrl_h2o.effects.action.signal import ActionBias, ActionGain
 from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.effect import ActionEffect, Effect, ForceEffect, ModelEffect, ObservationEffect
@@ -18,6 +18,9 @@ from torchrl_h2o.effects.model.compilation import compile_model, edit_spec
 from torchrl_h2o.effects.pipeline import Pipeline
 
 _LINEAR_IN_TIME = (ActionDelay, ActionLag)  # start from zero, so a gain before or after them is the same
+_ON_ACTUATORS = (ActionGain, ActionBias, ActionSaturation)
+# do not lead from a command within the control range out of it
+_WITHIN_RANGE = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag)
 
 
 @dataclass(frozen=True)
@@ -76,12 +79,21 @@ def put_into_spec(spec: mujoco.MjSpec, effects: Sequence[Effect]) -> tuple[NotHe
 def _into_actuators(spec: mujoco.MjSpec, model: mujoco.MjModel, actions: Sequence[ActionEffect]) -> list[ActionEffect]:
     """Writes action effects into the actuators, the last one first; returns those that the actuators hold."""
     drives = {i: Drive.of(model, i) for i in range(model.nu)}
+    # MuJoCo would clamp these commands before the actuator, the effect clamps after it
+    beyond = {
+        index
+        for effect in actions
+        if not isinstance(effect, (*_ON_ACTUATORS, *_WITHIN_RANGE))
+        for index in _actuators(effect, model)
+        if model.actuator_ctrllimited[index]
+    }
     held, between = [], []
     for effect in reversed(actions):
         chosen = _actuators(effect, model)
         drive_of = {i: drive for i in chosen if (drive := drives[i]) is not None}
         after = {i: changed for i, drive in drive_of.items() if (changed := drive.after(effect)) is not None}
-        if len(after) == len(chosen) and not any(_in_the_way(effect, other, model) for other in between):
+        possible = len(after) == len(chosen) and not beyond & set(chosen)
+        if possible and not any(_in_the_way(effect, other, model) for other in between):
             drives |= after
             held.append(effect)
         else:
@@ -122,8 +134,8 @@ def _reason(effect: Effect, *, reads_controls: bool) -> str:
         return "an actuator of MuJoCo filters its control at every physics step, this effect once per control step"
     if effect.random:
         return "MJCF has no random actuation"
-    if isinstance(effect, ActionGain | ActionBias | ActionSaturation):
+    if isinstance(effect, _ON_ACTUATORS):
         if reads_controls:
             return "another effect is a force that depends on the executed control"
-        return "its actuator is not linear in its control, or another effect comes between them"
+        return "its actuator is not linear in its control, or another effect on the action comes between them"
     return "MuJoCo's actuators have no such nonlinearity"

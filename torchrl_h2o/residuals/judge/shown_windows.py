@@ -32,8 +32,8 @@ def shown_windows(
         settings: length of the windows, and number of quantities.
 
     Returns:
-        Three windows in this order, each with the quantities with the largest error; fewer, or none, if there are
-        fewer windows.
+        Three windows in this order, each with the quantities whose errors are largest over all windows; fewer, or none,
+        if there are fewer windows.
 
     Examples:
         >>> from torchrl_h2o.effects import Gravity
@@ -56,9 +56,12 @@ def shown_windows(
     error = np.sqrt((scaled**2).mean(-1))
     order = np.argsort(np.nan_to_num(error[1], nan=np.inf), kind="stable")
     ranks = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
+    finite = np.where(np.isfinite(scaled), scaled, np.nan)
+    largest = np.argsort(-np.nan_to_num(np.nanmean(finite**2, axis=1)).max(0), kind="stable")
+    quantities = largest[: settings.shown_quantities]
     chosen = {int(window): rank for rank, window in reversed(ranks.items())}  # of a few windows, some coincide
     return tuple(
-        _shown(rank, simulation, measured, int(starts[window]), missed[:, window], scaled[:, window], settings)
+        _shown(rank, simulation, measured, int(starts[window]), missed[:, window], scaled[:, window], quantities)
         for window, rank in sorted(chosen.items(), key=lambda item: list(ranks).index(item[1]))
     )
 
@@ -70,7 +73,7 @@ def _shown(
     row: int,
     missed: np.ndarray,
     scaled: np.ndarray,
-    settings: JudgeSettings,
+    quantities: np.ndarray,
 ) -> ShownWindow:
     """One window.
 
@@ -81,13 +84,11 @@ def _shown(
         row: first row of the window.
         missed: (2, H, n), residuals before and after.
         scaled: (2, n), the residuals at the end, in spreads.
-        settings: number of quantities.
+        quantities: indices of the quantities.
     """
     steps = missed.shape[1]
     values = np.vstack([measured.observation[row], measured.following[row : row + steps]])
     simulated = values - np.concatenate([np.zeros_like(missed[:, :1]), missed], axis=1)
-    size = np.nan_to_num(np.abs(scaled), nan=np.inf).max(0)
-    largest = np.argsort(-size, kind="stable")[: settings.shown_quantities]
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (float(np.sqrt((ends**2).mean())) for ends in scaled)
     return ShownWindow(
@@ -100,6 +101,6 @@ def _shown(
         after=after,
         quantities=tuple(
             WindowQuantity(names[i], units[i], *(tuple(part[:, i].tolist()) for part in (values, *simulated)))
-            for i in largest
+            for i in quantities
         ),
     )

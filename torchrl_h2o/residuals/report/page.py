@@ -70,6 +70,7 @@ def report_page(report: ReportContents) -> str:
         ranking=_ranking(report),
         shown_runs=sorted(report.runs, key=_worst_first)[:SHOWN_RUNS],
         remedy=REMEDY,
+        held=_held(report),
         pictures=_pictures(report),
         colours={"before": plots.BEFORE, "after": plots.AFTER},
     )
@@ -99,6 +100,12 @@ def _ranking(report: ReportContents) -> list[_Tried]:
     ]
     # NaN, the error of a divergence, sorts last
     return found + sorted(rejected, key=lambda tried: (number(tried.error) == "–", tried.error))
+
+
+def _held(report: ReportContents) -> str:
+    """The effects found that the file with the mended model holds."""
+    left_out = () if report.mended_model is None else report.mended_model.effects
+    return ", ".join(found.words for found in report.found if found.effect not in left_out) or "none of them"
 
 
 def _worst_first(run: RunError) -> tuple[bool, float]:

@@ -48,7 +48,7 @@ class ShownWindow:
         before: error without the effects at the end of the window: root mean square over the dimensions, each divided
             by the standard deviation of its change over such a window; NaN if the simulation diverges.
         after: the same error with all effects.
-        quantities: the quantities with the largest errors.
+        quantities: the quantities whose errors are largest over all windows.
     """
 
     rank: str
