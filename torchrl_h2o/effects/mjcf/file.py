@@ -78,6 +78,7 @@ def _copy_assets(spec: mujoco.MjSpec, folder: Path, name: str) -> None:
             ]
     if names:
         spec.meshdir = spec.texturedir = ""
+        spec.modelfiledir = str(folder)
         spec.strippath = False
 
 
