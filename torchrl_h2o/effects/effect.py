@@ -153,11 +153,11 @@ class Effect(ABC):
         return self.wording.format(**parameters, **chosen, load=load)
 
 
-def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> str:
+def _in_words(field: str, chosen: Any, names: Sequence[str]) -> str:
     """Words for a selection: "all joints" for ``"*"``; "actuators 0, 2" for ``(0, 2)``, or their names."""
     if chosen is None or chosen == "*":
         return f"all {field}"
-    selected: tuple[Any, ...] = (chosen,) if isinstance(chosen, str) else chosen
+    selected = chosen if isinstance(chosen, tuple) else (chosen,)
     return f"{field} {', '.join(names[int(i)] if i in range(len(names)) else str(i) for i in selected)}"
 
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests.effects.models import task_xml
+from tests.full_disk import full_disk
 from torchrl_h2o.effects import BodyMass, Payload, compile_model
-from torchrl_h2o.effects.mjcf import file as module
 from torchrl_h2o.effects.mjcf import write_mjcf
 
 WITH_MESHES = """
@@ -68,13 +68,11 @@ def test_all_digits_are_kept_and_short_numbers_stay_short(tmp_path):
     assert 'timestep="0.01"' in path.read_text()
 
 
-def test_a_failure_leaves_the_earlier_file_and_nothing_else(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_earlier_file_and_nothing_else(tmp_path):
     path = tmp_path / "mended.xml"
     path.write_text("<mujoco/>")
-    monkeypatch.setattr(module, "_LONG_NUMBER", module.re.compile(r"9\.81"))
-    monkeypatch.setattr(module, "repr", lambda number: "1.5", raising=False)  # a text that gives another model
-    with pytest.raises(ValueError, match="another gravity"):
-        write_mjcf(mujoco.MjSpec.from_string("<mujoco><option gravity='0 1 -9.81'/></mujoco>"), path)
+    with full_disk(), pytest.raises(OSError, match="too large"):
+        write_mjcf(mujoco.MjSpec.from_string(task_xml("HalfCheetah")), path)
     assert path.read_text() == "<mujoco/>"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import ActionEffect, Effect
 from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.envs.dynamics_gap import transforms_of
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.report.json_file import entries_from_json, read_json, report_to_json, write_json
 from torchrl_h2o.residuals.report.page import write_page
@@ -57,8 +58,8 @@ class Report(ReportContents):
 
         Raises:
             ValueError: if the model has no element that an effect could act on, if the env is batched or does not run
-                on MuJoCo, or if it has transforms other than dynamics gaps and an effect alters actions or
-                observations.
+                on MuJoCo, if it has transforms other than dynamics gaps and an effect alters actions or observations,
+                or if an effect and a gap of the env both alter actions, because the gap would come second.
 
         Examples:
             >>> from torchrl.envs import GymEnv
@@ -73,6 +74,12 @@ class Report(ReportContents):
             >>> env.rollout(3)["next", "reward"].shape
             torch.Size([3, 1])
         """
+        own = [effect for gap in transforms_of(env) if isinstance(gap, DynamicsGap) for effect in gap.effects]
+        if all(any(isinstance(effect, ActionEffect) for effect in effects) for effects in (own, self.effects)):
+            raise ValueError(
+                "a gap of the env and an effect of the report both alter actions, and the gap has to come first: put "
+                "both into one gap of a new env, TransformedEnv(env, DynamicsGap(*gap.effects, *report.effects))"
+            )
         return TransformedEnv(env, DynamicsGap(*self.effects))
 
     def sample(self, n: int, *, seed: int = 0) -> list[tuple[Effect, ...]]:

@@ -1,7 +1,5 @@
 """Parts of the data that a report shows: windows, measured against simulated, and the error of each run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 
