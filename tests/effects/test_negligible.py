@@ -18,7 +18,14 @@ from torchrl_h2o.effects import (
 
 @pytest.mark.parametrize(
     "effect",
-    [Payload(1e-18, x=0.3), Gravity(1.0 + 1e-9), ActionDelay(1e-12), ActionSaturation(1e9), BodyCentreOfMass(1e-12)],
+    [
+        Payload(1e-18, x=0.3),
+        Payload(0.0, x=1.0),
+        Gravity(1.0 + 1e-9),
+        ActionDelay(1e-12),
+        ActionSaturation(1e9),
+        BodyCentreOfMass(1e-12),
+    ],
 )
 def test_a_value_within_rounding_is_no_effect(effect):
     assert is_negligible(effect)
@@ -41,8 +48,3 @@ def test_trials_tell_how_large_a_parameter_usually_is():
 def test_numbers_without_a_neutral_value_do_not_count():
     assert not is_negligible(ResidualForce(("torque on elbow: 0.4 · sin(7 q)",)))
     assert is_negligible(ResidualForce(("torque on elbow: 0 · sin(7 q)",)))
-
-
-def test_a_payload_without_mass_is_neutral_wherever_it_is():
-    assert Payload(0.0, x=1.0).is_neutral
-    assert not Payload(0.1).is_neutral

@@ -109,9 +109,7 @@ class Effect(ABC):
             >>> str(JointDamping(0.1, "rail").parameters_on(joints)["damping"])
             '0.1 N·s/m'
         """
-        if not hasattr(self, "joints"):
-            return self.parameters
-        moving = motion(self.joints, names)
+        moving = motion(getattr(self, "joints", None), names)
         return {
             name: dataclasses.replace(parameter, unit=unit_under(moving, parameter.unit))
             for name, parameter in self.parameters.items()

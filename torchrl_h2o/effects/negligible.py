@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 
 from torchrl_h2o.effects.effect import Effect
+from torchrl_h2o.effects.model.body import Payload
 from torchrl_h2o.effects.parameter import Parameter
 
 _ROUNDING = 1e-6  # share of a parameter's typical size; fits stop at moves of about this size
@@ -29,6 +30,8 @@ def is_negligible(effect: Effect, trials: tuple[Mapping[str, float], ...] = ()) 
         for name, parameter in effect.parameters.items()
         if _is_rounding(parameter, [trial[name] for trial in trials if name in trial])
     }
+    if isinstance(effect, Payload) and "mass" in rounded:
+        return True  # wherever it is
     return effect.is_neutral or (bool(rounded) and effect.with_parameters(rounded).is_neutral)
 
 

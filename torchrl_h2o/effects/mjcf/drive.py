@@ -61,7 +61,8 @@ class Drive:
         commands = _interval(model.actuator_ctrlrange[index] if clamped else None)
         forces = _interval(model.actuator_forcerange[index] if model.actuator_forcelimited[index] else None)
         affine = model.actuator_biastype[index] == _AFFINE
-        bias = tuple(float(value) for value in model.actuator_biasprm[index][:3]) if affine else (0.0, 0.0, 0.0)
+        constant, position, velocity = model.actuator_biasprm[index][:3].tolist() if affine else (0.0, 0.0, 0.0)
+        bias = (constant, position, velocity)
         gain = float(model.actuator_gainprm[index][0])
         return cls(index, commands, gain, bias, forces, slope=1.0, offset=0.0, low=commands[0], high=commands[1])
 

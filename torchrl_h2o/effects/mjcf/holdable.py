@@ -126,6 +126,8 @@ def _reads_controls(effect: Effect) -> bool:
 def _reason(effect: Effect, *, reads_controls: bool) -> str:
     if isinstance(effect, ObservationEffect):
         return "MJCF describes the mechanism, not the errors of its sensors"
+    if isinstance(effect, JointForce):
+        return "MJCF has no constant force on a joint without a further actuator"
     if isinstance(effect, ForceEffect):
         return "MJCF has no such force"
     if isinstance(effect, ActionDelay):

@@ -140,10 +140,6 @@ class Payload(ModelEffect):
     y: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
     bodies: Names = "*"
 
-    @property
-    def is_neutral(self) -> bool:
-        return self.mass == 0.0  # wherever it is
-
     def edit(self, spec: mujoco.MjSpec) -> None:
         bodies = selection.bodies(spec, self.bodies)
         if self.mass:

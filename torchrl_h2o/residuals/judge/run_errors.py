@@ -45,7 +45,13 @@ def run_errors(
     squared = [(residuals(which, measured, rows, rng=rng(0))[:, 0] / size) ** 2 for which in (simulation, mended)]
     of_run = np.split(np.arange(len(rows)), np.cumsum([len(entry[1]) for entry in listed])[:-1])
     return tuple(
-        RunError(str(index), len(chosen), *(_root_mean(part[places]) for part in squared), held_out)
+        RunError(
+            str(index),
+            len(chosen),
+            before=_root_mean(squared[0][places]),
+            after=_root_mean(squared[1][places]),
+            held_out=held_out,
+        )
         for (index, chosen, held_out), places in zip(listed, of_run, strict=True)
     )
 
