@@ -65,7 +65,8 @@ def _beyond_range(log: Log, response: Response, settings: AuditSettings) -> list
         if not model.actuator_ctrllimited[index]:
             continue
         low, high = model.actuator_ctrlrange[index]
-        outside = (log.action[:, index] < low - 1e-3 * (high - low)) | (log.action[:, index] > high + 1e-3 * (high - low))
+        margin = 1e-3 * (high - low)
+        outside = (log.action[:, index] < low - margin) | (log.action[:, index] > high + margin)
         usual = float(np.median(np.abs(log.action[:, index])))
         far = usual > 3.0 * max(abs(low), abs(high))
         if outside.mean() > settings.repeated:
@@ -81,14 +82,14 @@ def _beyond_range(log: Log, response: Response, settings: AuditSettings) -> list
 def _against_accelerations(response: Response, settings: AuditSettings) -> list[Finding]:
     actions = response.limited[response.rows].mean(1)
     effect = response.by_action * actions[:, None]
-    target = response.change - response.simulated + effect.sum(-1)
-    nuisance = friction_responses(response)
+    target, nuisance = response.target, friction_responses(response)
     known = np.isfinite(target).all(1) & np.isfinite(effect).all((1, 2))
     if known.sum() < settings.min_windows:
         return []
     base = robust_fit(target, nuisance, response.scale, settings.robust)
     at_zero = robust_fit(target, np.concatenate([effect, nuisance], -1), response.scale, settings.robust)
-    weights = robust_weights((target - np.concatenate([effect, nuisance], -1) @ at_zero.values) / response.scale, settings.robust)
+    left = target - np.concatenate([effect, nuisance], -1) @ at_zero.values
+    weights = robust_weights(left / response.scale, settings.robust)
     claimed = _share(effect.sum(-1), target, response.scale, weights * known[:, None])
     if claimed < settings.action_matters:
         return []
@@ -97,7 +98,11 @@ def _against_accelerations(response: Response, settings: AuditSettings) -> list[
     found, lag = [], int(lags[best])
     if explained[best] < settings.unrelated:
         return [_foreign_actions(explained[best], claimed)]
-    if lag != 0 and (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]]):
+    sharp = lag_of_events(response, settings)
+    if sharp >= settings.clear_lag and explained[sharp - lags[0]] > settings.unrelated:
+        best, lag = int(sharp - lags[0]), sharp
+        found += _late(response, lag, settings)
+    elif lag != 0 and (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]]):
         found += _late(response, lag, settings)
     else:
         best = int(-lags[0])
@@ -141,6 +146,42 @@ def _over_lags(
         explained.append(1.0 - found.unexplained / max(without.unexplained, 1e-300))
         fits.append(found)
     return lags, np.array(explained), fits
+
+
+def lag_of_events(response: Response, settings: AuditSettings) -> int:
+    """Lag in rows at which sudden changes of the actions and of the accelerations coincide; 0 if it is not clear.
+
+    Smooth actions tell little about their lag beside friction and masses that are not known exactly. Second differences
+    of the velocities leave these out. The lag must be the same over one and two rows, and significant.
+    """
+    found = {_lag_of_changes(response, rows, settings) for rows in (1, 2)}
+    return found.pop() if len(found) == 1 else 0
+
+
+def _lag_of_changes(response: Response, rows: int, settings: AuditSettings) -> int:
+    log, (first, last) = response.log, settings.action_lags
+    velocity = np.vstack([log.observation[:, response.moving], log.following[-1:, response.moving]])
+    sums = np.concatenate([np.zeros((1, response.actions.shape[1])), np.cumsum(response.limited, axis=0)])
+    starts = np.arange(last, len(log) - 2 * rows + first)
+    starts = starts[log.run[starts - last] == log.run[starts + 2 * rows - first - 1]]
+    if len(starts) < settings.min_windows:
+        return 0
+    second = velocity[starts + 2 * rows] - 2.0 * velocity[starts + rows] + velocity[starts]
+    scale = 1.4826 * np.median(np.abs(second), axis=0) + 1e-12
+    slope = np.nan_to_num(np.nanmedian(response.by_action, axis=0)) / scale[:, None]
+    wanted = np.clip(second / scale, -2.0 * settings.robust, 2.0 * settings.robust)
+    left = []
+    for lag in range(first, last + 1):
+        begin = starts - lag
+        changes = sums[begin + 2 * rows] - 2.0 * sums[begin + rows] + sums[begin]
+        responses = (slope[None] * changes[:, None]).reshape(-1, changes.shape[1])
+        gram = responses.T @ responses + 1e-12 * np.eye(changes.shape[1])
+        explained = responses @ np.linalg.solve(gram, responses.T @ wanted.ravel())
+        left.append(float(((wanted.ravel() - explained) ** 2).sum()))
+    best, number = int(np.argmin(left)), len(starts) * len(scale) / (2 * rows)
+    gained, at_zero = (np.log(left[-first] / left[best]), np.log(float((wanted**2).sum()) / left[-first]))
+    clear = number * gained > settings.lag_significance and at_zero < 0.3 * gained
+    return best + first if clear else 0
 
 
 def _foreign_actions(explained: float, claimed: float) -> Finding:
@@ -219,7 +260,8 @@ def _exchanged(
         other = int(strongest[index])
         clear = abs(gains[index, other]) > settings.significance * errors[index, other]
         # 0.4: the gain of the simulator's own actuator is 1
-        if clear and abs(gains[index, other]) > 0.4 * spread[other] and abs(gains[index, index]) < 0.3 * abs(gains[index, other]):
+        strong = abs(gains[index, other]) > 0.4 * spread[other]
+        if clear and strong and abs(gains[index, index]) < 0.3 * abs(gains[index, other]):
             names, joint = response.log.actuators, joint_of(response.simulation.model, int(index), response.log.pairs)
             where = names[index] if joint is None else response.log.pairs[joint].name
             words = f"{where} follows the action of {names[other]} instead of {names[index]}: the columns are exchanged"

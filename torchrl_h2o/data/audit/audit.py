@@ -15,11 +15,11 @@ from torchrl_h2o.data.audit.excitation import check_excitation
 from torchrl_h2o.data.audit.finding import SEVERITIES, Finding
 from torchrl_h2o.data.audit.kinematics import check_kinematics
 from torchrl_h2o.data.audit.log import AuditedSimulation, AuditedTransitions, Log
-from torchrl_h2o.data.audit.model import check_model
+from torchrl_h2o.data.audit.model import check_belonging, check_model
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.rows import check_rows
 from torchrl_h2o.data.audit.settings import AUDIT_SETTINGS, AuditSettings
-from torchrl_h2o.data.audit.time import check_time
+from torchrl_h2o.data.audit.time import check_step, check_time
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,11 @@ def audit(
     noise = estimate_noise(log, derivatives, step)
     found = check_time(log, simulation, derivatives, settings)
     found += check_rows(log, simulation, settings)
-    found += check_kinematics(log, derivatives, noise, step, settings)
+    if not any(finding.severity == "severe" and finding.check == "time" for finding in found):
+        kinematics = check_kinematics(log, derivatives, noise, step, settings)
+        severe = any(finding.severity == "severe" for finding in kinematics)
+        # a wrong time step can look like wrong columns
+        found += (check_step(step, settings) if severe else []) or kinematics
     if any(finding.severity == "severe" for finding in found):
         return ordered(found)
     response = Response.of(log, simulation, noise, settings)
@@ -110,6 +114,7 @@ def audit(
     if not any(finding.severity == "severe" for finding in found):
         found += check_actions(log, response, settings)
     if not any(finding.severity == "severe" for finding in found):
+        found += check_belonging(response, settings)
         found += check_excitation(response, settings)
     return ordered(found)
 

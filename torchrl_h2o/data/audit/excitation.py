@@ -17,6 +17,13 @@ _TO_RECORD = {
     frozenset({"dry friction", "viscous friction"}): "record slow and fast motion of the joint",
     frozenset({"armature", "motor gain"}): "record a constant torque against gravity beside fast changes",
     frozenset({"gravity", "mass"}): "record fast motion with a known torque: gravity shows at rest, mass in acceleration",
+    frozenset({"mass", "motor gain"}): "only their ratio shows in the motion: weigh the robot, or measure a torque",
+    frozenset({"mass", "armature"}): "weigh the robot",
+    frozenset({"gravity", "armature"}): "record fast and slow motion through the same angles",
+    frozenset({"gravity", "motor gain"}): "record fast motion beside holding still",
+    frozenset({"viscous friction", "motor gain"}): "record actions that do not follow the velocity, such as random ones",
+    frozenset({"viscous friction", "armature"}): "record several frequencies of motion",
+    frozenset({"dry friction", "armature"}): "record several frequencies of motion",
     frozenset({"drive delay", "motor gain"}): "record steps of the action",
     frozenset({"drive delay", "viscous friction"}): "record steps of the action from rest",
 }
@@ -100,8 +107,9 @@ def _pairs(found: list[Sensitivity], settings: AuditSettings) -> list[Finding]:
             if abs(cosine) < settings.alike:
                 continue
             record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record other motion of this joint")
-            joint = f" of {one.joint or other.joint}" if one.joint or other.joint else ""
-            words = f"{one.effect} and {other.effect}{joint} look alike in this log (cosine {cosine:.2f})"
+            words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
+            if one.joint == other.joint != "":
+                words = f"{one.effect} and {other}{words[len(f'{one} and {other}') :]}"
             notes.append(Finding(CHECK, "note", words, None, record))
     return notes
 

@@ -150,7 +150,7 @@ class Log:
         return [slice(a, b) for a, b in zip([0, *edges.tolist()], [*edges.tolist(), len(self)], strict=True)]
 
     def starts(self, horizon: int, most: int, margin: int = 0) -> np.ndarray:
-        """First rows of windows that do not overlap, evenly thinned, (W,).
+        """First rows of windows that overlap by half at most, evenly thinned, (W,).
 
         Args:
             horizon: transitions per window.
@@ -161,7 +161,7 @@ class Log:
         bad = np.concatenate([[0], np.cumsum(self.clipped)])
         whole = self.run[starts - margin] == self.run[starts + horizon - 1]
         starts = starts[whole & (bad[starts + horizon] == bad[starts])]
-        apart = starts[:: max(1, horizon)]
+        apart = starts[:: max(1, horizon // 2)]
         return apart[np.unique(np.linspace(0, len(apart) - 1, min(most, len(apart))).round().astype(int))]
 
 

@@ -95,6 +95,16 @@ class Response:
         return np.clip(self.actions, *self._range)
 
     @cached_property
+    def anchor(self) -> np.ndarray:
+        """Actions of the windows about which the simulation is linearised, (W, H, nu).
+
+        They are the logged ones, or zero if the simulator is far nearer to the log without actions.
+        """
+        logged = self.limited[self.rows]
+        without = self.misfit(actions=np.zeros_like)
+        return logged if without > self.settings.better * self.misfit() else np.zeros_like(logged)
+
+    @cached_property
     def _range(self) -> tuple[np.ndarray, np.ndarray]:
         model = self.simulation.model
         low, high = model.actuator_ctrlrange.T
@@ -119,8 +129,14 @@ class Response:
 
     @cached_property
     def simulated(self) -> np.ndarray:
-        """Simulated change of the velocities under the logged actions, (W, m)."""
-        return self._velocities(self.limited[self.rows]) - self.before
+        """Simulated change of the velocities under the actions of :attr:`anchor`, (W, m)."""
+        return self._velocities(self.anchor) - self.before
+
+    @cached_property
+    def target(self) -> np.ndarray:
+        """Change of the velocities that the actions have to explain, linearised, (W, m)."""
+        effect = (self.by_action * self.anchor.mean(1)[:, None]).sum(-1)
+        return self.change - self.simulated + effect
 
     @cached_property
     def error(self) -> np.ndarray:
@@ -135,7 +151,7 @@ class Response:
     @cached_property
     def by_action(self) -> np.ndarray:
         """Derivative of the change by a constant offset of each action, (W, m, nu), by differences inside its range."""
-        base, unit = self.limited[self.rows], self.settings.nudge * self.action_unit
+        base, unit = self.anchor, self.settings.nudge * self.action_unit
         inward = np.where(base.mean(1) > 0.5 * sum(np.nan_to_num(self._range, posinf=0.0, neginf=0.0)), -1.0, 1.0)
         steps = inward * unit  # (W, nu)
         moved = np.concatenate([base + (steps * row)[:, None] for row in np.eye(base.shape[-1])])
@@ -147,7 +163,7 @@ class Response:
         """Derivative of the change by a constant force on each pair's degree of freedom, (W, m, pairs)."""
         pairs, nv = self.log.pairs, self.simulation.model.nv
         size = self._force_nudge()
-        actions = np.tile(self.limited[self.rows], (len(pairs), 1, 1))
+        actions = np.tile(self.anchor, (len(pairs), 1, 1))
         applied = np.zeros((len(pairs), len(self.starts), self.horizon, nv))
         for index, pair in enumerate(pairs):
             applied[index, ..., pair.dof] = size[index]
@@ -164,7 +180,7 @@ class Response:
     @cached_property
     def by_zero(self) -> np.ndarray:
         """Derivative of the change by the zero of each pair's position, (W, m, pairs)."""
-        pairs, actions = self.log.pairs, self.limited[self.rows]
+        pairs, actions = self.log.pairs, self.anchor
         size, moved = self.settings.zero_nudge, []
         for pair in pairs:
             moved.append(self.states.copy())
@@ -190,7 +206,7 @@ class Response:
         """Unexplained share of the change of the velocities: median error over median change, mean over velocities.
 
         Args:
-            actions: changes the actions (W, H, nu) first; None for none.
+            actions: changes the actions (W, H, nu) first, also to another number of steps; None for none.
             observations: changes the observations (..., n) first; None for none.
         """
         executed = self.limited[self.rows]

@@ -96,8 +96,13 @@ def _jumps(log: Log, simulation: AuditedSimulation, settings: AuditSettings) -> 
     size = np.zeros(len(log))
     for pair in log.pairs:
         error = np.abs(_deviations(log, pair))
-        usual = np.maximum(settings.jump_noise * deviation(error), settings.jump * log.observation[:, pair.position].std())
-        size = np.maximum(size, np.where(log.clipped, 0.0, error / max(usual, 1e-12)))
+        usual = max(settings.jump_noise * deviation(error), settings.jump * log.observation[:, pair.position].std())
+        # a velocity that changes within the row accounts for as much
+        speed = np.maximum(
+            2.0 * np.abs(log.following[:, pair.velocity] - log.observation[:, pair.velocity]),
+            1.5 * log.observation[:, pair.velocity].std(),
+        )
+        size = np.maximum(size, np.where(log.clipped, 0.0, error / np.maximum(np.maximum(usual, log.dt * speed), 1e-12)))
     suspects = np.flatnonzero(size > 1.0)
     if not len(suspects):
         return []

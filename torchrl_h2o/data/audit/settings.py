@@ -24,8 +24,15 @@ class AuditSettings:
     """Share of irregular steps beyond which they are a warning; below they are a note."""
     very_irregular: float = 0.05
     """Share of irregular steps beyond which they are severe."""
+    short_runs: float = 50.0
+    """Mean number of rows between two splits of a log with time stamps below which a warning is given."""
+    very_short_runs: float = 15.0
+    """The number below which it is severe."""
     few_rows_per_period: float = 6.0
     """Rows per period of the model's fastest oscillation below which a note is given."""
+
+    step_multiples: tuple[int, ...] = (2, 3, 4, 5, 10)
+    """Control steps per row that are tried if the simulator does not lead from row to row."""
 
     # rows
     examples: int = 5
@@ -36,11 +43,11 @@ class AuditSettings:
     """The share beyond which repeated rows are severe."""
     moving: float = 0.2
     """Velocity, in spreads, beyond which a joint moves: an equal next reading is then no chance."""
-    jump: float = 0.3
+    jump: float = 0.5
     """Deviation of a position from the integral of its velocity, in spreads, that may be a jump."""
     jump_noise: float = 8.0
     """Smallest jump, in usual deviations."""
-    many_jumps: float = 0.005
+    many_jumps: float = 0.01
     """Share of jumps beyond which they are severe."""
     spike: float = 0.2
     """Part of a jump's size to which a signal returns in the next row if the jump was a single wrong reading."""
@@ -123,6 +130,10 @@ class AuditSettings:
     to another run."""
     action_lags: tuple[int, int] = (-5, 40)
     """Rows by which actions may act early or late."""
+    clear_lag: int = 4
+    """Rows of a lag of sudden changes from which it is reported, even if the whole motion does not show it."""
+    lag_significance: float = 10.0
+    """Logarithm of the likelihood ratio that such a lag must have against no lag."""
     lag_share: float = 0.85
     """Share of the unexplained variance that must remain at most at another lag."""
     ordinary_lag: float = 0.03

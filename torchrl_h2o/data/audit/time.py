@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from torchrl_h2o.data.audit.derivative import Derivative
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import AuditedSimulation, Log
+from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
 
 CHECK = "time"
@@ -37,7 +39,7 @@ def common_factor(derivatives: Sequence[Derivative], settings: AuditSettings) ->
     middle = float(np.median(factors))
     low, high = settings.scale_warning
     close = np.abs(factors - middle) <= settings.same_factor * abs(middle)
-    if low <= middle <= high or close.mean() < 0.8:
+    if low <= middle <= high or close.mean() < 0.7:
         return None
     thousand = any(abs(middle / known - 1.0) < settings.known_factor for known in (1e3, 1e-3))
     degrees = any(abs(abs(middle) / known - 1.0) < settings.known_factor for known in (np.degrees(1), np.radians(1)))
@@ -69,6 +71,7 @@ def _stamps(log: Log, settings: AuditSettings) -> list[Finding]:
                 "sort out the order of the rows, or use the stamps of the sensors instead of those of the logger",
             )
         )
+    found += _splits(log, settings)
     late = rows[(np.abs(step[rows] - usual) > settings.late_step * abs(usual)) & (step[rows] > 0.0)]
     share = len(late) / len(rows)
     if len(late):
@@ -86,6 +89,17 @@ def _stamps(log: Log, settings: AuditSettings) -> list[Finding]:
             )
         )
     return found
+
+
+def _splits(log: Log, settings: AuditSettings) -> list[Finding]:
+    """Reports a log that its reader had to split at irregular stamps again and again."""
+    runs = int(log.run[-1]) + 1
+    rows = len(log) / runs
+    if runs < 10 or rows >= settings.short_runs:
+        return []
+    severity = "severe" if rows < settings.very_short_runs else "warning"
+    words = f"the log breaks into {runs} runs of {rows:.0f} rows on average: its time steps are irregular"
+    return [Finding(CHECK, severity, words, None, "log with a regular clock, or resample the log")]
 
 
 def _wrong_step(usual: float, dt: float, settings: AuditSettings) -> Finding:
@@ -123,6 +137,29 @@ def _step_of_motion(log: Log, derivatives: Sequence[Derivative], settings: Audit
         remedy = "correct dt or the unit of the time column (or the units of all velocities)"
     severity = "warning" if low <= factor <= high else "severe"
     return [Finding(CHECK, severity, words, None, remedy)]
+
+
+def check_step(step: Response | None, settings: AuditSettings) -> list[Finding]:
+    """Whether the simulator leads from row to row in a multiple of its control step, and not in one."""
+    if step is None:
+        return []
+    columns = [column for pair in step.log.pairs for column in (pair.position, pair.velocity)]
+    few = replace(step.thinned(settings.hypothesis_windows), moving=np.array(columns))
+    misfit = few.misfit()
+    if misfit <= settings.misfit:
+        return []
+    left = {
+        number: few.misfit(actions=lambda actions, number=number: np.repeat(actions, number, axis=1))
+        for number in settings.step_multiples
+        if number * few.simulation.frame_skip <= settings.physics_steps // settings.min_windows
+    }
+    if not left or min(left.values()) > settings.better * misfit:
+        return []
+    number = min(left, key=lambda multiple: left[multiple])
+    dt = step.log.dt
+    words = f"the simulator leads from row to row in {number * dt:.4g} s, not in its control step of {dt:.4g} s: rows were "
+    words += "left out, or dt is wrong"
+    return [Finding(CHECK, "severe", words, None, "give the time between two rows, or log every row")]
 
 
 def _periods(log: Log, simulation: AuditedSimulation, settings: AuditSettings) -> list[Finding]:
