@@ -68,7 +68,6 @@ def drawn_controls(draws: int) -> Iterator[Control]:
 
 def _effect(name: str, rng: np.random.Generator) -> Effect:
 
-
     torque = {"HalfCheetah": 10.0, "Walker2d": 5.0, "wheel_legged": 0.2, "pendulum": 0.2}[name]
     delay = {"HalfCheetah": 0.02, "Walker2d": 0.008, "wheel_legged": 0.012, "pendulum": 0.015}[name]
     candidates: Sequence[Effect] = (

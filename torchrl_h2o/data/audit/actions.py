@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from torchrl_h2o.data.audit.finding import Finding, Rows
@@ -70,7 +72,9 @@ def _beyond_range(log: Log, response: Response, settings: AuditSettings) -> list
         usual = float(np.median(np.abs(log.action[:, index])))
         far = usual > 3.0 * max(abs(low), abs(high))
         if outside.mean() > settings.repeated:
-            words = f"{outside.mean():.0%} of the actions of {name} lie outside the range of its actuator, {low:.4g} to "
+            words = (
+                f"{outside.mean():.0%} of the actions of {name} lie outside the range of its actuator, {low:.4g} to "
+            )
             words += f"{high:.4g}, up to {np.abs(log.action[:, index]).max():.4g}; the simulator clips them"
             words += ": they look like another unit" if far else ""
             severity = "severe" if far else "warning"
@@ -80,6 +84,9 @@ def _beyond_range(log: Log, response: Response, settings: AuditSettings) -> list
 
 
 def _against_accelerations(response: Response, settings: AuditSettings) -> list[Finding]:
+    reversed_ones = _reversed(response, settings)
+    if reversed_ones:
+        return reversed_ones
     actions = response.limited[response.rows].mean(1)
     effect = response.by_action * actions[:, None]
     target, nuisance = response.target, friction_responses(response)
@@ -98,16 +105,49 @@ def _against_accelerations(response: Response, settings: AuditSettings) -> list[
     found, lag = [], int(lags[best])
     if explained[best] < settings.unrelated:
         return [_foreign_actions(explained[best], claimed)]
-    sharp = lag_of_events(response, settings)
+    gained = (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]])
+    sharp = 0 if gained else lag_of_events(response, settings)
     if sharp >= settings.clear_lag and explained[sharp - lags[0]] > settings.unrelated:
-        best, lag = int(sharp - lags[0]), sharp
-        found += _late(response, lag, settings)
-    elif lag != 0 and (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]]):
+        best = int(sharp - lags[0])
+        found += _late(response, sharp, settings)
+    elif gained and lag != 0:
+        if best in (0, len(lags) - 1):
+            return [_out_of_step(lag)]
         found += _late(response, lag, settings)
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)
     return [*found, *(order or _gains(response, fits[best], settings))]
+
+
+def _reversed(response: Response, settings: AuditSettings) -> list[Finding]:
+    """Actions with which the simulator fits much better if their sign is changed."""
+    few = response.for_hypotheses()
+    misfit = few.misfit()
+    if misfit <= 0.5 * settings.misfit:
+        return []
+    found = []
+    for index, name in enumerate(few.log.actuators):
+        left = few.misfit(actions=reversed_action(index))
+        if left < settings.better * misfit:
+            words = (
+                f"the simulator leaves {misfit:.0%} of the accelerations unexplained, and {left:.0%} if the action of "
+            )
+            words += f"{name} has the other sign"
+            remedy = "reverse the sign of the action, or of the joint's position and velocity"
+            found.append(Finding(CHECK, "severe", words, None, remedy))
+    return found
+
+
+def reversed_action(index: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Function that changes the sign of one entry of actions (..., nu)."""
+
+    def change(actions: np.ndarray) -> np.ndarray:
+        changed = actions.copy()
+        changed[..., index] *= -1.0
+        return changed
+
+    return change
 
 
 def _share(part: np.ndarray, whole: np.ndarray, scale: np.ndarray, weights: np.ndarray) -> float:
@@ -193,6 +233,12 @@ def _foreign_actions(explained: float, claimed: float) -> Finding:
         None,
         "pair the log with its own actions",
     )
+
+
+def _out_of_step(lag: int) -> Finding:
+    words = f"the accelerations agree with the actions best if these act {abs(lag)} rows or more "
+    words += f"{'later' if lag > 0 else 'earlier'}: they belong to another run, or are far out of step"
+    return Finding(CHECK, "severe", words, None, "pair the log with its own actions")
 
 
 def _late(response: Response, lag: int, settings: AuditSettings) -> list[Finding]:

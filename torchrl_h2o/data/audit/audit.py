@@ -91,7 +91,7 @@ def audit(
         ()
         >>> data["action"] = -data["action"]
         >>> print(audit(data, simulation).severe[0].words)
-        the accelerations follow -1.00 × the action of wheels: its sign is reversed
+        the simulator leaves ... of the accelerations unexplained, and ... if the action of wheels has the other sign
     """
     log = Log.of(measured, simulation)
     derivatives = [fit_derivative(log, pair, settings) for pair in log.pairs]

@@ -16,12 +16,16 @@ _TO_RECORD = {
     "beside fast swings, or let the joint swing freely",
     frozenset({"dry friction", "viscous friction"}): "record slow and fast motion of the joint",
     frozenset({"armature", "motor gain"}): "record a constant torque against gravity beside fast changes",
-    frozenset({"gravity", "mass"}): "record fast motion with a known torque: gravity shows at rest, mass in acceleration",
+    frozenset(
+        {"gravity", "mass"}
+    ): "record fast motion with a known torque: gravity shows at rest, mass in acceleration",
     frozenset({"mass", "motor gain"}): "only their ratio shows in the motion: weigh the robot, or measure a torque",
     frozenset({"mass", "armature"}): "weigh the robot",
     frozenset({"gravity", "armature"}): "record fast and slow motion through the same angles",
     frozenset({"gravity", "motor gain"}): "record fast motion beside holding still",
-    frozenset({"viscous friction", "motor gain"}): "record actions that do not follow the velocity, such as random ones",
+    frozenset(
+        {"viscous friction", "motor gain"}
+    ): "record actions that do not follow the velocity, such as random ones",
     frozenset({"viscous friction", "armature"}): "record several frequencies of motion",
     frozenset({"dry friction", "armature"}): "record several frequencies of motion",
     frozenset({"drive delay", "motor gain"}): "record steps of the action",

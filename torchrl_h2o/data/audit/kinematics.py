@@ -45,16 +45,20 @@ def check_kinematics(
     exchanged: set[str] = set()
     for index, derivative in enumerate(derivatives):
         pair = derivative.pair
-        found += _wrapped(log, pair, settings)
-        if not _moves(log, pair):
+        wrapped = _wrapped(log, pair, settings)
+        found += wrapped
+        if wrapped or not _moves(log, pair):
             continue
+        filtered = _lag(log, derivative, settings)
         if abs(derivative.correlation) < settings.related:
-            if pair.name not in exchanged:
+            if filtered and derivative.correlation > 0.5 * settings.related:
+                found += filtered
+            elif pair.name not in exchanged:
                 found.append(_unrelated(log, index, derivatives, exchanged, settings))
             continue
         if not time_is_wrong and not _explained(derivative, step, settings):
-            found += _factor(derivative, settings)
-        found += _lag(log, derivative, settings)
+            found += _factor(log, derivative, settings)
+        found += filtered
         found += _bias(log, derivative, step, settings)
     return [*found, *_noisy(log, noise, settings)]
 
@@ -75,9 +79,11 @@ def _explained(derivative: Derivative, step: Response | None, settings: AuditSet
     return deviation(step.error[:, pair.position]) < 0.7 * plain
 
 
-def _factor(derivative: Derivative, settings: AuditSettings) -> list[Finding]:
+def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
     pair, factor = derivative.pair, derivative.factor
-    low, high = settings.scale_warning
+    speed = log.observation[:, pair.velocity]
+    coarse = np.corrcoef(speed[:-1], speed[1:])[0, 1] < settings.fine
+    low, high = settings.scale_severe if coarse else settings.scale_warning
     if low <= factor <= high:
         return []
     size = abs(factor)

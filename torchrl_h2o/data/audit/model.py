@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from torchrl_h2o.data.audit.actions import friction_responses
+from torchrl_h2o.data.audit.actions import friction_responses, reversed_action
 from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.regression import robust_fit
@@ -25,7 +25,7 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
         response: simulated windows.
         settings: thresholds.
     """
-    few = response.thinned(settings.hypothesis_windows)
+    few = response.for_hypotheses()
     misfit = few.misfit()
     if misfit <= settings.misfit:
         return []
@@ -37,19 +37,10 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
     if words is None:
         return _zeros(response, settings)
     # a reversed action of one joint can look like a reversed joint
-    if any(few.misfit(actions=_reversed(index)) <= best for index in range(len(few.log.actuators))):
+    if any(few.misfit(actions=reversed_action(index)) <= best for index in range(len(few.log.actuators))):
         return []
     explained = f"the simulator leaves {_percent(misfit)} of the accelerations unexplained, and {_percent(best)} if "
     return [Finding(CHECK, "severe", explained + words, None, "correct units, signs or order of the columns")]
-
-
-def _reversed(index: int) -> Change:
-    def change(actions: np.ndarray) -> np.ndarray:
-        changed = actions.copy()
-        changed[..., index] *= -1.0
-        return changed
-
-    return change
 
 
 def _percent(share: float) -> str:
@@ -123,7 +114,9 @@ def _zeros(response: Response, settings: AuditSettings) -> list[Finding]:
         left = response.misfit(observations=change)
         if left < settings.zero_better * misfit:
             words = f"the simulator leaves {_percent(misfit)} of the accelerations unexplained, and {_percent(left)} if the "
-            words += f"zero of {pair.name} is shifted by {-shift:.2f} rad: the angle has an offset, or the model is tilted"
+            words += (
+                f"zero of {pair.name} is shifted by {-shift:.2f} rad: the angle has an offset, or the model is tilted"
+            )
             findings.append(Finding(CHECK, "warning", words, None, "measure the angle's zero, for example at rest"))
     return findings
 
@@ -136,6 +129,8 @@ def check_belonging(response: Response, settings: AuditSettings) -> list[Finding
     left = np.nanmedian(np.abs(response.target - responses @ found.values), axis=0) / response.scale
     if not np.mean(left) > settings.foreign:
         return []
-    words = f"the simulator leaves {_percent(float(min(np.mean(left), 1.0)))} of the accelerations unexplained, with any "
+    words = (
+        f"the simulator leaves {_percent(float(min(np.mean(left), 1.0)))} of the accelerations unexplained, with any "
+    )
     words += "gains, friction and zeros: another robot's log, or noise as large as the motion"
     return [Finding(CHECK, "warning", words, None, "check that model and log belong together")]

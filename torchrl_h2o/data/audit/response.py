@@ -73,6 +73,11 @@ class Response:
         chosen = np.unique(np.linspace(0, len(self.starts) - 1, min(most, len(self.starts))).round().astype(int))
         return replace(self, starts=self.starts[chosen], states=self.states[chosen])
 
+    def for_hypotheses(self) -> Response:
+        """As many of the windows as a hypothesis may simulate."""
+        most = self.settings.hypothesis_steps // (self.simulation.frame_skip * self.horizon)
+        return self.thinned(int(np.clip(most, 40, self.settings.hypothesis_windows)))
+
     @property
     def before(self) -> np.ndarray:
         """Measured velocities at the start of each window, (W, m)."""
@@ -119,7 +124,10 @@ class Response:
         return np.where(np.isfinite(high - low), 0.5 * (high - low), spread)
 
     def reached(
-        self, states: np.ndarray, actions: np.ndarray, applied: np.ndarray | None = None,
+        self,
+        states: np.ndarray,
+        actions: np.ndarray,
+        applied: np.ndarray | None = None,
         simulation: AuditedSimulation | None = None,
     ) -> np.ndarray:
         """Simulated observations at the end of windows, (B, n), from states (B, nq + nv) and actions (B, H, nu)."""

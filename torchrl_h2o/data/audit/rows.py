@@ -10,13 +10,14 @@ from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
 from torchrl_h2o.data.audit.settings import AuditSettings
 
 CHECK = "rows"
+_SLOPE_ROWS = 10  # over which a position is differentiated beside a frozen velocity
 
 
 def check_rows(log: Log, simulation: AuditedSimulation, settings: AuditSettings) -> list[Finding]:
     """Order and repetition of rows, and each column's readings."""
     found = [*_order(log, settings), *_repeated(log, settings), *_duplicates(log, settings)]
-    found += _jumps(log, simulation, settings)
     ends = at_extremes(log, settings)
+    found += _jumps(log, simulation, ends, settings)
     for column in range(len(log.names)):
         known = log.clipped & ends[:, column]
         if ends[:, column].sum() > 1.1 * known.sum():
@@ -91,10 +92,14 @@ def _duplicates(log: Log, settings: AuditSettings) -> list[Finding]:
     ]
 
 
-def _jumps(log: Log, simulation: AuditedSimulation, settings: AuditSettings) -> list[Finding]:
+def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: AuditSettings) -> list[Finding]:
     """Rows after which positions are where neither their velocities nor the simulator lead."""
     size = np.zeros(len(log))
+    repeated = (log.following == log.observation).all(1)
+    known = log.clipped | repeated | np.append(False, repeated[:-1])
     for pair in log.pairs:
+        at_end = ends[:, [pair.position, pair.velocity]].any(1)
+        left_out = known | at_end | np.append(at_end[1:], False)
         error = np.abs(_deviations(log, pair))
         usual = max(settings.jump_noise * deviation(error), settings.jump * log.observation[:, pair.position].std())
         # a velocity that changes within the row accounts for as much
@@ -102,7 +107,7 @@ def _jumps(log: Log, simulation: AuditedSimulation, settings: AuditSettings) -> 
             2.0 * np.abs(log.following[:, pair.velocity] - log.observation[:, pair.velocity]),
             1.5 * log.observation[:, pair.velocity].std(),
         )
-        size = np.maximum(size, np.where(log.clipped, 0.0, error / np.maximum(np.maximum(usual, log.dt * speed), 1e-12)))
+        size = np.maximum(size, np.where(left_out, 0.0, error / np.maximum(np.maximum(usual, log.dt * speed), 1e-12)))
     suspects = np.flatnonzero(size > 1.0)
     if not len(suspects):
         return []
@@ -264,12 +269,13 @@ def _others_move(log: Log, column: int, partner: int | None, part: slice, settin
         spread = others.std(0)
         moved = others[part].std(0) > settings.moving * spread
         return bool(moved[spread > 0.0].mean() > 0.5) if (spread > 0.0).any() else False
-    is_position = any(pair.position == column for pair in log.pairs)
-    values, spread = log.observation[part, partner], log.observation[:, partner].std()
-    if is_position:  # the velocity tells that the joint moves
-        return bool(np.median(np.abs(values)) > settings.moving * spread)
-    speed = np.ptp(values) / ((part.stop - part.start) * log.dt)
-    return bool(speed > settings.moving * log.observation[:, column].std() or np.ptp(values) > settings.moving * spread)
+    step, spread = _resolution(log.observation[:, column]), log.observation[:, column].std()
+    values = log.observation[part, partner]
+    if any(pair.position == column for pair in log.pairs):  # the velocity tells how far the joint moves
+        distance = np.ptp(np.cumsum(values)) * log.dt
+        return bool(distance > max(3.0 * step, 0.5 * settings.moving * spread))
+    slopes = (values[_SLOPE_ROWS:] - values[:-_SLOPE_ROWS]) / (_SLOPE_ROWS * log.dt)
+    return bool(np.std(slopes) > max(2.0 * step, settings.moving * spread))
 
 
 def _sensor_ranges(log: Log, settings: AuditSettings) -> list[Finding]:

@@ -20,7 +20,7 @@ class AuditSettings:
     """Share beyond which that difference is severe."""
     late_step: float = 0.2
     """Share of the median time step by which a single step may differ before it counts as irregular."""
-    irregular: float = 0.001
+    irregular: float = 0.003
     """Share of irregular steps beyond which they are a warning; below they are a note."""
     very_irregular: float = 0.05
     """Share of irregular steps beyond which they are severe."""
@@ -81,6 +81,8 @@ class AuditSettings:
     """Factors between a position's derivative and its velocity that are unsuspicious."""
     scale_severe: tuple[float, float] = (0.6, 1.67)
     """Factors between which a wrong scale is only a warning."""
+    fine: float = 0.7
+    """Correlation of successive velocities below which rows are too far apart for a small error of scale to show."""
     known_factor: float = 0.15
     """Relative distance to a known factor, such as 57.3 deg/rad, at which it is named."""
     same_factor: float = 0.1
@@ -103,6 +105,8 @@ class AuditSettings:
     """Windows that are simulated."""
     hypothesis_windows: int = 200
     """Windows on which a hypothesis such as exchanged joints is simulated."""
+    hypothesis_steps: int = 2_000
+    """Largest number of physics steps of one hypothesis."""
     physics_steps: int = 6_000
     """Largest number of physics steps of one pass over the windows."""
     min_windows: int = 60

@@ -144,7 +144,7 @@ def check_step(step: Response | None, settings: AuditSettings) -> list[Finding]:
     if step is None:
         return []
     columns = [column for pair in step.log.pairs for column in (pair.position, pair.velocity)]
-    few = replace(step.thinned(settings.hypothesis_windows), moving=np.array(columns))
+    few = replace(step.for_hypotheses(), moving=np.array(columns))
     misfit = few.misfit()
     if misfit <= settings.misfit:
         return []
@@ -157,7 +157,9 @@ def check_step(step: Response | None, settings: AuditSettings) -> list[Finding]:
         return []
     number = min(left, key=lambda multiple: left[multiple])
     dt = step.log.dt
-    words = f"the simulator leads from row to row in {number * dt:.4g} s, not in its control step of {dt:.4g} s: rows were "
+    words = (
+        f"the simulator leads from row to row in {number * dt:.4g} s, not in its control step of {dt:.4g} s: rows were "
+    )
     words += "left out, or dt is wrong"
     return [Finding(CHECK, "severe", words, None, "give the time between two rows, or log every row")]
 
