@@ -3,10 +3,10 @@
 python recipes/benchmarks/corruptions.py logs=path/to/logs                    # a few minutes
 python recipes/benchmarks/corruptions.py systems=[HalfCheetah] numbers=[7]    # one damage of a recorded log
 
-A damage is written into a CSV file, which is read and audited like any other log. It is right if the reader refuses the
-file, or if the audit has a severe finding or a warning of the check that is responsible. A good log, a log with a
-dynamics gap, and one with 1 % sensor noise must have no severe finding. ``logs`` is the folder of the real logs; without
-it, only the recorded system is damaged. Writes corruptions.csv to the run's folder.
+A damage is written into a CSV file, which is read and audited like any other log. It is right if the reader refuses
+the file, or if the audit has a severe finding or a warning of the check that is responsible. A good log, with or
+without a dynamics gap and 1 % sensor noise, must have no severe finding. ``logs`` is the folder of the real logs;
+without it, only the recorded system is damaged. Writes corruptions.csv to the run's folder.
 """
 
 import csv
@@ -30,20 +30,8 @@ import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.residuals import Simulation
 
-COLUMNS = (
-    "system",
-    "number",
-    "corruption",
-    "seed",
-    "right",
-    "outcome",
-    "check",
-    "severity",
-    "words",
-    "warnings",
-    "wall_s",
-    "cpu_s",
-)
+COLUMNS = ("system", "number", "corruption", "seed", "right", "outcome", "check", "severity", "words", "warnings")
+TIMES = ("wall_s", "cpu_s")
 
 
 def judge(good: GoodLog, number: int, corruption: Corruption, seed: int, folder: Path) -> dict:
@@ -116,9 +104,9 @@ def control_rows(cfg: DictConfig) -> Iterator[dict]:
 
 def save(rows: list[dict], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, [*COLUMNS, *TIMES])
         writer.writeheader()
-        writer.writerows(row | {key: f"{row[key]:.2f}" for key in ("wall_s", "cpu_s")} for row in rows)
+        writer.writerows(row | {key: f"{row[key]:.2f}" for key in TIMES} for row in rows)
 
 
 def print_table(rows: list[dict]) -> None:

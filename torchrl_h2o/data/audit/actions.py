@@ -228,8 +228,8 @@ def _foreign_actions(explained: float, claimed: float) -> Finding:
     return Finding(
         CHECK,
         "severe",
-        f"the actions explain {max(0.0, explained):.0%} of the accelerations at any lag and sign; in the simulator they "
-        f"cause {min(claimed, 1.0):.0%}: they belong to another run",
+        f"the actions explain {max(0.0, explained):.0%} of the accelerations at any lag and sign; in the simulator "
+        f"they cause {min(claimed, 1.0):.0%}: they belong to another run",
         None,
         "pair the log with its own actions",
     )

@@ -1,4 +1,4 @@
-"""Checks of units, signs, order and zeros that only the simulator can tell, because the columns agree among themselves."""
+"""Checks of units, signs, order and zeros that only the simulator can tell: the columns agree among themselves."""
 
 from __future__ import annotations
 
@@ -113,10 +113,8 @@ def _zeros(response: Response, settings: AuditSettings) -> list[Finding]:
 
         left = response.misfit(observations=change)
         if left < settings.zero_better * misfit:
-            words = f"the simulator leaves {_percent(misfit)} of the accelerations unexplained, and {_percent(left)} if the "
-            words += (
-                f"zero of {pair.name} is shifted by {-shift:.2f} rad: the angle has an offset, or the model is tilted"
-            )
+            words = f"the simulator leaves {_percent(misfit)} of the accelerations unexplained, and {_percent(left)} "
+            words += f"if the zero of {pair.name} is shifted by {-shift:.2f} rad: an offset, or a tilted model"
             findings.append(Finding(CHECK, "warning", words, None, "measure the angle's zero, for example at rest"))
     return findings
 

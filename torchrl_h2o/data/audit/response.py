@@ -1,4 +1,4 @@
-"""Simulated windows of a log, and what small changes of actions, forces and states do to the velocities at their end."""
+"""Simulated windows of a log, and what small changes of actions, forces and states do to their last velocities."""
 
 from __future__ import annotations
 

@@ -285,7 +285,7 @@ def _sensor_ranges(log: Log, settings: AuditSettings) -> list[Finding]:
         Finding(
             CHECK,
             "warning" if log.clipped.mean() > 0.9 else "note",
-            f"{log.clipped.mean():.0%} of the rows hold a value at the end of the range of the simulator's own sensors; "
+            f"{log.clipped.mean():.0%} of the rows hold a value at the end of the simulator's own sensor range; "
             "they are left out of fits",
             Rows.of(log.clipped, settings.examples),
             "record slower motion, if the remaining rows are too few",
