@@ -101,7 +101,9 @@ def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: 
         at_end = ends[:, [pair.position, pair.velocity]].any(1)
         left_out = known | at_end | np.append(at_end[1:], False)
         error = np.abs(_deviations(log, pair))
-        usual = max(settings.jump_noise * deviation(error), settings.jump * log.observation[:, pair.position].std())
+        spread = position_spread(log, pair)
+        # where most rows jump, the usual deviation is that of jumps
+        usual = max(min(settings.jump_noise * deviation(error), spread), settings.jump * spread)
         # a velocity that changes within the row accounts for as much
         speed = np.maximum(
             2.0 * np.abs(log.following[:, pair.velocity] - log.observation[:, pair.velocity]),
@@ -134,6 +136,12 @@ def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: 
     ]
 
 
+def position_spread(log: Log, pair: Pair) -> float:
+    """Standard deviation of a position; of an angle that turns over and over, that within one turn."""
+    spread = float(log.observation[:, pair.position].std())
+    return min(spread, 2.0 * np.pi / np.sqrt(12.0)) if pair.angle and spread < 50.0 else spread
+
+
 def _deviations(log: Log, pair: Pair) -> np.ndarray:
     """Displacement minus the integral of the velocity, (T,); turns of an angle by 2 π are removed."""
     moved = log.following[:, pair.position] - log.observation[:, pair.position]
@@ -154,7 +162,7 @@ def _surprising(log: Log, simulation: AuditedSimulation, rows: np.ndarray, setti
         error = log.following[rows, pair.position] - reached[:, pair.position]
         if pair.angle:
             error = error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
-        limit = settings.jump * log.observation[:, pair.position].std()
+        limit = settings.jump * position_spread(log, pair)
         surprising |= ~(np.abs(error) <= limit) & (np.abs(_deviations(log, pair)[rows]) > limit)
     return surprising
 
@@ -181,8 +189,13 @@ def at_extremes(log: Log, settings: AuditSettings) -> np.ndarray:
             continue
         for end, beside in ((0, slice(1, 4)), (-1, slice(-4, -1))):
             many = counts[end] > max(5.0, settings.at_end * len(log))
-            if many and counts[end] > 4.0 * counts[beside].max():
-                found[:, column] |= values == levels[end]
+            if not many or counts[end] <= 4.0 * counts[beside].max():
+                continue
+            at_end = values == levels[end]
+            # one long stretch is a frozen sensor that happens to stop at an extreme
+            longest = max((b - a for a, b in _stretches(at_end, 1)), default=0)
+            if longest <= 0.5 * counts[end]:
+                found[:, column] |= at_end
     return found
 
 
