@@ -78,7 +78,7 @@ def _duplicates(log: Log, settings: AuditSettings) -> list[Finding]:
     again = np.zeros(len(log), bool)
     continued = (back[1:] == back[:-1]) & (back[1:] > settings.duplicate_block)
     for start, stop in _stretches(continued, settings.duplicate_block):
-        again[start : stop + 1] = np.ptp(log.observation[start : stop + 1], axis=0).any()
+        again[start : stop + 1] = bool(np.any(np.ptp(log.observation[start : stop + 1], axis=0)))
     if not again.any():
         return []
     return [
@@ -98,7 +98,7 @@ def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: 
     repeated = (log.following == log.observation).all(1)
     known = log.clipped | repeated | np.append(False, repeated[:-1])
     for pair in log.pairs:
-        at_end = ends[:, [pair.position, pair.velocity]].any(1)
+        at_end = np.asarray(ends[:, pair.position] | ends[:, pair.velocity])
         left_out = known | at_end | np.append(at_end[1:], False)
         error = np.abs(_deviations(log, pair))
         spread = position_spread(log, pair)
