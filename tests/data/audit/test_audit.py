@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.data.audit.recorded import arm, changed, measured, recording, rows_of, scaled, with_action
+from tests.data.audit.recorded import NAMES, arm, changed, measured, recording, rows_of, scaled, with_action
 from torchrl_h2o.data import Audit, DataError, Finding, audit
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointFrictionLoss
+from torchrl_h2o.residuals import Simulation
 
 DEGREES = 180.0 / np.pi
 
@@ -301,3 +302,14 @@ def test_ted_and_measured_give_the_same_findings(good, simulation):
     assert [f.words for f in audit(data, simulation).findings][:2] == [
         f.words for f in audit(good, simulation).findings
     ][:2]
+
+
+def test_real_log_that_cannot_tell_friction_from_gain_says_so(shared_data):
+    """In this log the torque follows the sign of the velocity, as its description says."""
+    folder = shared_data / "double_pendulum"
+    table = np.genfromtxt(folder / "trajectory_00.csv", delimiter=",", skip_header=1)[8:]
+    real = Simulation.from_mjcf(folder / "double_pendulum.xml", NAMES, 0.002)
+    found = audit(measured(table[:, 1:5], table[:-1, 7:9], table[:-1, 0]), real)
+    assert found.severe == ()
+    (note,) = [finding for finding in found.findings if finding.words.startswith("a weaker motor of shoulder")]
+    assert "friction" in note.words

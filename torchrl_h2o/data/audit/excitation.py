@@ -11,6 +11,7 @@ from torchrl_h2o.data.audit.response import Response, joint_of
 from torchrl_h2o.data.audit.settings import AuditSettings
 
 CHECK = "excitation"
+_JOINT = ("dry friction", "viscous friction", "armature")
 _TO_RECORD = {
     frozenset({"dry friction", "motor gain"}): "record both directions under the same torque, such as slow reversals "
     "beside fast swings, or let the joint swing freely",
@@ -110,7 +111,7 @@ def _pairs(found: list[Sensitivity], settings: AuditSettings) -> list[Finding]:
             cosine = _cosine(one.response, other.response)
             if abs(cosine) < settings.alike:
                 continue
-            record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record other motion of this joint")
+            record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record torques that do not follow the motion, such as random ones")
             words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
             if one.joint == other.joint != "":
                 words = f"{one.effect} and {other}{words[len(f'{one} and {other}') :]}"
@@ -122,9 +123,12 @@ def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: Audi
     """Motor gains that friction, armature and gravity together can take the place of."""
     notes = []
     for gain in (s for s in found if s.effect == "motor gain"):
-        if any(gain.joint in note.words and "motor gain" in note.words for note in pairs):
+        if any(
+            note.words.startswith(f"{effect} and motor gain of {gain.joint} ") for note in pairs for effect in _JOINT
+        ):
             continue
-        others = [s for s in found if s is not gain and s.joint in (gain.joint, "") and s.effect != "drive delay"]
+        # the whole mass and a gain always show as their ratio, which is a note of its own
+        others = [s for s in found if s.joint in (gain.joint, "") and s.effect in (*_JOINT, "gravity")]
         if not others:
             continue
         design = np.stack([s.response for s in others], -1)
@@ -136,7 +140,7 @@ def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: Audi
         strongest = [others[i].effect for i in np.argsort(-np.abs(values))[:3]]
         words = f"a weaker motor of {gain.joint} and a combination of {', '.join(strongest)} look alike in this log "
         notes.append(
-            Finding(CHECK, "note", f"{words}(correlation {multiple:.2f})", None, "record other motion of this joint")
+            Finding(CHECK, "note", f"{words}(correlation {multiple:.2f})", None, "record torques that do not follow the motion, such as random ones")
         )
     return notes
 

@@ -166,7 +166,7 @@ class AuditSettings:
     # excitation
     alike: float = 0.9
     """Cosine of the angle between two effects' sensitivities from which they look alike."""
-    combined: float = 0.97
+    combined: float = 0.92
     """Multiple correlation with the other effects of a joint from which an effect looks like their combination."""
     negligible: float = 0.02
     """Size of a trial effect's response, in usual changes of the velocities, below which it is not excited."""
