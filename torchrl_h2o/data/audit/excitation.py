@@ -111,7 +111,7 @@ def _pairs(found: list[Sensitivity], settings: AuditSettings) -> list[Finding]:
             cosine = _cosine(one.response, other.response)
             if abs(cosine) < settings.alike:
                 continue
-            record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record torques that do not follow the motion, such as random ones")
+            record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record other motion of this joint")
             words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
             if one.joint == other.joint != "":
                 words = f"{one.effect} and {other}{words[len(f'{one} and {other}') :]}"
@@ -139,9 +139,8 @@ def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: Audi
             continue
         strongest = [others[i].effect for i in np.argsort(-np.abs(values))[:3]]
         words = f"a weaker motor of {gain.joint} and a combination of {', '.join(strongest)} look alike in this log "
-        notes.append(
-            Finding(CHECK, "note", f"{words}(correlation {multiple:.2f})", None, "record torques that do not follow the motion, such as random ones")
-        )
+        record = "record torques that do not follow the motion, such as random ones"
+        notes.append(Finding(CHECK, "note", f"{words}(correlation {multiple:.2f})", None, record))
     return notes
 
 
