@@ -22,9 +22,11 @@ from torchrl.envs import TransformedEnv
 from torchrl_h2o.commands.guess import GUESS, guess_columns
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.commands.recording import Recording, read_recording
+from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
+from torchrl_h2o.residuals.report.json_file import write_json
 from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
 
 
@@ -86,11 +88,34 @@ def main(cfg: DictConfig) -> None:
         source=recording.source,
         held_out=recording.reported_on,
         seed=cfg.seed,
+        audit=audited(cfg, recording, simulation),
+        known=() if cfg.start_from is None else Report.load(cfg.start_from).effects,
+        so_far=lambda unfinished: write_json(unfinished, directory),
     )
     if report.found:
         report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
     report.save(directory)
     print_report(report, directory)
+
+
+def audited(cfg: DictConfig, recording: Recording, simulation: Simulation) -> Audit | None:
+    """Audit the data, print the findings, and stop at severe ones; None with ``audit=false``.
+
+    Raises:
+        ValueError: for an unknown value of ``audit``.
+        DataError: for severe findings, unless ``audit=warn``.
+    """
+    if cfg.audit not in (True, False, "warn"):
+        raise ValueError(f"audit={cfg.audit}: choose true, warn (goes on in spite of severe findings) or false")
+    if not cfg.audit:
+        return None
+    found = audit(recording.transitions, simulation)
+    if found.findings:
+        print(f"audit of {recording.source}\n{found.words()}\n")
+    if found.severe and cfg.audit != "warn":
+        first = found.severe[0]
+        raise DataError(first.words, f"{first.remedy}; audit=warn goes on all the same", source=recording.source)
+    return found
 
 
 def print_report(report: Report, directory: Path) -> None:
@@ -119,7 +144,7 @@ def print_report(report: Report, directory: Path) -> None:
     if mended is not None and mended.left_out:
         where = f"not in {mended.file}" if mended.file else f"no {FILE} ({mended.failure})"
         print(f"           {where}: {'; '.join(left.words for left in mended.left_out)}")
-    if report.found:
+    if report.found and (report.verdict is None or report.verdict.recommended):
         print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")
 
 

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report, unfinished_report
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
@@ -38,6 +39,7 @@ def close_the_loop(
     held_out: float | Collection[int] = HELD_OUT,
     seed: int = 0,
     progress: bool = True,
+    audit: Audit | None = None,
     known: Sequence[Effect] = (),
     so_far: Callable[[Report], object] = lambda report: None,
     settings: LoopSettings = DEFAULTS,
@@ -53,6 +55,7 @@ def close_the_loop(
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
+        audit: findings of :func:`torchrl_h2o.data.audit`, for the report.
         known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
         so_far: called with an unfinished report whenever an effect has been found and after each stage.
         settings: thresholds and budgets of all stages.
@@ -79,7 +82,7 @@ def close_the_loop(
     simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
     measured = read_measured(data, simulation, source, held_out, settings)
     if (reason := why_no_conclusion(simulation, measured)) is not None:
-        return inconclusive_report(simulation, measured, reason)
+        return replace(inconclusive_report(simulation, measured, reason), audit=audit)
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
         evidence = gather_evidence(simulation, measured, settings)
@@ -89,14 +92,15 @@ def close_the_loop(
             rng=np.random.default_rng(seed),
             progress=bar,
             known=known,
-            so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
+            so_far=lambda found, stage: so_far(replace(unfinished_report(evidence, found, stage), audit=audit)),
             settings=settings,
         )
-        so_far(unfinished_report(evidence, explanation, "the errors before and after were computed"))
+        computing = "the errors before and after were computed"
+        so_far(replace(unfinished_report(evidence, explanation, computing), audit=audit))
         bar.set_description("reporting")
         judgement = judge(evidence, explanation, seed=seed, settings=settings)
         wall_s = time.perf_counter() - start
-        return compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings)
+        return replace(compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings), audit=audit)
 
 
 def read_measured(

@@ -17,7 +17,8 @@ from torchrl_h2o.data.readers.ted import require_ted
 class AuditedSimulation(Protocol):
     """What an audit needs of a simulator; ``torchrl_h2o.residuals.Simulation`` provides it."""
 
-    state_map: Any
+    @property
+    def state_map(self) -> Any: ...
 
     @property
     def model(self) -> Any: ...

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.report.mended_model import MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
@@ -276,6 +277,7 @@ class ReportContents:
             versions.
         failures: attempts that failed with an error, and why.
         unfinished: stage in which the run stopped or was when the report was written; None for a finished report.
+        audit: findings of the audit of the data; None if it was not audited.
         windows: worst, median and best window by the error with the effects, measured against simulated.
         runs: error of each run.
         mended_model: the MJCF file with the effects; None if none was asked for.
@@ -299,6 +301,7 @@ class ReportContents:
     verdict: Verdict | None = None
     failures: tuple[str, ...] = ()
     unfinished: str | None = None
+    audit: Audit | None = None
     windows: tuple[ShownWindow, ...] = ()
     runs: tuple[RunError, ...] = ()
     mended_model: MendedModel | None = None

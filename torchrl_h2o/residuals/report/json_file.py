@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
 from torchrl_h2o.residuals.report.atomic import write_text
@@ -95,6 +96,7 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "error": None if report.error is None else dataclasses.asdict(report.error),
             "verdict": None if report.verdict is None else dataclasses.asdict(report.verdict),
             "failures": report.failures,
+            "audit": None if report.audit is None else report.audit.to_dict(),
             "unfinished": report.unfinished,
             "two_sample": dataclasses.asdict(report.two_sample),
             "unexplained_intervals": [dataclasses.asdict(interval) for interval in report.unexplained_intervals],
@@ -127,6 +129,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "error": None if entries["error"] is None else _error(entries["error"]),
         "verdict": None if entries.get("verdict") is None else _verdict(entries["verdict"]),
         "failures": tuple(entries.get("failures", ())),
+        "audit": None if entries.get("audit") is None else Audit.from_dict(entries["audit"]),
         "unfinished": entries.get("unfinished"),
         "two_sample": _read(TwoSample, entries["two_sample"]),
         "unexplained_intervals": tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),

@@ -18,6 +18,7 @@ from torchrl_h2o.residuals.report.sentence import sentence
 from torchrl_h2o.residuals.report.windows import RunError
 from torchrl_h2o.residuals.report.words import (
     change,
+    duration,
     interval,
     interval_digits,
     number,
@@ -66,6 +67,7 @@ def report_page(report: ReportContents) -> str:
         report=report,
         sentence=sentence(report),
         change=change,
+        duration=duration,
         parameters=_parameters,
         ranking=_ranking(report),
         shown_runs=sorted(report.runs, key=_worst_first)[:SHOWN_RUNS],

@@ -20,7 +20,14 @@ NOT_IN_CATALOGUE = "Something is missing that this catalogue does not explain"
 
 
 def sentence(report: ReportContents) -> str:
-    """The whole report in one sentence."""
+    """The whole report in one sentence, and a second one if the audit found severe faults in the data."""
+    if report.audit is None or not report.audit.severe:
+        return _verdict_words(report)
+    faults = "; ".join(finding.words for finding in report.audit.severe)
+    return f"{_verdict_words(report)} Do not rely on this: the data are faulty ({faults})."
+
+
+def _verdict_words(report: ReportContents) -> str:
     if report.conclusion is not None:
         return f"No conclusion: {report.conclusion.rstrip('. ')}."
     if report.unfinished is not None:
