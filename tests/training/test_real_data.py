@@ -11,6 +11,7 @@ from torchrl_h2o.data import episodes
 from torchrl_h2o.envs import record
 from torchrl_h2o.training.environments import sim_capacity_of, task_of
 from torchrl_h2o.training.real_data import behaviour_of, first_seconds, is_cut
+from torchrl_h2o.training.run_folder import resolve_paths
 
 STEP = 0.005  # s
 
@@ -78,3 +79,18 @@ def test_the_poor_controller_falls_within_five_seconds():
     task = task_of(poor)
     real = record(task.make_reality(), instantiate(task.config["behaviour"]), 960, seed=0, progress=False)
     assert real["next", "terminated"].flatten().nonzero().flatten().tolist() == [pytest.approx(940, abs=15)]
+
+
+def test_several_logs_are_read_as_runs_of_their_own_and_kept_by_absolute_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, rows in (("a.txt", 5), ("b.txt", 8)):
+        (tmp_path / name).write_text("0.1 0.2 0.0 0.4 1 0\n" * rows)
+    for data in ("data=[a.txt,b.txt]", "data='*.txt'"):
+        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+            cfg = hydra.compose("h2o_plus", [data])
+        resolve_paths(cfg)
+        real = task_of(cfg).read_real_data(cfg.data, cfg.columns)
+        assert real["log"].bincount().tolist() == [4, 7]
+        assert real["next", "done"].flatten().nonzero().flatten().tolist() == [3, 10]
+        names = [cfg.data] if isinstance(cfg.data, str) else cfg.data
+        assert all(str(name).startswith(str(tmp_path)) for name in names)

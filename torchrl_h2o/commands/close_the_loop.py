@@ -4,6 +4,7 @@ close-the-loop                                           # the wheel-legged robo
 close-the-loop data=standing_still.txt                   # the same simulator with the real robot's log
 close-the-loop simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
 close-the-loop simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
+close-the-loop --guess data=log.csv simulator=robot.xml                # writes a first log.yaml for you to correct
 """
 
 import os
@@ -18,7 +19,9 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
+from torchrl_h2o.commands.guess import GUESS, guess_columns
 from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
@@ -76,15 +79,16 @@ def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
     simulation = make_simulation(cfg, recording)
+    recording = recording.for_model(simulation.model)
     report = close_the_loop(
         simulation,
         recording.transitions,
         chosen_entries(cfg, simulation),
         source=recording.source,
-        held_out=cfg.held_out,
+        held_out=recording.reported_on,
         seed=cfg.seed,
     )
-    if report.found:
+    if report.found and (report.verdict is None or report.verdict.recommended):
         report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
     report.save(directory)
     print_report(report, directory)
@@ -132,6 +136,9 @@ def expanded(argument: str) -> list[str]:
 
 def run() -> None:
     """Entry point of the console command ``close-the-loop``."""
+    if GUESS in sys.argv[1:]:
+        with one_line_errors():
+            return guess_columns(sys.argv[1:])
     sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()
 

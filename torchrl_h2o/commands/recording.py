@@ -1,8 +1,13 @@
 """Reads the measured data of ``close-the-loop``: transitions and, for a log, the description of its columns."""
 
+from __future__ import annotations
+
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import cast
 
 import hydra
 import mujoco
@@ -10,7 +15,10 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDictBase
 
-from torchrl_h2o.data import LogColumns, load
+from torchrl_h2o.data import LogColumns, load, sources_of
+from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
+from torchrl_h2o.data.readers.sources import Source, is_log, names_of, unique, words_of
+from torchrl_h2o.residuals.measured.transitions import HELD_OUT
 from torchrl_h2o.training.real_data import RECORDED
 from torchrl_h2o.training.task import Task
 
@@ -20,14 +28,44 @@ class Recording:
     """Measured transitions and their origin.
 
     Args:
-        transitions: TED, batch size (T,).
+        transitions: TED, batch size (T,), with ``log`` (T,), int64: the index of each transition's log in ``logs``. The
+            last transition of each log is done. Logs that are held out by name come last.
         source: name of the data and the range of the selected rows.
         columns: description of the log's columns; None if the data are not a log.
+        logs: names of the logs, or of the data set.
+        held_out: what neither a fit nor a choice uses: a share of the transitions, from the end, or the names of logs.
     """
 
     transitions: TensorDictBase
     source: str
     columns: LogColumns | None = None
+    logs: tuple[str, ...] = ()
+    held_out: float | tuple[str, ...] = HELD_OUT
+
+    @property
+    def held_out_logs(self) -> tuple[str, ...]:
+        """Names of the logs that are held out; empty if a share of the transitions is."""
+        return self.held_out if isinstance(self.held_out, tuple) else ()
+
+    @property
+    def reported_on(self) -> float | tuple[int, ...]:
+        """What errors are reported on: a share of the transitions, from the end, or the indices of logs."""
+        if not isinstance(self.held_out, tuple):
+            return self.held_out
+        return tuple(self.logs.index(name) for name in self.held_out)
+
+    @property
+    def estimated(self) -> tuple[EstimatedVelocity, ...]:
+        """Observed velocities that were not measured but estimated from positions; ``words()`` says so in a report."""
+        return () if self.columns is None else estimated_velocities(self.transitions, self.columns)
+
+    def for_model(self, model: mujoco.MjModel) -> Recording:
+        """Returns the recording of a free motion with the model's actuators at zero; any other recording unchanged."""
+        if self.columns is None or not self.columns.free_motion:
+            return self
+        transitions = self.transitions.clone(recurse=False)
+        transitions["action"] = torch.zeros(len(transitions), model.nu)
+        return replace(self, transitions=transitions)
 
     def coordinates(self, chosen: Mapping[str, str] | Sequence[str] | None) -> Mapping[str, str] | list[str]:
         """Maps each observed column, in the data's order, to a coordinate of the model.
@@ -83,33 +121,94 @@ class Recording:
 
 
 def read_recording(cfg: DictConfig) -> Recording:
-    """Reads the data given in the configuration and selects rows.
+    """Reads the data given in the configuration and selects rows, of each log separately.
 
     Args:
-        cfg: configuration with ``data``, ``columns``, ``simulator``, ``first_row`` and ``transitions``.
+        cfg: configuration with ``data``, ``columns``, ``simulator``, ``held_out``, ``first_row`` and ``transitions``.
 
     Raises:
-        ValueError: if no row is selected, or data=recorded is given for a simulator without a recording controller.
+        ValueError: if no row of a log is selected, a log to hold out is not there, all logs are held out, or
+            data=recorded is given for a simulator without a recording controller.
         torchrl_h2o.data.DataError: if the data cannot be read.
     """
-    columns = None
+    columns, held_out = None, cfg.held_out
     if cfg.data == RECORDED:
         if cfg.simulator.get("recorded") is None:
             raise ValueError("data=recorded requires the wheel-legged robot; name a data set, or a log and its columns")
+        if not isinstance(held_out, float | int):
+            raise ValueError(f"held_out={words_of(held_out)}: data=recorded is one run; give a share, such as 0.3")
         recorded = hydra.compose("recorded", [f"env={cfg.simulator.recorded}"])
-        transitions = Task.from_config(recorded.env).read_real_data(RECORDED)
+        transitions, logs = Task.from_config(recorded.env).read_real_data(RECORDED), (RECORDED,)
     else:
-        is_log = Path(cfg.data).is_file() and Path(cfg.data).suffix not in (".hdf5", ".h5")
-        name = cfg.columns or (cfg.simulator.get("columns") if is_log else None)
+        data = cfg.data if isinstance(cfg.data, str) else list(cfg.data)
+        sources, held_out = split_by_name(data, held_out)
+        logs = names_of(sources)
+        name = cfg.columns or (cfg.simulator.get("columns") if is_log(sources) else None)
         columns = None if name is None else LogColumns.load(name)
-        transitions = load(cfg.data, columns=columns, task=cfg.simulator.get("task"))
-    first, last = cfg.first_row, len(transitions)
-    if cfg.transitions is not None:
-        last = min(last, first + cfg.transitions)
-    if not 0 <= first < last:
-        raise ValueError(
-            f"first_row={first} transitions={cfg.transitions} select none of the {len(transitions)} rows of {cfg.data}"
-        )
-    whole = last - first == len(transitions)
-    rows = f"all {last} rows" if whole else f"rows {first} to {last - 1} of {len(transitions)}"
-    return Recording(transitions[first:last], f"{cfg.data}, {rows}", columns)
+        transitions = load(sources, columns=columns, task=cfg.simulator.get("task"))
+    if "log" not in transitions.keys():
+        transitions["log"] = torch.zeros(len(transitions), dtype=torch.int64)
+    count = len(transitions)
+    transitions, (first, last) = _selected(transitions, logs, cfg)
+    if len(transitions) == count:
+        rows = f"all {count} rows"
+    elif len(logs) == 1:
+        rows = f"rows {first} to {last - 1} of {count}"
+    else:
+        rows = f"{len(transitions)} of {count} rows, from row {first} of each"
+    if isinstance(held_out, tuple):
+        rows = f"{rows}; held out: {', '.join(held_out)}"
+    return Recording(transitions, f"{words_of(cfg.data)}, {rows}", columns, logs, held_out)
+
+
+def split_by_name(
+    data: Source, held_out: float | Source | Sequence[str]
+) -> tuple[tuple[str | Path, ...], float | tuple[str, ...]]:
+    """Finds the logs of a recording, those held out at the end.
+
+    Args:
+        data: the sources of the data, see :func:`torchrl_h2o.data.sources_of`.
+        held_out: a share of the rows, or sources; these may be among the data, by name or path, or further ones.
+
+    Returns:
+        All sources, and the share or the names of the sources that are held out, as in ``Recording.logs``.
+
+    Raises:
+        ValueError: for a source to hold out that is not there, or if nothing is left for the fit.
+    """
+    sources = list(sources_of(data))
+    if isinstance(held_out, float | int):
+        return tuple(sources), held_out
+    chosen: list[str | Path] = []
+    for name in [held_out] if isinstance(held_out, str | Path) else list(held_out):
+        among = [one for one in sources if str(name) == str(one) or fnmatchcase(Path(one).name, str(name))]
+        if not among and not Path(name).exists() and not any(sign in str(name) for sign in "*?["):
+            logs = ", ".join(names_of(sources))
+            raise ValueError(f"held_out={name}: there is no such file, and the data are {logs}")
+        chosen += among or sources_of(name)
+    apart = {os.path.abspath(one) for one in chosen}
+    fitted = [one for one in sources if os.path.abspath(one) not in apart]
+    if not fitted:
+        raise ValueError(f"held_out={words_of(held_out)} leaves no log for the fit; name fewer")
+    together = (*fitted, *unique(chosen))
+    return together, names_of(together)[len(fitted) :]
+
+
+def _selected(
+    transitions: TensorDictBase, logs: Sequence[str], cfg: DictConfig
+) -> tuple[TensorDictBase, tuple[int, int]]:
+    """Selects ``transitions`` consecutive rows of each log from ``first_row`` on; also returns the largest range."""
+    first, parts, most = cfg.first_row, [], 0
+    for index, log in enumerate(logs):
+        rows = cast("TensorDictBase", transitions[transitions["log"] == index])
+        last = len(rows) if cfg.transitions is None else min(len(rows), first + cfg.transitions)
+        if not 0 <= first < last:
+            raise ValueError(
+                f"first_row={first} transitions={cfg.transitions} select none of the {len(rows)} rows of {log}"
+            )
+        part, most = cast("TensorDictBase", rows[first:last]), max(most, last)
+        following = cast("TensorDictBase", part["next"])
+        following["truncated"][-1] |= ~following["terminated"][-1]
+        following["done"][-1] = True
+        parts.append(part)
+    return cast("TensorDictBase", torch.cat(parts)), (first, most)

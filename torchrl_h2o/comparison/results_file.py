@@ -13,6 +13,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.training.run_folder import uninterrupted
 
@@ -89,10 +90,12 @@ def _strength(cfg: DictConfig) -> float:
     return PAPER_GAPS[cfg.gap].strength if cfg.gap_strength is None else cfg.gap_strength
 
 
-def _short(data: str) -> str:
+def _short(data: Source) -> str:
     """Return the data set's name; for an absolute path, its last two parts, which have the form of a Minari name."""
+    if not isinstance(data, str | Path):
+        return " + ".join(_short(one) for one in data)
     path = Path(data)
-    return "/".join(path.parts[-2:]) if path.is_absolute() else data
+    return "/".join(path.parts[-2:]) if path.is_absolute() else str(data)
 
 
 def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:

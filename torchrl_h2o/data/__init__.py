@@ -13,6 +13,7 @@ from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 from torchrl_h2o.data.readers.memory_map import read_ted, write_ted
 from torchrl_h2o.data.readers.minari_dataset import read_minari, write_minari
 from torchrl_h2o.data.readers.robot_log import read_robot_log
+from torchrl_h2o.data.readers.sources import sources_of
 from torchrl_h2o.data.readers.specs import check_specs
 from torchrl_h2o.data.readers.ted import episodes
 
@@ -29,6 +30,7 @@ __all__ = [
     "read_minari",
     "read_robot_log",
     "read_ted",
+    "sources_of",
     "write_minari",
     "write_ted",
 ]

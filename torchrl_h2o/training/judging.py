@@ -100,7 +100,7 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
         "gap": cfg.gap,
         "gap_fix": cfg.get("gap_fix"),
         "mend": cfg.get("mend"),
-        "data": cfg.data,
+        "data": cfg.data if isinstance(cfg.data, str) else list(cfg.data),
         "data_seconds": cfg.get("data_seconds"),
         "transitions": len(real),
         **({key: cfg[key] for key in of_h2o_plus} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from torchrl_h2o.data.readers.sources import Source, words_of
 from torchrl_h2o.effects import Effect, effect_to_dict
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.report.contents import DataSummary
@@ -88,8 +89,8 @@ def report_of_run(directory: Path) -> Report | None:
     return Report.load(directory / FOLDER) if (directory / FOLDER).exists() else None
 
 
-def _search(task: Task, real: TensorDictBase, data: str, folder: Path) -> Report:
-    source = Path(data).name if Path(data).exists() else data
+def _search(task: Task, real: TensorDictBase, data: Source, folder: Path) -> Report:
+    source = Path(data).name if isinstance(data, str) and Path(data).exists() else words_of(data)
     try:
         return cached_report(task.make_simulator(), task.simulator, task.config["make"], real, source, folder)
     except Exception as error:  # of any kind, because training is possible without the result

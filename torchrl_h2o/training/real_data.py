@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o import __version__
 from torchrl_h2o.data import DataError, check_specs, episodes, load, read_ted, write_ted
+from torchrl_h2o.data.readers.sources import Source, is_log, words_of
 from torchrl_h2o.envs import record
 from torchrl_h2o.training.returns import Evaluation
 
@@ -22,14 +23,15 @@ RECORDED = "recorded"
 
 
 def read_real_data(
-    config: Mapping[str, Any], reality: EnvBase, data: str, columns: str | None = None
+    config: Mapping[str, Any], reality: EnvBase, data: Source, columns: str | None = None
 ) -> TensorDictBase:
     """Reads real transitions in TED, ``[T]``, and checks them against the task.
 
     Args:
         config: the ``env`` section of a configuration, see :class:`~torchrl_h2o.training.task.Task`.
         reality: one env of the task, with observations in physical units.
-        data: ``"recorded"``, or a source for :func:`torchrl_h2o.data.load`: a data set's name, a file or a folder.
+        data: ``"recorded"``, or a source for :func:`torchrl_h2o.data.load`: a data set's name, a file or a folder, or
+            several logs: a list, a glob or a folder.
         columns: YAML file that describes a log's columns. Defaults to ``columns`` of the configuration.
 
     Raises:
@@ -38,11 +40,13 @@ def read_real_data(
     """
     if data == RECORDED:
         return _recorded(config, reality)
+    if not isinstance(data, str | Path):
+        data = list(data)  # of Hydra's own type
     if columns is None and is_log(data):
         columns = config.get("columns")
     reward = instantiate(config["reward"]) if "reward" in config else None
     real = load(data, columns=columns, reward=reward, task=config["make"].get("env_name", config["name"]))
-    check_specs(real, reality, source=data)
+    check_specs(real, reality, source=words_of(data))
     return real
 
 
@@ -82,11 +86,6 @@ def first_seconds(real: TensorDictBase, seconds: float, seconds_per_step: float)
     following["truncated"][-1] |= ~following["terminated"][-1]
     following["done"][-1] = True
     return part
-
-
-def is_log(data: str) -> bool:
-    """Whether ``data`` is the file of a log, which needs a description of its columns."""
-    return Path(data).is_file() and Path(data).suffix not in (".hdf5", ".h5")
 
 
 def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:

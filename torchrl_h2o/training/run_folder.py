@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import signal
 import sys
@@ -13,7 +14,7 @@ from pathlib import Path
 import torch
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_h2o.training.mending import check_mending
@@ -88,8 +89,17 @@ def check_settings(cfg: DictConfig) -> None:
 def resolve_paths(cfg: DictConfig) -> None:
     """Makes file names absolute, in place, because a run may be resumed from another working directory."""
     for key in ("data", "columns", "gap_fix"):
-        if cfg[key] is not None and Path(cfg[key]).exists():
-            cfg[key] = str(Path(cfg[key]).resolve())
+        if isinstance(cfg[key], ListConfig):
+            cfg[key] = [_absolute(name) for name in cfg[key]]
+        elif cfg[key] is not None:
+            cfg[key] = _absolute(cfg[key])
+
+
+def _absolute(name: str) -> str:
+    """The absolute name of a file, a folder or a glob with matches; any other name, such as a data set's, as is."""
+    path = Path(name)
+    is_glob = not path.exists() and not path.is_absolute() and any(glob.iglob(name, recursive=True))
+    return str(path.resolve()) if path.exists() else str(Path.cwd() / path) if is_glob else name
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 
+from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import Effect, effect_from_dict, paper_gap
 from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
 from torchrl_h2o.residuals import Report
@@ -136,7 +137,7 @@ class Task:
         env = BatchedMujocoEnv(instantiate(self.config["make"]), num_worlds, self.worlds)
         return self._transformed(env, preprocessing)
 
-    def read_real_data(self, data: str, columns: str | None = None, seconds: float | None = None) -> TensorDictBase:
+    def read_real_data(self, data: Source, columns: str | None = None, seconds: float | None = None) -> TensorDictBase:
         """Reads the real transitions, ``[T]``, or the first ``seconds`` of them.
 
         See :func:`~torchrl_h2o.training.real_data.read_real_data` and

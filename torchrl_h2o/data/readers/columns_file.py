@@ -1,7 +1,7 @@
 """Read a log's layout from a YAML file, with errors that name the wrong entry.
 
 Three rules of YAML 1.1 need checks: ``on`` means true, ``5e-3`` is a string, and of two equal keys only the last one
-counts.
+counts. Aliases need one as well: nine lines can stand for a billion entries, and an anchor can contain itself.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import yaml
 
 from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.settings import READER_SETTINGS
 
 Layout = TypeVar("Layout")
 
@@ -38,8 +39,12 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
         ('torque',)
     """
     path = _find(source)
+    if path.stat().st_size > READER_SETTINGS.layout_bytes:
+        raise DataError(f"the file has {path.stat().st_size} bytes", "give a column description", source=source)
     try:
         entries = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except RecursionError as error:
+        raise DataError("the entries are nested too deeply", "correct the file", source=source) from error
     except yaml.constructor.ConstructorError as error:
         line = None if error.problem_mark is None else error.problem_mark.line + 1
         raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
@@ -56,7 +61,13 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
 
 
 class _Loader(yaml.SafeLoader):
-    """yaml's safe loader, which additionally rejects duplicate keys instead of keeping the last value."""
+    """yaml's safe loader, which additionally rejects duplicate keys, and aliases that expand without measure."""
+
+    def get_single_node(self):
+        node = super().get_single_node()
+        if node is not None:
+            _expanded_size(node, {})
+        return node
 
     def construct_mapping(self, node, deep=False):
         seen = set()
@@ -70,10 +81,31 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+def _expanded_size(node: yaml.Node, sizes: dict[int, int | None]) -> int:
+    """Count the entries of a node with its aliases expanded.
+
+    Args:
+        node: a node of the graph that yaml makes of a file; an alias is a second edge to the same node.
+        sizes: the sizes of nodes by their id; None for a node that is being counted, which thus contains itself.
+    """
+    if id(node) not in sizes:
+        sizes[id(node)] = None
+        inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
+        is_scalar = isinstance(node, yaml.ScalarNode)
+        sizes[id(node)] = 1 + (0 if is_scalar else sum(_expanded_size(part, sizes) for part in inner))
+    size = sizes[id(node)]
+    if size is None or size > READER_SETTINGS.layout_entries:
+        problem = "an anchor contains itself" if size is None else "the aliases expand to too many entries"
+        raise yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
+    return size
+
+
 def _find(source: str | Path) -> Path:
     path = Path(source).expanduser()
     if path.is_file():
         return path
+    if path.exists():
+        raise DataError("this is not a regular file", "give a YAML file", source=source)
     shipped = Path(str(resources.files("torchrl_h2o.data.readers") / "logs"))
     names = sorted(file.stem for file in shipped.glob("*.yaml"))
     if str(source) in names:

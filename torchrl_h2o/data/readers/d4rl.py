@@ -8,11 +8,13 @@ import numpy as np
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_h2o.data.readers.error import DataError, require_finite
+from torchrl_h2o.data.readers.error import DataError, require_finite, require_flags, require_real
 from torchrl_h2o.data.readers.file_kind import require_file
+from torchrl_h2o.data.readers.own_data import require_own_data
 from torchrl_h2o.data.readers.ted import to_ted
 
 _REQUIRED = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "timeouts": 1}
+_FLAGS = ("terminals", "timeouts")
 
 
 def read_d4rl(path: str | Path) -> TensorDict:
@@ -35,7 +37,8 @@ def read_d4rl(path: str | Path) -> TensorDict:
 
     Raises:
         DataError: for a file that is missing, empty, truncated or a pickle; a missing array, arrays of different
-            lengths, NaN or infinity, or a flag other than 0 and 1. Rows in the message are counted from 1.
+            lengths, NaN or infinity, complex numbers, a flag other than 0 and 1, or an array whose values are in
+            another file or nowhere. Rows in the message are counted from 1.
 
     Example:
         >>> import h5py, numpy as np, tempfile
@@ -62,11 +65,13 @@ def read_d4rl(path: str | Path) -> TensorDict:
                 source=path,
                 column=name,
             )
+        if name in _FLAGS:
+            continue
         columns = values.reshape(steps, -1)
         names = [name] if values.ndim == 1 else [f"{name}[{i}]" for i in range(columns.shape[1])]
         require_finite(columns, names, source=path)
-    for name in ("terminals", "timeouts"):
-        arrays[name] = _flags(arrays[name], name, path)
+    for name in _FLAGS:
+        arrays[name] = require_flags(arrays[name], name, source=path)
     if "next_observations" in arrays:
         rows, following = slice(None), arrays["next_observations"]
         if following.shape != arrays["observations"].shape:
@@ -103,6 +108,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
                     column=missing[0],
                 )
             names = [*_REQUIRED, *(["next_observations"] if "next_observations" in file else [])]
+            require_own_data(file, names, source=path)
             arrays = {name: np.asarray(file[name]) for name in names}
     except (OSError, RuntimeError, TypeError) as error:
         raise DataError(
@@ -113,27 +119,15 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     for name, values in arrays.items():
         if _REQUIRED.get(name) == 1 and values.ndim == 2 and values.shape[1] == 1:
             arrays[name] = values = values[:, 0]
-        if values.ndim != _REQUIRED.get(name, 2) or values.dtype.kind not in "fiub":
+        require_real(values, name, source=path)
+        if values.ndim != _REQUIRED.get(name, 2):
             raise DataError(
-                f"it has {values.ndim} dimensions of {values.dtype}",
-                f"expected {_REQUIRED.get(name, 2)} dimensions of real numbers",
+                f"it has {values.ndim} dimensions",
+                f"expected {_REQUIRED.get(name, 2)} dimensions",
                 source=path,
                 column=name,
             )
     return arrays
-
-
-def _flags(values: np.ndarray, name: str, path: Path) -> np.ndarray:
-    wrong = np.flatnonzero((values != 0) & (values != 1))
-    if len(wrong):
-        raise DataError(
-            f"the flag is {values[wrong[0]]}",
-            "it must be 0 or 1",
-            source=path,
-            column=name,
-            row=int(wrong[0]) + 1,
-        )
-    return values.astype(bool)
 
 
 def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray:

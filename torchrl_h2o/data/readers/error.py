@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+_LONGEST_CAUSE = 300  # characters
+
 
 class DataError(ValueError):
     """Invalid data, with its location and a remedy.
 
     Args:
-        problem: the problem, with the invalid value.
+        problem: the problem, with the invalid value; put on one line and cut to 300 characters.
         remedy: how to correct it.
         source: the file, folder or dataset name; also an attribute.
         column: the column's name, or the path inside a file; also an attribute.
@@ -46,7 +48,13 @@ class DataError(ValueError):
             None if row is None else f"row {row}",
         ]
         where = ", ".join(part for part in place if part)
-        super().__init__(f"{where + ': ' if where else ''}{problem}; {remedy}")
+        super().__init__(f"{where + ': ' if where else ''}{_one_line(problem)}; {remedy}")
+
+
+def _one_line(text: str) -> str:
+    """The text without line breaks, cut in the middle to 300 characters: libraries give causes of many lines."""
+    text = " ".join(text.split())
+    return text if len(text) <= _LONGEST_CAUSE else f"{text[:200]} ... {text[5 + 200 - _LONGEST_CAUSE :]}"
 
 
 def require_finite(
@@ -87,3 +95,63 @@ def require_finite(
         column=columns[int(position)],
         row=row_of(int(index)),
     )
+
+
+def require_real(values: np.ndarray, column: str, *, source: str | Path) -> None:
+    """Raise DataError unless an array holds real numbers or booleans.
+
+    A complex number would lose its imaginary part in the conversion to float32.
+
+    Args:
+        values: any array.
+        column: its name.
+        source: the file of the values.
+
+    Raises:
+        DataError: for complex numbers, text, objects or structures.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_h2o.data.readers.error import require_real
+        >>> require_real(np.array([1j]), "actions", source="a.hdf5")
+        Traceback (most recent call last):
+        ...
+        torchrl_h2o.data.readers.error.DataError: a.hdf5, column 'actions': the values are complex128, ...
+    """
+    if values.dtype.kind not in "fiub":
+        raise DataError(
+            f"the values are {values.dtype}, expected real numbers",
+            "write them as real numbers",
+            source=source,
+            column=column,
+        )
+
+
+def require_flags(values: np.ndarray, column: str, *, source: str | Path) -> np.ndarray:
+    """Return flags as booleans.
+
+    Args:
+        values: flags, (T,), each 0 or 1.
+        column: their name.
+        source: the file of the values.
+
+    Raises:
+        DataError: for any other value, such as 2, 0.5 or NaN, with its row.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_h2o.data.readers.error import require_flags
+        >>> require_flags(np.array([0.0, 1.0]), "terminals", source="a.hdf5").tolist()
+        [False, True]
+    """
+    require_real(values, column, source=source)
+    wrong = np.flatnonzero((values != 0) & (values != 1))
+    if len(wrong):
+        raise DataError(
+            f"the flag is {values[wrong[0]]}",
+            "it must be 0 or 1",
+            source=source,
+            column=column,
+            row=int(wrong[0]) + 1,
+        )
+    return values.astype(bool)

@@ -1,10 +1,11 @@
-"""Check a file before it is read: reject missing, empty and compressed files, and pickles.
+"""Check a file before it is read: reject missing, empty and compressed files, fifos, and pickles.
 
 A pickle can execute code. It is recognised by its name or first bytes and never unpickled.
 """
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 from torchrl_h2o.data.readers.error import DataError
@@ -29,6 +30,10 @@ def is_pickle(path: str | Path) -> bool:
         True
     """
     path = Path(path)
+    if path.suffix.lower() == ".npz" and path.is_file() and zipfile.is_zipfile(path):
+        # objects in the arrays are refused where the arrays are read
+        with zipfile.ZipFile(path) as archive:
+            return not all(name.endswith(".npy") for name in archive.namelist())
     if path.suffix.lower() in _PICKLE_SUFFIXES:
         return True
     with path.open("rb") as file:
@@ -42,13 +47,15 @@ def require_file(path: str | Path) -> Path:
         path: a file.
 
     Raises:
-        DataError: for a missing file, a folder, an empty or compressed file, or a pickle.
+        DataError: for a missing file, a folder, a fifo or device, an empty or compressed file, or a pickle.
     """
     path = Path(path).expanduser()
     if not path.exists():
         raise DataError("there is no such file", "check the path", source=path)
     if path.is_dir():
         raise DataError("this is a folder, but a file was expected", "give the file in it", source=path)
+    if not path.is_file():  # opening a fifo would wait for a writer, reading /dev/zero would not end
+        raise DataError("this is not a regular file", "copy the data into a file and give that", source=path)
     if is_pickle(path):
         raise DataError(
             "this is a pickle, or a format that may contain one, and reading it could execute arbitrary code",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+import torch
 from tensordict import TensorDict
 
 from torchrl_h2o.data.readers.d4rl import read_d4rl
@@ -15,28 +17,30 @@ from torchrl_h2o.data.readers.log_columns import LogColumns
 from torchrl_h2o.data.readers.memory_map import read_ted
 from torchrl_h2o.data.readers.minari_dataset import read_minari
 from torchrl_h2o.data.readers.robot_log import Reward, read_robot_log
+from torchrl_h2o.data.readers.sources import Source, is_hdf5, sources_of, words_of
 from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
+from torchrl_h2o.data.readers.ted import entry_name
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
-_HDF5_SUFFIXES = {".hdf5", ".h5", ".hdf"}
-_HDF5_START = b"\x89HDF\r\n\x1a\n"
-
 
 def load(
-    source: str | Path,
+    source: Source,
     *,
     env: EnvBase | None = None,
     columns: LogColumns | str | Path | None = None,
     reward: Reward | None = None,
     task: str | None = None,
 ) -> TensorDict:
-    """Load transitions from a Minari dataset, a D4RL file, a robot log or a TED memory map.
+    """Load transitions from Minari datasets, D4RL files, robot logs or TED memory maps.
+
+    Each of several sources is a run of its own: its last transition is done.
 
     Args:
-        source: a Minari name (``"halfcheetah/medium-v0"``) or folder, an HDF5 file, a text or CSV log, or a folder
-            written by :func:`write_ted`.
+        source: a Minari name (``"halfcheetah/medium-v0"``) or folder, an HDF5 file, a log (.csv, .txt, .parquet, .npz,
+            .mat, .mcap), or a folder written by :func:`write_ted`; or several of them: a list, a glob
+            (``"logs/*.csv"``), or a folder of logs. See :func:`sources_of` for their order.
         env: an environment; the data's dimensions, kinds of numbers and action bounds are checked against it.
         columns: for a log, the layout of its columns; see :func:`read_robot_log`.
         reward: for a log, its reward function; see :func:`read_robot_log`.
@@ -44,7 +48,8 @@ def load(
             may differ. If the source does not name its task, a warning is logged.
 
     Returns:
-        TensorDict of batch size [T] in TED.
+        TensorDict of batch size [T] in TED. From several sources, it has the int64 entry ``log`` of shape [T]: the
+        index of the source.
 
     Raises:
         DataError: with file, column and row, for invalid data; also if columns are given for a source that is not a
@@ -58,18 +63,44 @@ def load(
         >>> load(path, columns="wheel_legged_moving_forward")["observation"].shape
         torch.Size([1, 3])
     """
+    parts = sources_of(source)
+    tds = [_read(one, columns, reward, task) for one in parts]
+    td = tds[0] if len(tds) == 1 else _joined(tds, parts)
+    if env is not None:
+        check_specs(td, env, source=words_of(source))
+    return td
+
+
+def _read(
+    source: str | Path, columns: LogColumns | str | Path | None, reward: Reward | None, task: str | None
+) -> TensorDict:
     path = Path(source).expanduser()
     if path.is_dir():
         _require_no_columns(columns, source)
-        td = _read_folder(path, task)
-    elif path.exists() or _looks_like_a_path(source):
-        td = _read_file(path, columns, reward, task)
-    else:
-        _require_no_columns(columns, source)
-        td = read_minari(str(source), task=task)
-    if env is not None:
-        check_specs(td, env, source=source)
-    return td
+        return _read_folder(path, task)
+    if path.exists() or _looks_like_a_path(source):
+        return _read_file(path, columns, reward, task)
+    _require_no_columns(columns, source)
+    return read_minari(str(source), task=task)
+
+
+def _joined(tds: Sequence[TensorDict], sources: Sequence[str | Path]) -> TensorDict:
+    """Join the transitions of several sources, whose last transitions are done, with the entry ``log``."""
+    keys, first = set(tds[0].keys(True, True)), tds[0]
+    for index, (td, source) in enumerate(zip(tds, sources, strict=True)):
+        for key in sorted(keys ^ set(td.keys(True, True)), key=str):
+            problem = f"{sources[0] if key in keys else source} has this entry, and another of the data has not"
+            raise DataError(problem, "give data of the same kind", source=source, column=entry_name(key))
+        for key in ("observation", "action"):
+            if td[key].shape[1:] != first[key].shape[1:]:
+                raise DataError(
+                    f"it has {list(td[key].shape[1:])} entries, {sources[0]} has {list(first[key].shape[1:])}",
+                    "give data of the same system",
+                    source=source,
+                    column=key,
+                )
+        td["log"] = torch.full((len(td),), index, dtype=torch.int64)
+    return cast("TensorDict", torch.cat(list(tds)))
 
 
 def _require_no_columns(columns: LogColumns | str | Path | None, source: str | Path) -> None:
@@ -85,13 +116,7 @@ def _read_folder(path: Path, task: str | None) -> TensorDict:
     if (path / "meta.json").is_file():
         warn_of_unknown_task(task, path)
         return read_ted(path)
-    if (path / "metadata.json").is_file() or (path / "data" / "metadata.json").is_file():
-        return read_minari(path, task=task)
-    raise DataError(
-        "the folder holds neither a Minari dataset (data/metadata.json) nor a memory-mapped TensorDict (meta.json)",
-        "give a folder that holds one of them",
-        source=path,
-    )
+    return read_minari(path, task=task)
 
 
 def _read_file(
@@ -101,16 +126,14 @@ def _read_file(
     task: str | None,
 ) -> TensorDict:
     path = require_file(path)
-    with path.open("rb") as file:
-        is_hdf5 = file.read(len(_HDF5_START)) == _HDF5_START
-    if is_hdf5 or path.suffix.lower() in _HDF5_SUFFIXES:
+    if is_hdf5(path):
         _require_no_columns(columns, path)
         warn_of_unknown_task(task, path)
         return read_d4rl(path)
     if columns is None:
         raise DataError(
             "a log does not describe its columns",
-            "give columns=, a YAML file as in torchrl_h2o/data/readers/logs",
+            "give columns=, a YAML file as in torchrl_h2o/data/readers/logs; close-the-loop --guess writes a first one",
             source=path,
         )
     return read_robot_log(path, columns, reward=reward)

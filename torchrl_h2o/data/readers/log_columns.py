@@ -24,6 +24,9 @@ class Column:
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
         scale: a factor in addition to the unit's, such as a gear ratio or a sign.
         bounds: lowest and highest value in SI, for actions only.
+        index: position in the file, counted from 0, for files without names; all columns have it, or none.
+        derivative_of: the observed position whose velocity this column is, for a velocity that is not in the file. It
+            is estimated, in SI; see :func:`~torchrl_h2o.data.readers.velocity.estimate_velocity`.
 
     Example:
         >>> from torchrl_h2o.data import Column
@@ -36,6 +39,8 @@ class Column:
     unit: str = "1"
     scale: float = 1.0
     bounds: tuple[float, float] | None = None
+    index: int | None = None
+    derivative_of: str | None = None
 
     def __post_init__(self):
         if not isinstance(self.name, str):
@@ -55,6 +60,15 @@ class Column:
                 raise ValueError("bounds are for actions only")
             if not self.bounds[0] < self.bounds[1]:
                 raise ValueError(f"bounds {list(self.bounds)} must be [lowest, highest]")
+        if self.index is not None and (
+            not isinstance(self.index, int) or isinstance(self.index, bool) or self.index < 0
+        ):
+            raise ValueError(f"index {self.index!r} must be a number of a column, counted from 0")
+        if self.derivative_of is not None:
+            if self.role != "observation":
+                raise ValueError("derivative_of is for observations only")
+            if self.index is not None or self.unit != "1" or self.scale != 1.0:
+                raise ValueError("a column with derivative_of is not in the file: omit index, unit and scale")
 
     @property
     def factor(self) -> float:
@@ -66,8 +80,10 @@ class Column:
 class LogColumns:
     """The layout of a log file. Options that drop rows are off by default.
 
+    Files of .parquet, .npz, .mat and .mcap name their columns, and have no separator, header, comment and decimal.
+
     Args:
-        columns: the columns; for a file without a header, in the file's order.
+        columns: the columns; for a file without a header, in the file's order, or with their ``index``.
         dt: time between two rows in s; ``None`` uses the median of the time column.
         separator: ``"whitespace"`` or one character; with a character, cells may be quoted with "".
         header: whether the first row holds the names.
@@ -83,6 +99,8 @@ class LogColumns:
         after_done: treatment of rows with done = 0 after a row with done = 1: ``"error"``, ``"drop"``, which drops the
             rest of the file, or ``"new_episode"``.
         drop_trailing_zero_rows: whether to drop rows at the end of the file that are all zero.
+        free_motion: whether the log has no actions; those of the transitions then have the shape (T, 0).
+        topic: for a bag with several topics of joint states, the one whose messages are the rows.
 
     Raises:
         ValueError: for contradicting or invalid entries; the message lists what is allowed.
@@ -108,6 +126,8 @@ class LogColumns:
     on_time_jump: Literal["error", "split"] = "error"
     after_done: Literal["error", "drop", "new_episode"] = "error"
     drop_trailing_zero_rows: bool = False
+    free_motion: bool = False
+    topic: str | None = None
 
     def __post_init__(self):
         for name, count in Counter(column.name for column in self.columns).items():
@@ -115,12 +135,16 @@ class LogColumns:
                 raise ValueError(f"the column name {name!r} occurs {count} times")
         for role in ("observation", "action"):
             names = self._names(role)
-            if not names:
-                raise ValueError(f"there is no column with the role {role!r}")
+            if not names and not (role == "action" and self.free_motion):
+                free = "; set free_motion: true if the log has no actions" if role == "action" else ""
+                raise ValueError(f"there is no column with the role {role!r}{free}")
             order = getattr(self, role) or names
             if sorted(order) != sorted(names):
                 raise ValueError(f"{role}: {list(order)} must name each of {list(names)} once")
             object.__setattr__(self, role, tuple(order))
+        if self.free_motion and self.action:
+            raise ValueError(f"free_motion: true, but {', '.join(self.action)} has the role action")
+        self._check_places()
         for role in ("reward", "done", "time"):
             if len(self._names(role)) > 1:
                 raise ValueError(f"several columns have the role {role!r}; at most one is allowed")
@@ -138,7 +162,7 @@ class LogColumns:
             )
         if self.decimal == self.separator:
             raise ValueError(f"decimal and separator are both {self.decimal!r}; they must differ")
-        if self.other_columns == "ignore" and not self.header:
+        if self.other_columns == "ignore" and not self.header and not self.by_index:
             raise ValueError(
                 "other_columns: ignore requires a header; without one, describe all columns, with role: ignore"
             )
@@ -152,9 +176,36 @@ class LogColumns:
             ("decimal", (".", ",")),
             ("other_columns", ("error", "ignore")),
             ("drop_trailing_zero_rows", (True, False)),
+            ("free_motion", (True, False)),
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} {getattr(self, name)!r} must be one of {allowed}")
+
+    def _check_places(self) -> None:
+        indices = [column.index for column in self.in_file]
+        if not indices:
+            raise ValueError("all columns have derivative_of; describe those of the file")
+        if set(indices) != {None} and (None in indices or len(set(indices)) < len(indices)):
+            raise ValueError("two columns have the same index, or only some have one; give all or none an index")
+        positions = [name for name in self._names("observation") if name not in self.derivatives]
+        for name, position in self.derivatives.items():
+            if position not in positions:
+                raise ValueError(f"{name}: derivative_of {position!r} must be one of the observations {positions}")
+
+    @property
+    def in_file(self) -> tuple[Column, ...]:
+        """The columns that are in the file: all but estimated velocities."""
+        return tuple(column for column in self.columns if column.derivative_of is None)
+
+    @property
+    def by_index(self) -> bool:
+        """Whether the columns are given by their positions in the file."""
+        return self.in_file[0].index is not None
+
+    @property
+    def derivatives(self) -> dict[str, str]:
+        """The estimated velocities and the position of each."""
+        return {column.name: column.derivative_of for column in self.columns if column.derivative_of is not None}
 
     def named(self, role: str) -> Column | None:
         """Return the column of a role that occurs at most once, or None."""

@@ -1,17 +1,19 @@
-"""Convert the text of a log to numbers in SI, with errors that name the line and column."""
+"""Select the columns of a log that its layout describes, and convert them to SI."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from torchrl_h2o.data.readers.error import DataError, require_finite
-from torchrl_h2o.data.readers.file_kind import require_file
-from torchrl_h2o.data.readers.log_columns import LogColumns
+from torchrl_h2o.data.readers.formats import read_raw
+from torchrl_h2o.data.readers.formats.raw_table import RawTable
+from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class LogTable:
         source: the file.
         names: names of the columns that are not ignored, in the file's order.
         values: values in SI, float64, (rows, columns).
-        rows: line number of each row, counted from 1, (rows,).
+        rows: number of each row, counted from 1; the line number in text files, (rows,).
         zero_rows: number of rows of zeros that were dropped at the end of the file.
     """
 
@@ -63,121 +65,47 @@ def read_table(path: str | Path, layout: LogColumns) -> LogTable:
         >>> read_table(path, layout).columns(["torque"]).tolist()
         [[0.001], [0.002]]
     """
-    path = require_file(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except UnicodeDecodeError as error:
-        raise DataError(f"the file is not text: {error}", "give a text or CSV file", source=path) from error
-    # blank lines and comments are skipped but counted, so that row numbers are line numbers
-    rows = [
-        (number, _cells(line, layout.separator, path, number))
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not (layout.comment and line.lstrip().startswith(layout.comment))
-    ]
-    names = [column.name for column in layout.columns]
-    if layout.header and rows:
-        names = _require_names(rows.pop(0), names, path, layout.other_columns == "ignore")
-    if len(rows) < 2:
-        raise DataError(
-            f"there are {len(rows)} rows of data",
-            "a transition needs two: the file is empty or truncated",
-            source=path,
-        )
-    _require_width(rows, names, path)
-    by_name = {column.name: column for column in layout.columns}
-    kept = [i for i, name in enumerate(names) if name in by_name and by_name[name].role != "ignore"]
-    names = [names[i] for i in kept]
-    values = _numbers([[cells[i] for i in kept] for _, cells in rows], names, rows, layout.decimal, path)
-    numbers = np.array([number for number, _ in rows])
-    zero_rows = 0
+    raw = read_raw(path, layout)
+    chosen = _chosen(raw, layout)
+    names = [column.name for _, column in chosen]
+    values = raw.numbers([index for index, _ in chosen], names)
+    numbers, zero_rows = raw.rows, 0
     if layout.drop_trailing_zero_rows:
         filled = np.flatnonzero((values != 0).any(1))
         zero_rows = len(values) - (filled[-1] + 1 if len(filled) else 0)
         values, numbers = values[: len(values) - zero_rows], numbers[: len(values) - zero_rows]
     if len(values) < 2:
-        raise DataError("only rows of zeros remain", "record the log again", source=path)
-    values = values * np.array([by_name[name].factor for name in names])
-    require_finite(values, names, source=path, row_of=lambda index: int(numbers[index]))
-    return LogTable(str(path), tuple(names), values, numbers, int(zero_rows))
+        raise DataError("only rows of zeros remain", "record the log again", source=raw.source)
+    values = values * np.array([column.factor for _, column in chosen])
+    require_finite(values, names, source=raw.source, row_of=lambda index: int(numbers[index]))
+    return LogTable(str(raw.source), tuple(names), values, numbers, int(zero_rows))
 
 
-def _cells(line: str, separator: str, path, number: int) -> list[str]:
-    if separator == "whitespace":
-        return line.split()
-    try:
-        # skipinitialspace, so that a quote after a space is recognised
-        skip = separator != " "
-        (cells,) = csv.reader([line.rstrip("\r")], delimiter=separator, skipinitialspace=skip, strict=True)
-    except csv.Error as error:
-        raise DataError(
-            f"the line cannot be split into cells: {error}",
-            "correct its quotes; a cell cannot span lines",
-            source=path,
-            row=number,
-        ) from error
-    return [cell.strip() for cell in cells]
+def _chosen(raw: RawTable, layout: LogColumns) -> list[tuple[int, Column]]:
+    """Return the columns that are not ignored, with their positions in the file, in the file's order."""
+    if layout.by_index:
+        placed = [(cast("int", column.index), column) for column in layout.in_file]
+        _require_indices(placed, raw, layout)
+    elif raw.names is None:
+        placed = list(enumerate(layout.in_file))
+    else:
+        placed = [(raw.names.index(column.name), column) for column in layout.in_file]
+    return [(index, column) for index, column in sorted(placed, key=itemgetter(0)) if column.role != "ignore"]
 
 
-def _require_names(header: tuple[int, list[str]], expected: list[str], path, ignore_others: bool) -> list[str]:
-    number, cells = header
-    names = [cell.strip("\"'") for cell in cells]
-    remedy = f"the header is {', '.join(names)}; correct the file or its column description"
-    for name in names:
-        if ignore_others and name not in expected:
-            continue
-        if names.count(name) > 1:
-            problem = "two columns have this name"
-        elif name not in expected:
-            problem = "the column is not described (use role: ignore, or other_columns: ignore for all such columns)"
-        else:
-            continue
-        raise DataError(problem, remedy, source=path, column=name, row=number)
-    for name in expected:
-        if name not in names:
-            raise DataError("the column is missing", remedy, source=path, column=name, row=number)
-    return names
-
-
-def _require_width(rows: list[tuple[int, list[str]]], names: list[str], path) -> None:
-    for number, cells in rows:
-        if len(cells) == len(names):
-            continue
-        place = {"source": path, "row": number}
-        found = f"the row has {len(cells)} columns, {len(names)} are expected"
-        if len(cells) > len(names):
+def _require_indices(placed: list[tuple[int, Column]], raw: RawTable, layout: LogColumns) -> None:
+    for index, column in placed:
+        if index >= raw.width:
             raise DataError(
-                f"{found}; extra: {', '.join(cells[len(names) :])}",
-                "describe them (with the role ignore if not needed), or check the separator",
-                column=f"column {len(names) + 1}",
-                **place,
+                f"its index is {index}, but the file has {raw.width} columns",
+                "count from 0, and check the separator",
+                source=raw.source,
+                column=column.name,
             )
-        place["column"] = names[len(cells)]
-        if number == rows[-1][0] and len(rows) > 1:
-            raise DataError(f"{found}, and it is the last row", "the file is truncated", **place)
-        raise DataError(f"{found}; missing", "correct the row, or check the separator", **place)
-
-
-def _numbers(
-    cells: list[list[str]], names: list[str], rows: list[tuple[int, list[str]]], decimal: str, path
-) -> np.ndarray:
-    values = np.empty((len(cells), len(names)))
-    for index, row in enumerate(cells):
-        for position, cell in enumerate(row):
-            try:
-                values[index, position] = _number(cell, decimal)
-            except ValueError:
-                raise DataError(
-                    f"{cell!r} is not a number",
-                    f"correct it, or check separator, header and decimal ({decimal!r})",
-                    source=path,
-                    column=names[position],
-                    row=rows[index][0],
-                ) from None
-    return values
-
-
-def _number(cell: str, decimal: str) -> float:
-    # float() would read 1_5 as 15; in a file with decimal commas, a point may separate thousands
-    if "_" in cell or (decimal == "," and "." in cell):
-        raise ValueError
-    return float(cell.replace(",", ".") if decimal == "," else cell)
+    if layout.other_columns == "error" and len(placed) < raw.width:
+        missing = sorted(set(range(raw.width)) - {index for index, _ in placed})
+        raise DataError(
+            f"the columns {', '.join(map(str, missing))} are not described",
+            "describe them (with the role ignore if not needed), or set other_columns: ignore",
+            source=raw.source,
+        )

@@ -7,10 +7,10 @@ stores entries that are not tensors as pickles.
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
@@ -124,7 +124,7 @@ def _require_whole_files(folder: Path) -> None:
     try:
         meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
         sizes = {
-            folder / f"{key}.memmap": int(np.prod(entry["shape"], dtype=np.int64))
+            folder / f"{key}.memmap": math.prod(entry["shape"])  # not numpy's, which overflows
             * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
             for key, entry in meta.items()
             if isinstance(entry, dict) and "dtype" in entry

@@ -6,13 +6,16 @@ torchrl 0.14.1 returns zeros for these files without an error.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_h2o.data.readers.error import DataError, require_finite
+from torchrl_h2o.data.readers.error import DataError, require_finite, require_flags, require_real
+from torchrl_h2o.data.readers.file_kind import require_file
+from torchrl_h2o.data.readers.own_data import require_own_file
 from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.readers.ted import episodes, require_continuous, require_ted, to_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
@@ -23,6 +26,8 @@ if TYPE_CHECKING:  # imported where they are used, because the replay buffer doe
     from torchrl.envs import EnvBase
 
 _FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
+_MAIN_FILE = "main_data.hdf5"
+_FLAGS = ("terminations", "truncations")
 
 
 def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
@@ -41,8 +46,9 @@ def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
 
     Raises:
         DataError: for an unknown name, truncated files, an episode with arrays of inconsistent shapes, NaN or infinity
-            (the column is the path inside the HDF5 file, the row is counted from 1 within its episode), or spaces
-            other than flat boxes.
+            (the column is the path inside the HDF5 file, the row is counted from 1 within its episode), complex
+            numbers, flags other than 0 and 1, values that are in another file or nowhere, or spaces other than flat
+            boxes.
 
     Example:
         >>> import tempfile
@@ -69,8 +75,7 @@ def read_minari(source: str | Path, *, task: str | None = None) -> TensorDict:
             path = f"episode_{number}/{field}"
             names = [f"{path}[{i}]" for i in range(values.shape[1])]
             require_finite(values, names, source=source)
-    truncated = np.concatenate(parts["truncations"]).astype(bool)
-    terminated = np.concatenate(parts["terminations"]).astype(bool)
+    truncated, terminated = np.concatenate(parts["truncations"]), np.concatenate(parts["terminations"])
     # Minari allows episodes that end without either flag; they are marked truncated
     last = np.cumsum(lengths) - 1
     truncated[last] |= ~terminated[last]
@@ -170,10 +175,16 @@ def _open(source: str | Path) -> MinariDataset:
 
     folder = Path(source).expanduser()
     data = folder if (folder / "metadata.json").is_file() else folder / "data"
+    for name in ("metadata.json", _MAIN_FILE):
+        if (data / name).exists():
+            require_file(data / name)
     try:
         if data.is_dir():
+            _require_plausible_count(data)
             return minari.MinariDataset(data)
         return minari.load_dataset(str(source), download=True)
+    except DataError:
+        raise
     except Exception as error:  # each hosting service raises its own network errors
         raise DataError(
             f"no Minari dataset can be opened: {error}",
@@ -181,6 +192,18 @@ def _open(source: str | Path) -> MinariDataset:
             "MINARI_DATASETS_PATH or can be downloaded",
             source=source,
         ) from error
+
+
+def _require_plausible_count(data: Path) -> None:
+    """Raise DataError if the metadata state more episodes than the file has bytes: minari makes a list of them."""
+    metadata, main = data / "metadata.json", data / _MAIN_FILE
+    stated = json.loads(metadata.read_text(encoding="utf-8")).get("total_episodes")
+    if main.is_file() and not 0 <= stated <= main.stat().st_size:
+        raise DataError(
+            f"it states {stated} episodes, but the file of the data has {main.stat().st_size} bytes",
+            "the dataset is damaged: copy or download it again",
+            source=metadata,
+        )
 
 
 def _require_task(dataset: MinariDataset, task: str | None, source: str | Path) -> None:
@@ -204,6 +227,9 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
                 source=source,
                 column=name,
             )
+    main = dataset.storage.data_path / _MAIN_FILE
+    if main.exists():  # absent from a dataset in Arrow's format
+        require_own_file(main)
     parts = {field: [] for field in _FIELDS}
     sizes = {"observations": dataset.observation_space.shape, "actions": dataset.action_space.shape}
     bar = tqdm(dataset.iterate_episodes(), total=dataset.total_episodes, desc=str(source), delay=5)
@@ -220,7 +246,9 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
                         source=source,
                         column=f"episode_{number}/{field}",
                     )
-                parts[field].append(values)
+                place = {"column": f"episode_{number}/{field}", "source": source}
+                require_real(values, **place)
+                parts[field].append(require_flags(values, **place) if field in _FLAGS else values)
     except (OSError, KeyError, RuntimeError, AssertionError) as error:
         raise DataError(
             f"episode {len(parts['truncations'])} cannot be read: {error}",

@@ -1,4 +1,4 @@
-"""Read a robot's log, text or CSV, into TED: parse, convert to SI, and link rows into transitions.
+"""Read a robot's log into TED: parse, convert to SI, link rows into transitions, and estimate missing velocities.
 
 Rows t and t + 1 form a transition, so the last row of a run is used only as a next observation.
 """
@@ -6,9 +6,8 @@ Rows t and t + 1 form a transition, so the last row of a run is used only as a n
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -17,7 +16,9 @@ from torchrl import torchrl_logger
 
 from torchrl_h2o.data.readers.error import DataError, require_finite
 from torchrl_h2o.data.readers.log_columns import LogColumns
+from torchrl_h2o.data.readers.log_links import link_rows
 from torchrl_h2o.data.readers.log_table import LogTable, read_table
+from torchrl_h2o.data.readers.observed import observe
 from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.ted import to_ted
 
@@ -45,7 +46,9 @@ def read_robot_log(
         settings: the tolerance of the clock.
 
     Returns:
-        TensorDict of batch size [T] in TED, with a float64 ``time`` in s of shape [T, 1].
+        TensorDict of batch size [T] in TED, with a float64 ``time`` in s of shape [T, 1]. If the layout has velocities
+        that are estimated from positions, ``observation_std`` of shape [T, n] is the standard deviation of their
+        errors, in SI, and 0 for measured columns. Rows at the ends of runs then have no transitions.
 
     Raises:
         DataError: with file, column and line number.
@@ -63,8 +66,9 @@ def read_robot_log(
     """
     layout = columns if isinstance(columns, LogColumns) else LogColumns.load(columns)
     table = read_table(path, layout)
-    observation, action = table.columns(layout.observation), table.columns(layout.action)
-    links = _link_rows(table, layout, settings)
+    links = link_rows(table, layout, settings)
+    observation, stds, links = observe(table, layout, links)
+    action = table.columns(layout.action)
     action, clipped = _bounded(action, links.start, table, layout)
     observed, acted = observation[links.start], action[links.start]
     following = observation[links.start + 1]
@@ -77,127 +81,14 @@ def read_robot_log(
         reward=_rewards(table, layout, reward, links.start, observed, acted, following),
     )
     td["time"] = torch.from_numpy(_time(table, layout)[links.start])[:, None]
+    if layout.derivatives:
+        td["observation_std"] = torch.tensor(stds, dtype=torch.float32).repeat(len(td), 1)
     torchrl_logger.info(
         f"{path}: {len(links.start)} transitions from {len(table.rows)} rows; "
         f"{table.zero_rows} zero rows dropped at the end, {links.dropped} rows dropped because "
         f"they belong to no transition, {clipped} actions clipped"
     )
     return td
-
-
-@dataclass(frozen=True)
-class _Links:
-    """The first rows of all transitions and their flags.
-
-    Args:
-        start: index of the first row of each transition, (T,).
-        terminated: whether the second row has done = 1, (T,).
-        truncated: whether the run ends after the transition although done is 0, (T,).
-        dropped: number of rows that belong to no transition.
-    """
-
-    start: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    dropped: int
-
-
-def _link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> _Links:
-    done = _done(table, layout)
-    linked = ~done[:-1]
-    _require_declared_restart(table, layout, done)
-    if layout.after_done == "drop" and done.any():
-        linked[np.argmax(done) :] = False
-    linked &= ~_jumps(table, layout, linked, settings)
-    start = np.flatnonzero(linked)
-    if not len(start):
-        raise DataError(
-            "no two rows make a transition",
-            "record more, or correct done, time_tolerance or on_time_jump",
-            source=table.source,
-        )
-    terminated = done[start + 1]
-    continues = np.append(linked, False)[start + 1]
-    used = np.zeros(len(done), bool)
-    used[start] = used[start + 1] = True
-    return _Links(start, terminated, ~terminated & ~continues, int((~used).sum()))
-
-
-def _done(table: LogTable, layout: LogColumns) -> np.ndarray:
-    column = layout.named("done")
-    if column is None:
-        return np.zeros(len(table.rows), bool)
-    values = table.columns([column.name])[:, 0]
-    wrong = np.flatnonzero((values != 0) & (values != 1))
-    if len(wrong):
-        raise DataError(
-            f"done is {values[wrong[0]]:g}",
-            "it must be 0 or 1",
-            source=table.source,
-            column=column.name,
-            row=int(table.rows[wrong[0]]),
-        )
-    return values.astype(bool)
-
-
-def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndarray) -> None:
-    column, restarts = layout.named("done"), np.flatnonzero(done[:-1] & ~done[1:])
-    if column is not None and len(restarts) and layout.after_done == "error":
-        raise DataError(
-            "done falls back to 0 after the run has ended",
-            "state how to treat these rows: after_done: drop, or after_done: new_episode",
-            source=table.source,
-            column=column.name,
-            row=int(table.rows[restarts[0] + 1]),
-        )
-
-
-def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings) -> np.ndarray:
-    """Return a mask of the linked pairs of rows whose time step is not dt; raise DataError unless these are split."""
-    column = layout.named("time")
-    if column is None:
-        return np.zeros(len(linked), bool)
-    time = table.columns([column.name])[:, 0]
-    steps = np.diff(time)
-    place: dict[str, Any] = {"source": table.source, "column": column.name}
-    backwards = np.flatnonzero(linked & (steps <= 0))
-    if len(backwards):
-        index = backwards[0]
-        raise DataError(
-            f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
-            "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
-            "end of the file with zeros",
-            row=int(table.rows[index + 1]),
-            **place,
-        )
-    dt = _dt(steps[linked], layout, place, settings)
-    jumps = linked & (np.abs(steps - dt) > layout.time_tolerance * dt)
-    if jumps.any() and layout.on_time_jump == "error":
-        index = np.argmax(jumps)
-        raise DataError(
-            f"the time step is {steps[index]:.9g} s, dt is {dt:.9g} s",
-            "correct dt, widen time_tolerance, or set on_time_jump: split",
-            row=int(table.rows[index + 1]),
-            **place,
-        )
-    return jumps
-
-
-def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any], settings: ReaderSettings) -> float:
-    """Return the layout's dt after comparing it with the steps between linked rows; without it, their median."""
-    if layout.dt is None or not len(steps):
-        return float(np.median(steps)) if len(steps) else 0.0
-    median = float(np.median(steps))
-    # at 300 Hz a clock with a resolution of 1 ms gives steps of 3, 3, 4 ms; then the mean without gaps is accurate
-    mean = float(np.mean(steps[steps <= settings.longest_regular_step * median]))
-    # time_tolerance is for single late rows and would accept a dt that is wrong throughout
-    if min(abs(median - layout.dt), abs(mean - layout.dt)) > settings.clock_tolerance * layout.dt:
-        raise DataError(
-            f"the median time step is {median:.9g} s, dt is {layout.dt:.9g} s",
-            "correct dt or the unit of time, or omit dt to use the median",
-            **place,
-        )
-    return layout.dt
 
 
 def _time(table: LogTable, layout: LogColumns) -> np.ndarray:
@@ -210,7 +101,7 @@ def _time(table: LogTable, layout: LogColumns) -> np.ndarray:
 def _bounded(action: np.ndarray, start: np.ndarray, table: LogTable, layout: LogColumns) -> tuple[np.ndarray, int]:
     by_name = {column.name: column for column in layout.columns}
     bounds = [by_name[name].bounds or (-np.inf, np.inf) for name in layout.action]
-    low, high = np.array(bounds).T
+    low, high = np.array(bounds).reshape(-1, 2).T
     # only actions of transitions are checked
     outside = (action[start] < low) | (action[start] > high)
     if outside.any() and layout.outside_bounds == "error":

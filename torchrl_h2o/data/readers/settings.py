@@ -15,11 +15,23 @@ class ReaderSettings:
         longest_regular_step: multiple of the median time step; longer steps are gaps and are excluded from the mean.
         bound_rounding: share of an action bound by which an action may exceed it. A recording in float64 that is
             rounded to float32 exceeds it by about 1e-7.
+        largest_compression: ratio of the bytes that an array states to those that its file stores, above which the
+            file is refused; deflate reaches 1032 for constant values.
+        largest_expansion: ratio of the bytes of a log's values to those of its compressed file, above which the file
+            is refused.
+        unsuspicious_bytes: logs that state fewer bytes are read whatever their compression.
+        layout_bytes: largest size of a column description in bytes.
+        layout_entries: largest number of entries in a column description after its aliases are expanded.
     """
 
     clock_tolerance: float = 0.02
     longest_regular_step: float = 2.0
     bound_rounding: float = 1e-6
+    largest_compression: float = 1100.0
+    largest_expansion: float = 200.0
+    unsuspicious_bytes: int = 2**26
+    layout_bytes: int = 2**20
+    layout_entries: int = 20_000
 
 
 READER_SETTINGS = ReaderSettings()

@@ -5,6 +5,7 @@ Row t is a transition; ``next`` of the last row of an episode is the final obser
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -126,8 +127,11 @@ def require_ted(td: TensorDictBase, *, source: str | Path = "transitions") -> No
     _require_shapes(td, keys, source)
     _require_flags(td, source)
     for key in sorted(keys, key=str):
+        if td.get(key).is_complex():
+            problem = f"the dtype is {td.get(key).dtype}"
+            raise DataError(problem, "write real numbers", source=source, column=entry_name(key))
         if td.get(key).is_floating_point():
-            values = td.get(key).reshape(len(td), -1).numpy()
+            values = td.get(key).numpy().reshape(len(td), math.prod(td.get(key).shape[1:]))
             names = [f"{entry_name(key)}[{i}]" for i in range(values.shape[1])]
             require_finite(values, names, source=source)
 

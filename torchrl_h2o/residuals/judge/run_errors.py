@@ -28,7 +28,7 @@ def run_errors(
     Returns:
         An entry for each run with usable transitions, in the order of the data.
     """
-    judged = set(measured.judged(1).tolist())
+    judged = set(measured.reported_on(1).tolist())
     found: list[tuple[int, np.ndarray, bool]] = []
     usable = measured.windows(1)
     for index, run in enumerate(measured.runs):

@@ -46,7 +46,7 @@ def shown_windows(
     """
     if steps is None:
         steps = max(settings.shown_steps, round(settings.shown_seconds / simulation.control_step))
-    starts = measured.judged(steps)
+    starts = measured.reported_on(steps)
     if not len(starts):
         return ()
     rng = np.random.default_rng

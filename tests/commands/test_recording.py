@@ -1,0 +1,174 @@
+"""Several logs in one recording: their order, rows, and which are held out."""
+
+import hydra
+import numpy as np
+import pytest
+import torch
+
+from torchrl_h2o.commands.close_the_loop import make_simulation
+from torchrl_h2o.commands.recording import read_recording, split_by_name
+from torchrl_h2o.data import write_ted
+from torchrl_h2o.data.readers.ted import to_ted
+from torchrl_h2o.residuals.measured.transitions import Measured
+
+LAYOUT = """
+dt: 0.01
+separator: ","
+header: true
+columns:
+  - {name: pivot, role: observation, unit: rad}
+  - {name: pivot_velocity, role: observation, unit: rad/s}
+  - {name: torque, role: action, unit: N·m}
+"""
+MODEL = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody><body><joint name="pivot" axis="0 1 0"/><geom size="0.1" pos="0 0 -0.5"/></body></worldbody>
+  <actuator><motor name="motor" joint="pivot"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def logs(tmp_path, monkeypatch):
+    """Logs a, b and c of 10, 20 and 30 rows in a folder, each with values of its own."""
+    (tmp_path / "logs").mkdir()
+    for start, name, rows in ((0, "a", 10), (1000, "b", 20), (2000, "c", 30)):
+        values = start + np.arange(3.0 * rows).reshape(rows, 3)
+        path = tmp_path / "logs" / f"{name}.csv"
+        np.savetxt(path, values, delimiter=",", header="pivot,pivot_velocity,torque", comments="")
+    (tmp_path / "log.yaml").write_text(LAYOUT)
+    (tmp_path / "robot.xml").write_text(MODEL)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def read(*overrides):
+    with hydra.initialize_config_module("torchrl_h2o.config", version_base=None):
+        mjcf = ["simulator=mjcf", "simulator.path=robot.xml", "columns=log.yaml"]
+        cfg = hydra.compose("close_the_loop", [*mjcf, *overrides])
+        recording = read_recording(cfg)
+        return recording, make_simulation(cfg, recording)
+
+
+@pytest.mark.parametrize(
+    "data", ["[logs/a.csv,logs/b.csv,logs/c.csv]", "logs/*.csv", "logs", "['logs/[ab].csv',logs/c.csv]"]
+)
+def test_a_list_a_glob_and_a_folder_are_runs_of_their_own(logs, data):
+    recording, simulation = read(f"data={data}", "held_out=0.25")
+    assert recording.logs == ("a.csv", "b.csv", "c.csv")
+    assert recording.transitions["log"].dtype == torch.int64
+    assert recording.transitions["log"].bincount().tolist() == [9, 19, 29]
+    assert recording.transitions["next", "done"].flatten().nonzero().flatten().tolist() == [8, 27, 56]
+    measured = Measured.from_ted(recording.transitions, simulation)
+    assert [rows.stop - rows.start for rows in measured.runs] == [9, 19, 29]
+    assert recording.reported_on == 0.25
+    assert recording.held_out_logs == ()
+
+
+@pytest.mark.parametrize(
+    ("data", "held_out"),
+    [
+        ("logs", "[a.csv]"),
+        ("logs", "a.csv"),
+        ("logs/*.csv", "[logs/a.csv]"),
+        ("logs", "'a*'"),
+        ("[logs/b.csv,logs/c.csv]", "[logs/a.csv]"),
+        ("[logs/b.csv,logs/c.csv]", "'logs/a*'"),
+    ],
+)
+def test_logs_held_out_by_name_come_last(logs, data, held_out):
+    recording, simulation = read(f"data={data}", f"held_out={held_out}")
+    assert recording.logs == ("b.csv", "c.csv", "a.csv")
+    assert recording.held_out == recording.held_out_logs == ("a.csv",)
+    assert recording.source.endswith("all 57 rows; held out: a.csv")
+    measured = Measured.from_ted(recording.transitions, simulation, held_out=recording.reported_on)
+    assert measured.observation[measured.held_out].max() < 1000 <= measured.observation[~measured.held_out].min()
+
+
+def test_logs_of_the_same_name_are_told_apart(logs):
+    (logs / "other").mkdir()
+    (logs / "logs" / "a.csv").rename(logs / "other" / "b.csv")
+    recording, _ = read("data=[logs/b.csv,other/b.csv]", "held_out=[other/b.csv]")
+    assert recording.logs == ("logs/b.csv", "other/b.csv")
+    assert recording.held_out == ("other/b.csv",)
+
+
+def test_rows_are_selected_of_each_log(logs):
+    recording, _ = read("data=logs", "first_row=5", "transitions=6")
+    assert recording.transitions["log"].bincount().tolist() == [4, 6, 6]
+    assert recording.transitions["next", "truncated"].flatten().nonzero().flatten().tolist() == [3, 9, 15]
+    assert recording.source == "logs, 16 of 57 rows, from row 5 of each"
+    with pytest.raises(ValueError, match=r"first_row=9 .* select none of the 9 rows of a.csv"):
+        read("data=logs", "first_row=9")
+
+
+def test_a_single_log_and_a_data_set_have_one_log(logs):
+    recording, _ = read("data=logs/c.csv")
+    assert recording.logs == ("c.csv",)
+    assert recording.transitions["log"].unique().tolist() == [0]
+    ends = np.zeros(20, bool)
+    values = np.arange(21.0)[:, None].repeat(2, 1)
+    td = to_ted(
+        observation=values[:-1], action=values[:-1, :1], next_observation=values[1:], terminated=ends, truncated=ends
+    )
+    write_ted(td, logs / "ted")
+    recording, _ = read(
+        "data=ted", "columns=null", "simulator.coordinates=[pivot,pivot_velocity]", "simulator.control_step=0.01"
+    )
+    assert recording.logs == ("ted",)
+    assert recording.transitions["log"].unique().tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("data", "held_out", "message"),
+    [
+        ("logs", "[z.csv]", "held_out=z.csv: there is no such file, and the data are a.csv, b.csv, c.csv"),
+        ("logs", "[a.csv,b.csv,c.csv]", "leaves no log for the fit"),
+        ("logs", "'z*'", "no file has such a name"),
+        ("logs/d*.csv", "0.3", "no file has such a name"),
+        ("[]", "0.3", "the list of data is empty"),
+    ],
+)
+def test_logs_that_are_not_there_are_named(logs, data, held_out, message):
+    with pytest.raises(ValueError, match=message):
+        read(f"data={data}", f"held_out={held_out}")
+
+
+def test_a_recording_of_one_run_cannot_be_split_by_name():
+    with hydra.initialize_config_module("torchrl_h2o.config", version_base=None):
+        cfg = hydra.compose("close_the_loop", ["held_out=[c.csv]"])
+    with pytest.raises(ValueError, match="data=recorded is one run; give a share"):
+        read_recording(cfg)
+
+
+def test_each_file_is_taken_once(logs):
+    sources, held_out = split_by_name(["logs", "logs/a.csv"], ["logs/c.csv", "c.csv"])
+    assert [str(one) for one in sources] == ["logs/a.csv", "logs/b.csv", "logs/c.csv"]
+    assert held_out == ("c.csv",)
+
+
+def test_a_free_motion_has_the_model_s_actuators_at_zero(logs):
+    text = LAYOUT.replace("header: true", "header: true\nother_columns: ignore\nfree_motion: true")
+    (logs / "log.yaml").write_text("\n".join(line for line in text.splitlines() if "torque" not in line))
+    recording, simulation = read("data=logs")
+    assert recording.transitions["action"].shape == (57, 0)
+    free = recording.for_model(simulation.model)
+    assert free.transitions["action"].shape == (57, 1)
+    assert not free.transitions["action"].any()
+    assert recording.transitions["action"].shape == (57, 0)
+    Measured.from_ted(free.transitions, simulation)
+    assert read("data=logs")[0].for_model(simulation.model).logs == recording.logs
+
+
+def test_an_estimated_velocity_is_part_of_the_recording(logs):
+    text = LAYOUT.replace(
+        "{name: pivot_velocity, role: observation, unit: rad/s}", "{name: pivot_velocity, role: ignore}"
+    )
+    text += "  - {name: rate, role: observation, derivative_of: pivot}\n"
+    (logs / "log.yaml").write_text(text)
+    recording, _ = read("data=logs", "simulator.coordinates={rate: pivot_velocity}")
+    (estimate,) = recording.estimated
+    assert (estimate.name, estimate.position, estimate.unit) == ("rate", "pivot", "rad/s")
+    assert "rate was not measured: it is estimated from pivot, with an error of" in estimate.words()
+    torch.testing.assert_close(recording.transitions["observation"][:, 1], torch.full((39,), 300.0), rtol=1e-3, atol=0)

@@ -1,0 +1,71 @@
+"""Writes a first YAML file for the columns of a log: ``close-the-loop --guess data=log.csv [simulator=robot.xml]``."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+
+from torchrl_h2o.data import DataError, sources_of
+from torchrl_h2o.data.readers.guess.layout_text import Coordinates, guess_layout
+from torchrl_h2o.data.readers.robot_log import read_robot_log
+from torchrl_h2o.residuals.simulation.state_map import coordinate_names
+
+GUESS = "--guess"
+
+
+def guess_columns(arguments: Sequence[str]) -> None:
+    """Writes the guessed layout of a log, and prints what to do next.
+
+    Args:
+        arguments: ``--guess``, ``data=``, and optionally ``simulator=``, an MJCF file whose joints are matched, and
+            ``columns=``, the file to write: by default the log's name with the suffix .yaml, in the working directory.
+
+    Raises:
+        ValueError: for missing or other arguments, or a file that is not a model.
+        torchrl_h2o.data.DataError: if the log cannot be read as a table, or the file to write exists.
+    """
+    given = {name: value for name, _, value in (argument.partition("=") for argument in arguments if argument != GUESS)}
+    unknown = [name for name in given if name not in ("data", "simulator", "columns")]
+    if unknown or "data" not in given:
+        problem = f"{unknown[0]} is not an option of --guess" if unknown else "the log is missing"
+        raise ValueError(
+            f"{problem}; write close-the-loop --guess data=log.csv [simulator=robot.xml] [columns=log.yaml]"
+        )
+    log = Path(sources_of(given["data"].strip("[]").split(","))[0])
+    path = Path(given.get("columns", f"{log.stem}.yaml"))
+    guessed = guess_layout(log, _coordinates_of(given["simulator"]) if "simulator" in given else None)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(guessed.text)
+    except FileExistsError:
+        problem = "the file exists and is not overwritten"
+        raise DataError(problem, "remove it, or choose another name with columns=", source=path) from None
+    print(
+        f"{path} describes the columns of {log}; correct it, then run\n\n{_command(given, path, guessed.coordinates)}"
+    )
+    try:
+        read_robot_log(log, path)
+    except DataError as error:
+        print(f"\nNot yet readable: {error}")
+
+
+def _coordinates_of(simulator: str) -> Coordinates:
+    try:
+        model = mujoco.MjModel.from_xml_path(simulator)
+    except ValueError as error:
+        raise ValueError(f"simulator={simulator} is not an MJCF file that MuJoCo reads: {error}") from None
+    names, units = coordinate_names(model)
+    return Coordinates(
+        dict(zip(names, units, strict=True)), [model.actuator(i).name or str(i) for i in range(model.nu)]
+    )
+
+
+def _command(given: dict[str, str], path: Path, coordinates) -> str:
+    words = [f"simulator={given.get('simulator', 'robot.xml')}", f"data={given['data']}", f"columns={path}"]
+    if coordinates:
+        pairs = ", ".join(f"{name}: {other}" for name, other in coordinates.items())
+        words.append(f"simulator.coordinates={{{pairs}}}")
+    return shlex.join(["close-the-loop", *words])

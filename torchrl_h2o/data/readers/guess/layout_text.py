@@ -1,0 +1,211 @@
+"""Write the guessed layout of a log as YAML, with comments that say what to check."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
+from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns
+from torchrl_h2o.data.readers.units import to_si
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The coordinates and actuators of a model, for their names and units.
+
+    Args:
+        units: the unit of each coordinate by its name, positions before velocities; velocities end in ``_velocity``.
+        actuators: the actuators' names.
+    """
+
+    units: Mapping[str, str]
+    actuators: Sequence[str]
+
+
+@dataclass(frozen=True)
+class GuessedLayout:
+    """A guess for the user to correct.
+
+    Args:
+        text: the YAML file.
+        coordinates: the model's coordinate of each observed column whose name differs; empty without a model.
+    """
+
+    text: str
+    coordinates: Mapping[str, str]
+
+
+def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedLayout:
+    """Guess the layout of a log from the names and values of its columns.
+
+    Args:
+        path: the log, in any format.
+        model: the coordinates to which the observed columns are matched by name, or by order if there are as many.
+
+    Raises:
+        DataError: for a file that cannot be read as a table.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from torchrl_h2o.data.readers.guess import guess_layout
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+        >>> _ = path.write_text("t,hip,hip_vel,tau\\n0,0,1,0\\n0.01,0.01,1,0\\n0.02,0.02,1,0\\n")
+        >>> print(guess_layout(path).text.split("columns:")[1])
+        <BLANKLINE>
+          - {name: "t", role: time, unit: "s"}  # check: the median step is 0.01, which is 0.01 s, 100 Hz
+          - {name: "hip", role: observation, unit: "rad"}  # check the unit: the largest value is 0.02
+          - {name: "hip_vel", role: observation, unit: "rad/s"}  # slope of hip: 1 times this; check ...
+          - {name: "tau", role: action, unit: "N·m"}  # check the unit: the largest value is 0
+        <BLANKLINE>
+    """
+    contents = read_contents(path)
+    columns = _one_set(guess_columns(contents.values))
+    if model is not None and not contents.named:
+        columns = _by_order(columns, model)
+    pairs = _pairs(columns)
+    found = {} if model is None else _coordinates(columns, pairs, model)
+    units = {column.name: column.unit for column in columns}
+    columns = [_checked(column, contents, pairs, found, model, units) for column in columns]
+    return GuessedLayout(
+        _text(path, contents, columns, pairs), {name: other for name, other in found.items() if name != other}
+    )
+
+
+def _one_set(columns: Sequence[Guess]) -> list[Guess]:
+    """Keep the first set of actions, of positions and of velocities: logs have commanded and measured ones."""
+    kept: dict[tuple[str, str], str] = {}
+    result = []
+    for column in columns:
+        digits = "".join(sign for sign in column.name if sign.isdigit())
+        rest = "".join(sign for sign in column.name if not sign.isdigit())
+        key = (column.kind, digits)
+        if column.kind in ("action", "position", "velocity") and digits and kept.setdefault(key, rest) != rest:
+            note = f"looks like another {column.kind}; swap the roles if this is the one to use"
+            column = replace(column, kind="unknown", note=note)
+        result.append(column)
+    return result
+
+
+def _by_order(columns: Sequence[Guess], model: Coordinates) -> list[Guess]:
+    """Without names: positions, velocities and actions in the model's order, after a time if there is one more."""
+    kinds = ["velocity" if name.endswith("_velocity") else "position" for name in model.units]
+    kinds += ["action"] * len(model.actuators)
+    units = [*model.units.values(), *["1"] * len(model.actuators)]
+    names = [*model.units, *model.actuators]
+    if len(columns) == len(kinds) + 1:
+        kinds, units, names = ["time", *kinds], ["s", *units], ["time", *names]
+    if len(columns) != len(kinds):
+        return list(columns)
+    note = "guessed from the model's order; check"
+    return [Guess(*parts, note=note) for parts in zip(names, kinds, units, names, strict=True)]
+
+
+def _pairs(columns: Sequence[Guess]) -> dict[str, str]:
+    """Return the position of each velocity: by the rest of their names, or by order if as many are left."""
+    positions = [column for column in columns if column.kind == "position"]
+    velocities = [column for column in columns if column.kind == "velocity"]
+    pairs: dict[str, str] = {}
+    for velocity in velocities:
+        same = [p.name for p in positions if p.stem == velocity.stem and p.name not in pairs.values()]
+        if len(same) == 1:
+            pairs[velocity.name] = same[0]
+    rest = [p.name for p in positions if p.name not in pairs.values()]
+    alone = [v.name for v in velocities if v.name not in pairs]
+    return pairs | (dict(zip(alone, rest, strict=True)) if len(alone) == len(rest) else {})
+
+
+def _coordinates(columns: Sequence[Guess], pairs: Mapping[str, str], model: Coordinates) -> dict[str, str]:
+    """Return the coordinate of each position and velocity, also of the velocities that are to be estimated."""
+    joints = [name for name in model.units if not name.endswith("_velocity")]
+    positions = [column.name for column in columns if column.kind == "position"]
+    found: dict[str, str] = {}
+    for joint in sorted(joints, key=len, reverse=True):
+        like = [name for name in positions if joint.lower() in name.lower() and name not in found]
+        if like:
+            found[min(like, key=len)] = joint
+    if not found and len(positions) == len(joints):
+        found = dict(zip(positions, joints, strict=True))
+    velocity_of = {position: velocity for velocity, position in pairs.items()}
+    for position, joint in list(found.items()):
+        if f"{joint}_velocity" in model.units:
+            found[velocity_of.get(position, _estimated(position))] = f"{joint}_velocity"
+    return found
+
+
+def _checked(
+    column: Guess,
+    contents: Contents,
+    pairs: Mapping[str, str],
+    found: Mapping[str, str],
+    model: Coordinates | None,
+    units: Mapping[str, str],
+) -> Guess:
+    """Return the column with the unit of its coordinate or position, and with the slope of its position in the note."""
+    note, unit = column.note, column.unit
+    if column.name in pairs and to_si(unit)[0] != f"{to_si(units[pairs[column.name]])[0]}/s":
+        unit = f"{to_si(units[pairs[column.name]])[0]}/s"
+    coordinate = found.get(column.name)
+    if coordinate is not None and model is not None:
+        if to_si(unit)[0] != to_si(model.units[coordinate])[0]:
+            unit = model.units[coordinate]
+        note = f"{coordinate} of the model; {note}".rstrip("; ")
+    position, time = contents.values.get(pairs.get(column.name, "")), _time(contents)
+    values = contents.values.get(column.name)
+    if position is not None and values is not None and time is not None and values.any():
+        slope = np.gradient(position) / np.where(np.gradient(time) == 0, np.nan, np.gradient(time))
+        good = np.isfinite(slope)
+        factor = float(slope[good] @ values[good] / (values[good] @ values[good]))
+        note = f"slope of {pairs[column.name]}: {factor:.3g} times this; {note}"
+    return replace(column, unit=unit, note=note)
+
+
+def _time(contents: Contents) -> np.ndarray | None:
+    """The time column in s."""
+    for guess in guess_columns(contents.values):
+        values = contents.values[guess.name]
+        if guess.kind == "time" and values is not None:
+            return values * to_si(guess.unit)[1]
+    return None
+
+
+def _estimated(position: str) -> str:
+    return f"{position}_velocity"
+
+
+def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs: Mapping[str, str]) -> str:
+    kinds = [column.kind for column in columns]
+    lines = [
+        f"# The columns of {Path(path).name}, guessed from its names and values. Check every line: the unit in the",
+        "# file, which is converted to SI, and the role (observation, action, reward, done, time or ignore).",
+        *(f"{name}: {value}" for name, value in contents.options.items()),
+    ]
+    if "time" not in kinds:
+        lines.append("dt: 0.01  # no column of time was found: give the time between two rows in s")
+    if "action" not in kinds:
+        lines.append("free_motion: true  # no column of actions was found: remove this line if there is one")
+    steps = np.diff(time) if (time := _time(contents)) is not None else np.zeros(0)
+    jumps = int((np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)).sum()) if len(steps) else 0
+    if jumps:
+        lines.append(
+            f"on_time_jump: split  # {jumps} of {len(steps)} time steps differ by more than half: runs end there"
+        )
+    lines.append("columns:")
+    for column in columns:
+        role = {"position": "observation", "velocity": "observation"}.get(column.kind, column.kind)
+        note = column.note
+        if role == "desired":
+            role, note = "ignore", "a desired value; the role is action if the model's actuators are servos"
+        elif role == "unknown":
+            role, note = "ignore", note or "not recognised: observation, action or ignore?"
+        unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""
+        comment = f"  # {note}" if note else ""
+        lines.append(f'  - {{name: "{column.name}", role: {role}{unit}}}{comment}')
+    for column in columns:
+        if column.kind == "position" and column.name not in pairs.values():
+            entry = f'name: "{_estimated(column.name)}", role: observation, derivative_of: "{column.name}"'
+            lines.append(f"  - {{{entry}}}  # no such column was found: it is estimated")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,151 @@
+"""Guess what each column of a log is, from its name, its unit in brackets, and its values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchrl_h2o.data.readers.units import UNITS, to_si
+
+_WORDS = {
+    "time": ("t", "time", "timestamp", "stamp", "secs", "seconds", "millis", "clock"),
+    "done": ("done", "terminal", "terminated", "fallen"),
+    "reward": ("reward",),
+    "command": ("cmd", "command", "commanded"),
+    "desired": ("des", "desired", "ref", "reference", "target", "goal", "setpoint", "sp"),
+    "velocity": (
+        "vel",
+        "velocity",
+        "velocities",
+        "dot",
+        "qd",
+        "dq",
+        "qdot",
+        "omega",
+        "speed",
+        "rate",
+        "gyro",
+        "v",
+        "w",
+    ),
+    "action": ("tau", "torque", "torques", "u", "effort", "input", "action", "act", "force", "current"),
+    "position": (
+        *("pos", "position", "positions", "angle", "q", "theta", "phi", "psi", "roll", "pitch", "yaw", "alpha", "beta"),
+        *("x", "y", "z", "height", "encoder", "enc", "joint", "hip", "knee", "ankle", "elbow", "shoulder", "wrist"),
+    ),
+}
+_WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
+_LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
+_SI = {"position": "rad", "velocity": "rad/s"}
+_LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What a column may be.
+
+    Args:
+        name: the column.
+        kind: one of time, done, reward, position, velocity, action, desired, or unknown.
+        unit: its unit.
+        stem: the name without the words of its kind and its unit, by which positions and velocities are paired.
+        note: what the user should check; empty if nothing is doubtful.
+    """
+
+    name: str
+    kind: str
+    unit: str = "1"
+    stem: str = ""
+    note: str = ""
+
+
+def guess_columns(values: Mapping[str, np.ndarray | None]) -> list[Guess]:
+    """Guess the kind and unit of each column; at most one is the time.
+
+    Args:
+        values: the numbers of each column by name; None for a column that is not numbers.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_h2o.data.readers.guess.roles import guess_columns
+        >>> found = guess_columns({"t_ms": np.arange(5.0), "hip_vel (deg/s)": np.ones(5), "mode": None})
+        >>> [(column.kind, column.unit) for column in found]
+        [('time', 'ms'), ('velocity', 'deg/s'), ('unknown', '1')]
+    """
+    found = [_guess(name, numbers) for name, numbers in values.items()]
+    for kind in ("time", "done", "reward"):
+        same = [i for i, guess in enumerate(found) if guess.kind == kind]
+        for i in same[1:]:
+            found[i] = replace(found[i], kind="unknown", note=f"another column of {kind}")
+    return found
+
+
+def _guess(name: str, numbers: np.ndarray | None) -> Guess:
+    if numbers is None:
+        return Guess(name, "unknown", note="not numbers")
+    plain, unit = _without_unit(name)
+    words = _words(plain)
+    kind = _kind(words, numbers)
+    stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
+    if kind == "time":
+        return Guess(name, kind, *_unit_of_time(numbers, unit))
+    if unit is not None:
+        return Guess(name, kind, unit, stem)
+    unit, note = _unit_of(kind, words, numbers)
+    return Guess(name, kind, unit, stem, note)
+
+
+def _kind(words: list[str], numbers: np.ndarray) -> str:
+    fits = {kind for kind, known in _WORDS.items() if any(word in known for word in words)}
+    if "time" in fits and not ((np.diff(numbers) >= 0).mean() > 0.9 and np.ptp(numbers) > 0):
+        fits.remove("time")
+    if fits & {"desired", "command"}:
+        return "desired" if fits & {"position", "velocity"} else "action"
+    return next((kind for kind in _WORDS if kind in fits), "unknown")
+
+
+def _words(name: str) -> list[str]:
+    """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2."""
+    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+
+
+def _without_unit(name: str) -> tuple[str, str | None]:
+    """Split a name such as ``hip_vel (deg/s)``, ``hip[rad]`` or ``t_ms`` into the name and its unit, if it has one."""
+    bracket = re.search(r"[\[(]([^\])]+)[\])]\s*$", name)
+    candidates = [(bracket.start(), bracket.group(1))] if bracket else []
+    suffix = re.search(r"[_ .](deg|degs|rad|ms|us|ns|rpm|mm|cm|Nm|nm|mNm|rads|degps|radps)$", name)
+    if suffix:
+        spelled = {"rads": "rad/s", "radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "nm": "Nm"}
+        candidates.append((suffix.start(), spelled.get(suffix.group(1), suffix.group(1))))
+    for start, unit in candidates:
+        try:
+            to_si(unit)
+        except KeyError:
+            continue
+        if not unit.isdigit():  # q[1] is an entry, not a unit
+            return name[:start], unit
+    return name, None
+
+
+def _unit_of_time(numbers: np.ndarray, unit: str | None) -> tuple[str, str, str]:
+    step = float(np.median(np.diff(numbers)))
+    unit = unit or next(unit for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5), ("ns", np.inf)) if step <= most)
+    seconds = step * UNITS[unit][1]
+    rate = f", {1 / seconds:.4g} Hz" if seconds > 0 else ""
+    return unit, "", f"check: the median step is {step:.4g}, which is {seconds:.4g} s{rate}"
+
+
+def _unit_of(kind: str, words: Iterable[str], numbers: np.ndarray) -> tuple[str, str]:
+    unit, largest = _SI.get(kind, "1"), float(np.abs(numbers).max())
+    if kind == "action":
+        unit = "A" if "current" in words else "N" if "force" in words else "N·m"
+    elif kind not in ("position", "velocity"):
+        return unit, ""
+    elif any(word in _LENGTHS for word in words):
+        unit = unit.replace("rad", "m")
+    elif kind == "position" and largest > _LARGEST_ANGLE:
+        return "deg", f"check the unit: the largest value is {largest:.3g}, which is much for rad"
+    return unit, f"check the unit: the largest value is {largest:.3g}"

@@ -1,0 +1,169 @@
+"""Link the rows of a log into transitions: where a run ends, restarts, or has a gap in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.log_columns import LogColumns
+from torchrl_h2o.data.readers.log_table import LogTable
+from torchrl_h2o.data.readers.settings import ReaderSettings
+
+
+@dataclass(frozen=True)
+class Links:
+    """The first rows of all transitions and their flags.
+
+    Args:
+        start: index of the first row of each transition, (T,); the second row is the next one of the log.
+        terminated: whether the second row has done = 1, (T,).
+        truncated: whether the run ends after the transition although done is 0, (T,).
+        dropped: number of rows that belong to no transition.
+        dt: time between two rows in s.
+    """
+
+    start: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    dropped: int
+    dt: float
+
+    @classmethod
+    def of(cls, linked: np.ndarray, done: np.ndarray, dt: float) -> Links:
+        """Build the links of the pairs of rows (t, t + 1) for which ``linked``, (rows - 1,), is true."""
+        start = np.flatnonzero(linked)
+        terminated = done[start + 1]
+        continues = np.append(linked, False)[start + 1]
+        used = np.zeros(len(done), bool)
+        used[start] = used[start + 1] = True
+        return cls(start, terminated, ~terminated & ~continues, int((~used).sum()), dt)
+
+    @property
+    def runs(self) -> list[slice]:
+        """The rows of each unbroken run."""
+        if not len(self.start):
+            return []
+        ends = np.flatnonzero(np.diff(self.start) > 1)
+        firsts, lasts = self.start[np.append(0, ends + 1)], self.start[np.append(ends, -1)]
+        return [slice(int(first), int(last) + 2) for first, last in zip(firsts, lasts, strict=True)]
+
+    def between(self, rows: np.ndarray) -> Links:
+        """The links whose two rows are both in a mask, (rows,); a run that is cut off by it is truncated."""
+        linked, done = np.zeros(len(rows) - 1, bool), np.zeros(len(rows), bool)
+        linked[self.start] = rows[self.start] & rows[self.start + 1]
+        done[self.start + 1] = self.terminated
+        return Links.of(linked, done, self.dt)
+
+
+def link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> Links:
+    """Link the rows of a log into transitions.
+
+    Args:
+        table: the numbers of the log.
+        layout: the columns of time and done, dt, and what to do at a jump in time and after done.
+        settings: the tolerance of the clock.
+
+    Raises:
+        DataError: for time that does not increase, a time step or a restart that the layout does not allow, a done
+            other than 0 and 1, or a log without any transition.
+    """
+    done = _done(table, layout)
+    linked = ~done[:-1]
+    _require_declared_restart(table, layout, done)
+    if layout.after_done == "drop" and done.any():
+        linked[np.argmax(done) :] = False
+    jumps, dt = _jumps(table, layout, linked, settings)
+    linked &= ~jumps
+    if not linked.any():
+        raise DataError(
+            "no two rows make a transition",
+            "record more, or correct done, time_tolerance or on_time_jump",
+            source=table.source,
+        )
+    return Links.of(linked, done, dt)
+
+
+def _done(table: LogTable, layout: LogColumns) -> np.ndarray:
+    column = layout.named("done")
+    if column is None:
+        return np.zeros(len(table.rows), bool)
+    values = table.columns([column.name])[:, 0]
+    wrong = np.flatnonzero((values != 0) & (values != 1))
+    if len(wrong):
+        raise DataError(
+            f"done is {values[wrong[0]]:g}",
+            "it must be 0 or 1",
+            source=table.source,
+            column=column.name,
+            row=int(table.rows[wrong[0]]),
+        )
+    return values.astype(bool)
+
+
+def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndarray) -> None:
+    column, restarts = layout.named("done"), np.flatnonzero(done[:-1] & ~done[1:])
+    if column is not None and len(restarts) and layout.after_done == "error":
+        raise DataError(
+            "done falls back to 0 after the run has ended",
+            "state how to treat these rows: after_done: drop, or after_done: new_episode",
+            source=table.source,
+            column=column.name,
+            row=int(table.rows[restarts[0] + 1]),
+        )
+
+
+def _jumps(
+    table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings
+) -> tuple[np.ndarray, float]:
+    """Return a mask of the linked pairs of rows whose time step is not dt, and dt.
+
+    Raises:
+        DataError: at such a pair, unless the layout splits there.
+    """
+    column = layout.named("time")
+    if column is None:
+        return np.zeros(len(linked), bool), cast("float", layout.dt)  # a layout has dt or a time column
+    time = table.columns([column.name])[:, 0]
+    steps = np.diff(time)
+    place: dict[str, Any] = {"source": table.source, "column": column.name}
+    backwards = np.flatnonzero(linked & (steps <= 0))
+    if len(backwards):
+        index = backwards[0]
+        raise DataError(
+            f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
+            "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
+            "end of the file with zeros",
+            row=int(table.rows[index + 1]),
+            **place,
+        )
+    dt = _dt(steps[linked], layout, place, settings)
+    jumps = linked & (np.abs(steps - dt) > layout.time_tolerance * dt)
+    if jumps.any() and layout.on_time_jump == "error":
+        index = np.argmax(jumps)
+        raise DataError(
+            f"the time step is {steps[index]:.9g} s, dt is {dt:.9g} s",
+            "correct dt, widen time_tolerance, or set on_time_jump: split",
+            row=int(table.rows[index + 1]),
+            **place,
+        )
+    return jumps, dt
+
+
+def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any], settings: ReaderSettings) -> float:
+    """Return the layout's dt after comparing it with the steps between linked rows; without it, their median."""
+    if layout.dt is None or not len(steps):
+        return float(np.median(steps)) if len(steps) else 0.0
+    median = float(np.median(steps))
+    # at 300 Hz a clock with a resolution of 1 ms gives steps of 3, 3, 4 ms; then the mean without gaps is accurate
+    mean = float(np.mean(steps[steps <= settings.longest_regular_step * median]))
+    # time_tolerance is for single late rows and would accept a dt that is wrong throughout
+    if min(abs(median - layout.dt), abs(mean - layout.dt)) > settings.clock_tolerance * layout.dt:
+        raise DataError(
+            f"the median time step is {median:.9g} s, dt is {layout.dt:.9g} s",
+            "correct dt or the unit of time, or omit dt to use the median",
+            **place,
+        )
+    return layout.dt

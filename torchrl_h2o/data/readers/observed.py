@@ -1,0 +1,117 @@
+"""The observations of a log's rows: measured columns, and velocities that are estimated from positions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl import torchrl_logger
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.log_columns import LogColumns
+from torchrl_h2o.data.readers.log_links import Links
+from torchrl_h2o.data.readers.log_table import LogTable
+from torchrl_h2o.data.readers.units import to_si
+from torchrl_h2o.data.readers.velocity import estimate_velocity
+
+
+def observe(table: LogTable, layout: LogColumns, links: Links) -> tuple[np.ndarray, list[float], Links]:
+    """Return the observations of all rows, estimating the velocities that are not in the file.
+
+    Args:
+        table: the numbers of the log.
+        layout: the observed columns.
+        links: the transitions, which determine the unbroken runs.
+
+    Returns:
+        Observations (rows, n) in SI; the standard deviation of each column's error, 0 for measured columns; and the
+        links between rows that have an estimate.
+
+    Raises:
+        DataError: for runs that are too short for an estimate.
+    """
+    columns, stds = [], []
+    known = np.ones(len(table.rows), bool)
+    units = {column.name: to_si(column.unit)[0] for column in layout.columns}
+    for name in layout.observation:
+        position = layout.derivatives.get(name)
+        if position is None:
+            columns.append(table.columns([name])[:, 0])
+            stds.append(0.0)
+            continue
+        values = table.columns([position])[:, 0]
+        try:
+            found = estimate_velocity(values, links.runs, links.dt, angle=units[position] == "rad")
+        except ValueError as error:
+            raise DataError(str(error), "record longer runs", source=table.source, column=name) from error
+        torchrl_logger.info(
+            f"{table.source}: {name} is estimated from {position} over {found.window} rows, error {found.std:.3g} "
+            f"{velocity_unit(units[position])}; {found.window // 2} rows at each end of a run are left out"
+        )
+        known &= np.isfinite(found.velocity)
+        columns.append(np.nan_to_num(found.velocity))
+        stds.append(found.std)
+    kept = links.between(known) if layout.derivatives else links
+    if not len(kept.start):
+        raise DataError("no two rows have an estimated velocity", "record longer runs", source=table.source)
+    return np.stack(columns, axis=1), stds, kept
+
+
+@dataclass(frozen=True)
+class EstimatedVelocity:
+    """An observed column that was estimated, for reports.
+
+    Args:
+        name: the column.
+        position: the column that it is the derivative of.
+        std: standard deviation of its error, root mean square over the transitions.
+        unit: unit of the error.
+    """
+
+    name: str
+    position: str
+    std: float
+    unit: str
+
+    def words(self) -> str:
+        """Return a sentence for a report.
+
+        Example:
+            >>> from torchrl_h2o.data.readers.observed import EstimatedVelocity
+            >>> EstimatedVelocity("hip_velocity", "hip", 0.0123, "rad/s").words()[:71]
+            'hip_velocity was not measured: it is estimated from hip, with an error '
+        """
+        return (
+            f"{self.name} was not measured: it is estimated from {self.position}, with an error of {self.std:.2g} "
+            f"{self.unit} (standard deviation)."
+        )
+
+
+def estimated_velocities(td: TensorDictBase, layout: LogColumns) -> tuple[EstimatedVelocity, ...]:
+    """Return the estimated columns of a log's transitions.
+
+    Args:
+        td: transitions of batch size [T] from :func:`~torchrl_h2o.data.read_robot_log`.
+        layout: the layout that they were read with.
+    """
+    units = {column.name: to_si(column.unit)[0] for column in layout.columns}
+    return tuple(
+        EstimatedVelocity(name, position, _rms(td["observation_std"][:, _place(layout.observation, name)]), unit)
+        for name, position in layout.derivatives.items()
+        for unit in [velocity_unit(units[position])]
+    )
+
+
+def velocity_unit(unit: str) -> str:
+    """Return the unit of the derivative of a quantity: ``rad/s`` for ``rad``."""
+    return "1/s" if unit == "1" else f"{unit}/s"
+
+
+def _place(names: Sequence[str], name: str) -> int:
+    return list(names).index(name)
+
+
+def _rms(values) -> float:
+    return float(values.double().square().mean().sqrt())
