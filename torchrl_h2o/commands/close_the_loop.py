@@ -138,7 +138,8 @@ def run() -> None:
     """Entry point of the console command ``close-the-loop``."""
     if GUESS in sys.argv[1:]:
         with one_line_errors():
-            return guess_columns(sys.argv[1:])
+            guess_columns(sys.argv[1:])
+        return
     sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()
 
