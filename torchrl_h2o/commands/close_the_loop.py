@@ -21,6 +21,7 @@ from torchrl.envs import TransformedEnv
 
 from torchrl_h2o.commands.guess import GUESS, guess_columns
 from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
@@ -92,7 +93,7 @@ def main(cfg: DictConfig) -> None:
         known=() if cfg.start_from is None else Report.load(cfg.start_from).effects,
         so_far=lambda unfinished: write_json(unfinished, directory),
     )
-    if report.found:
+    if report.found and (report.verdict is None or report.verdict.recommended):
         report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
     report.save(directory)
     print_report(report, directory)
@@ -161,7 +162,8 @@ def expanded(argument: str) -> list[str]:
 def run() -> None:
     """Entry point of the console command ``close-the-loop``."""
     if GUESS in sys.argv[1:]:
-        guess_columns(sys.argv[1:])
+        with one_line_errors():
+            guess_columns(sys.argv[1:])
         return
     sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()

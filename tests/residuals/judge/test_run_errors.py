@@ -9,12 +9,14 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals.judge.held_out_error import overall_error
 from torchrl_h2o.residuals.judge.run_errors import run_errors
+from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
 REAL = SIMULATION.with_effects(Gravity(1.5))
 HALF = SIMULATION.with_effects(Gravity(1.25))
-MEASURED = recorded(REAL)  # 1500 transitions, the last 450 held out
+MEASURED = recorded(REAL)
+MEASURED = dataclasses.replace(MEASURED, split=np.repeat([Split.FIT, Split.SELECTION, Split.REPORT], [800, 250, 450]))
 RUNS = dataclasses.replace(MEASURED, run=np.repeat([0, 1, 2], [500, 700, 300]))
 
 

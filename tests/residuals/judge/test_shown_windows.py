@@ -8,12 +8,14 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import Gravity, JointDamping
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
 REAL = SIMULATION.with_effects(Gravity(1.5), JointDamping(0.1))
 MENDED = SIMULATION.with_effects(Gravity(1.5))
 MEASURED = recorded(REAL)
+ROWS = np.arange(len(MEASURED))
 
 
 def test_windows_are_ranked_by_the_error_with_the_effects_and_held_out():
@@ -21,7 +23,7 @@ def test_windows_are_ranked_by_the_error_with_the_effects_and_held_out():
     assert [window.rank for window in windows] == ["worst", "median", "best"]
     worst, median, best = windows
     assert worst.after > median.after > best.after
-    starts = MEASURED.judged(10)
+    starts = MEASURED.reported_on(10)
     missed = residuals(MENDED, MEASURED, starts, 10)[:, -1]
     change = MEASURED.following[starts + 9] - MEASURED.observation[starts]
     errors = np.sqrt(((missed / change.std(0)) ** 2).mean(-1))
@@ -55,14 +57,14 @@ def test_the_length_and_the_number_of_quantities_are_settings():
 
 
 def test_few_windows_are_shown_once_and_none_not_at_all():
-    few = dataclasses.replace(MEASURED, held_out=np.arange(len(MEASURED)) >= len(MEASURED) - 10)
+    few = dataclasses.replace(MEASURED, split=np.where(len(ROWS) - 10 <= ROWS, Split.REPORT, Split.FIT))
     assert [window.rank for window in shown_windows(SIMULATION, MENDED, few, 10)] == ["worst"]
-    none = dataclasses.replace(MEASURED, held_out=np.zeros(len(MEASURED), bool))
+    none = dataclasses.replace(MEASURED, split=np.full(len(ROWS), Split.FIT))
     assert shown_windows(SIMULATION, MENDED, none, 10) == ()
 
 
 def test_a_diverging_window_is_the_worst():
-    row = int(MEASURED.judged(10)[5])
+    row = int(MEASURED.reported_on(10)[5])
     observation = MEASURED.observation.copy()
     observation[row, 1] = 1e12
     broken = dataclasses.replace(MEASURED, observation=observation)

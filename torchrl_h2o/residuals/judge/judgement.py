@@ -57,10 +57,10 @@ class Judgement:
         alternatives: an entry for each part that has alternatives.
         two_sample: AUC of a classifier before and after.
         trace: the residual over time.
-        verdict: what these figures say.
-        failures: attempts that failed with an error, and why.
         windows: worst, median and best window, measured against simulated.
         runs: error of each run.
+        verdict: what these figures say.
+        failures: attempts that failed with an error, and why.
     """
 
     measured: Measured
@@ -111,11 +111,16 @@ def judge(
         ),
         two_sample=two_sample,
         trace=_residual_trace(simulation, mended, measured),
+        windows=shown_windows(simulation, mended, measured, _shown_steps(error, simulation), settings=settings.judge),
+        runs=run_errors(simulation, mended, measured, settings=settings.judge),
         verdict=reach_verdict(simulation, mended, measured, effects, error, two_sample, settings),
         failures=(*explanation.failures, *failures),
-        windows=shown_windows(simulation, mended, measured, settings=settings.judge),
-        runs=run_errors(simulation, mended, measured, settings=settings.judge),
     )
+
+
+def _shown_steps(error: ErrorSummary, simulation: Simulation) -> int | None:
+    """Control steps of the windows that the report shows: those of its sentence."""
+    return None if error.headline is None else round(error.headline.seconds / simulation.control_step)
 
 
 def _remaining_disturbances(
