@@ -19,6 +19,7 @@ from torchrl_h2o.residuals.report.windows import RunError
 from torchrl_h2o.residuals.report.words import (
     change,
     duration,
+    in_readable_unit,
     interval,
     interval_digits,
     number,
@@ -68,6 +69,7 @@ def report_page(report: ReportContents) -> str:
         sentence=sentence(report),
         change=change,
         duration=duration,
+        readable=in_readable_unit,
         parameters=_parameters,
         ranking=_ranking(report),
         shown_runs=sorted(report.runs, key=_worst_first)[:SHOWN_RUNS],
