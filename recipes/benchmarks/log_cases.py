@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl_h2o.data import load
 from torchrl_h2o.effects import ActionDelay, ActionLag, JointDamping, JointFrictionLoss, RollingResistance
 from torchrl_h2o.envs import WheelLeggedEnv
-from torchrl_h2o.residuals import Measured, Report, Simulation, residuals
+from torchrl_h2o.residuals import Measured, Report, Simulation, Split, residuals
 
 # RMSE 100 ms ahead of a direct linear predictor, in m/s, rad and rad/s, and the multiple of it to reach
 LINEAR_FLOOR = {"x_velocity": 0.067, "pitch": 0.021, "pitch_velocity": 0.27}
@@ -115,6 +115,6 @@ def judge_pendulum(report: Report, case: LogCase) -> dict:
 def median_window_error(simulation: Simulation, measured: Measured, seconds: float = WINDOW) -> float:
     """Median over held-out windows of the angle's RMS error within a window, rad."""
     horizon = round(seconds / simulation.control_step)
-    starts = measured.windows(horizon, horizon // 2, held_out=True)
+    starts = measured.windows(horizon, horizon // 2, split=Split.REPORT)
     errors = residuals(simulation, measured, starts, horizon)[:, :, 0]
     return float(np.median(np.sqrt((errors**2).mean(1))))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals import Report, Simulation
+from torchrl_h2o.residuals.report.contents import NOTHING_MISSING
 
 TINY = 1e-9  # values below this are rounded zeros, for which relative errors are undefined
 
@@ -90,7 +91,8 @@ def is_marked_undeclared(report: Report) -> bool:
 
 def says_nothing_is_missing(report: Report) -> bool:
     """Whether the report concludes that nothing is missing; a report without a conclusion does not."""
-    return not report.found and report.conclusion is None
+    said = report.verdict is None or report.verdict.kind == NOTHING_MISSING
+    return said and not report.found and report.conclusion is None
 
 
 def is_reported_as_group(report: Report, alike: Sequence[Effect]) -> bool:

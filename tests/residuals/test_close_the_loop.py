@@ -193,7 +193,7 @@ def test_what_is_in_the_simulator_is_not_found_again():
 
 
 def test_held_out_rows_are_not_fitted():
-    """Gravity changes at row 700, the first held-out one; the fit returns the value before it."""
+    """Gravity changes where the report's rows begin; the fit returns the value before it."""
     before, after = (recorded(SIMULATION.with_effects(Gravity(scale)), 1000) for scale in (1.3, 1.5))
     late = before.held_out[:, None]
     measured = replace(

@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 from torchrl_h2o.data import LogColumns, load, sources_of
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
 from torchrl_h2o.data.readers.sources import Source, is_log, names_of, unique, words_of
+from torchrl_h2o.residuals.measured.transitions import HELD_OUT
 from torchrl_h2o.training.real_data import RECORDED
 from torchrl_h2o.training.task import Task
 
@@ -32,14 +33,14 @@ class Recording:
         source: name of the data and the range of the selected rows.
         columns: description of the log's columns; None if the data are not a log.
         logs: names of the logs, or of the data set.
-        held_out: what no fit uses: a share of the transitions, from the end, or the names of logs.
+        held_out: what no fit and no choice uses: a share of the transitions, from the end, or the names of logs.
     """
 
     transitions: TensorDictBase
     source: str
     columns: LogColumns | None = None
     logs: tuple[str, ...] = ()
-    held_out: float | tuple[str, ...] = 0.3
+    held_out: float | tuple[str, ...] = HELD_OUT
 
     @property
     def held_out_logs(self) -> tuple[str, ...]:
@@ -47,12 +48,11 @@ class Recording:
         return self.held_out if isinstance(self.held_out, tuple) else ()
 
     @property
-    def held_out_share(self) -> float:
-        """Share of the transitions, from the end, that no fit uses."""
+    def held_out_indices(self) -> float | tuple[int, ...]:
+        """The share, or the indices in ``logs`` of the logs that are held out, as ``close_the_loop`` takes them."""
         if not isinstance(self.held_out, tuple):
             return self.held_out
-        held_out = torch.tensor([self.logs.index(name) for name in self.held_out])
-        return float(torch.isin(self.transitions["log"], held_out).double().mean())
+        return tuple(self.logs.index(name) for name in self.held_out)
 
     @property
     def estimated(self) -> tuple[EstimatedVelocity, ...]:

@@ -15,6 +15,8 @@ class EffectSettings:
         factors: scales that a trial multiplies a property of the model by.
         aligned: deviation of a direction cosine from 0 or 1 below which a joint's axis is perpendicular or parallel
             to the y axis.
+        large_factor: factor beyond which a wrong property of the model is surprising; see
+            :func:`~torchrl_h2o.effects.catalogue.plausibility.surprise`.
         inertia_change: relative change of a body's inertia above which a geom contributes to it.
     """
 
@@ -24,6 +26,7 @@ class EffectSettings:
     factors: tuple[float, ...] = (0.5, 0.8, 1.25, 2.0)
     aligned: float = 1e-3
     inertia_change: float = 1e-9
+    large_factor: float = 2.0
 
 
 EFFECT_SETTINGS = EffectSettings()

@@ -10,7 +10,7 @@ from torchrl_h2o.residuals.measured.initial_states import estimate_states, smoot
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.simulated_transitions import simulate_transitions
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -25,6 +25,7 @@ __all__ = [
     "Measured",
     "Report",
     "Simulation",
+    "Split",
     "StateMap",
     "close_the_loop",
     "estimate_states",

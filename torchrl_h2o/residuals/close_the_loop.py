@@ -6,20 +6,21 @@ Each stage takes the results of earlier stages and returns a new one; no stage c
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report, unfinished_report
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -34,21 +35,26 @@ def close_the_loop(
     catalogue: Sequence[CatalogueEntry] | None = None,
     *,
     source: str = "transitions",
-    held_out: float = 0.3,
+    held_out: float | Collection[int] = HELD_OUT,
     seed: int = 0,
     progress: bool = True,
+    known: Sequence[Effect] = (),
+    so_far: Callable[[Report], object] = lambda report: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Report:
-    """Finds what a simulator lacks from measured data, and judges it on data that no fit has used.
+    """Finds what a simulator lacks from measured data, and judges it on data that neither a fit nor a choice has used.
 
     Args:
         simulator: a TorchRL env of a Gymnasium MuJoCo task, with its gaps, or a :class:`Simulation`.
         data: transitions (T,) in TED, as the readers of :mod:`torchrl_h2o.data` return them, or :class:`Measured`.
         catalogue: effects to try; those of :meth:`Simulation.catalogue` by default.
         source: name of the data in the report.
-        held_out: share of the transitions, taken from the end, that is reserved for the judgement.
+        held_out: share of the transitions, taken from the end, on which errors are reported, or the indices of the
+            logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
+        known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
+        so_far: called with an unfinished report whenever an effect has been found and after each stage.
         settings: thresholds and budgets of all stages.
 
     Returns:
@@ -77,7 +83,16 @@ def close_the_loop(
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
         evidence = gather_evidence(simulation, measured, settings)
-        explanation = explain(evidence, entries, rng=np.random.default_rng(seed), progress=bar, settings=settings)
+        explanation = explain(
+            evidence,
+            entries,
+            rng=np.random.default_rng(seed),
+            progress=bar,
+            known=known,
+            so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
+            settings=settings,
+        )
+        so_far(unfinished_report(evidence, explanation, "the errors before and after were computed"))
         bar.set_description("reporting")
         judgement = judge(evidence, explanation, seed=seed, settings=settings)
         wall_s = time.perf_counter() - start
@@ -85,7 +100,11 @@ def close_the_loop(
 
 
 def read_measured(
-    data: TensorDictBase | Measured, simulation: Simulation, source: str, held_out: float, settings: LoopSettings
+    data: TensorDictBase | Measured,
+    simulation: Simulation,
+    source: str,
+    held_out: float | Collection[int],
+    settings: LoopSettings,
 ) -> Measured:
     """Measured transitions, checked against the simulation, with the sampling of the settings."""
     if isinstance(data, Measured):
@@ -99,6 +118,8 @@ def explain(
     *,
     rng: np.random.Generator,
     progress: tqdm,
+    known: Sequence[Effect] = (),
+    so_far: Callable[[Explanation, str], object] = lambda explanation, stage: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Explanation:
     """Explains the residual: effects of the catalogue, then a force outside it, then action noise.
@@ -108,15 +129,40 @@ def explain(
         catalogue: effects that the simulator may lack.
         rng: generator for screened windows and synthetic noise.
         progress: bar that counts screened entries and names the stage.
+        known: effects from which the search begins.
+        so_far: called with a preliminary explanation, and what was going on, as it grows.
         settings: thresholds and budgets.
 
     Returns:
         The explanation, without any parts if nothing is missing.
     """
     simulation, measured = evidence.simulation, evidence.undisturbed
-    trace = trace_effects(simulation, measured, catalogue, rng=rng, progress=progress, settings=settings)
-    progress.set_description("looking for undeclared forces")
+    trace = trace_effects(
+        simulation,
+        measured,
+        catalogue,
+        rng=rng,
+        progress=progress,
+        known=known,
+        found=lambda trace: so_far(Explanation.of(trace), "effects of the catalogue were tried"),
+        settings=settings,
+    )
     declared = Explanation.of(trace)
-    with_force = add_undeclared_force(simulation, measured, declared, rng=rng, settings=settings)
+    so_far(declared, "undeclared forces were looked for")
+    progress.set_description("looking for undeclared forces")
+    add_force = partial(add_undeclared_force, rng=rng, settings=settings)
+    with_force = _tried("an undeclared force", declared, lambda: add_force(simulation, measured, declared))
+    so_far(with_force, "action noise was looked for")
     progress.set_description("looking for action noise")
-    return add_action_noise(simulation, measured, with_force, settings)
+    return _tried("action noise", with_force, lambda: add_action_noise(simulation, measured, with_force, settings))
+
+
+def _tried(what: str, before: Explanation, search: Callable[[], Explanation]) -> Explanation:
+    """The result of a search, or the explanation before it with the search recorded as failed.
+
+    Data without variety, such as a constant action or collinear terms, may make the equations of a search singular.
+    """
+    try:
+        return search()
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return before.with_failure(f"the search for {what} failed: {error}")

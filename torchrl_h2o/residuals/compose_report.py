@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 from torchrl_h2o.effects import Effect
@@ -76,12 +77,36 @@ def compose_report(
         stop_test=stop_test(settings),
         wall_s=wall_s,
         trace=judgement.trace,
+        verdict=judgement.verdict,
+        failures=judgement.failures,
     )
 
 
 def inconclusive_report(simulation: Simulation, measured: Measured, reason: str) -> Report:
     """The report if the data or the simulator allow no conclusion."""
     return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
+
+
+def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) -> Report:
+    """The report of a run that is not finished: the effects so far, without errors.
+
+    Args:
+        evidence: the simulator and the data.
+        explanation: the effects so far.
+        stage: what was going on.
+    """
+    simulation = evidence.simulation
+    words = partial(effect_words, names={"entries": simulation.state_map.names, "actuators": simulation.actuators})
+    return Report(
+        simulator=simulation.name,
+        data=_data_summary(evidence.measured),
+        found=tuple(
+            FoundEffect(part.effect, part.declared, part.ci95, math.nan, words(part.effect))
+            for part in explanation.parts
+        ),
+        failures=explanation.failures,
+        unfinished=stage,
+    )
 
 
 def _fitted_together(explanation: Explanation) -> dict[Effect, Fitted]:

@@ -33,10 +33,12 @@ class Explanation:
     Args:
         parts: the effects in the order of their composition; empty if nothing is missing.
         trace: the search over the catalogue.
+        failures: attempts that failed with an error, and why.
     """
 
     parts: tuple[Part, ...]
     trace: Trace
+    failures: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, trace: Trace) -> Explanation:
@@ -46,6 +48,10 @@ class Explanation:
             for index, effect in enumerate(trace.fit.effects)
         )
         return cls(tuple(parts), trace)
+
+    def with_failure(self, failure: str) -> Explanation:
+        """The explanation with a further attempt that failed."""
+        return replace(self, failures=(*self.failures, failure))
 
     def with_parts(self, parts: Iterable[Part]) -> Explanation:
         """The explanation with other parts."""

@@ -14,6 +14,10 @@ class MeasuredSettings:
 
     min_transitions: int = 200
     """Usable transitions below which no conclusion is drawn: no test could distinguish an effect from chance."""
+    selection: float = 0.27
+    """Share of the transitions that are not reported on, by which effects are chosen; a fifth of all by default."""
+    border_moves: float = 0.1
+    """Share of the transitions by which a border between two parts of the data moves to the end of a run."""
     max_windows: int = 3500
     """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
     max_diverged: float = 0.1
@@ -106,16 +110,20 @@ class FitSettings:
 class HorizonSettings:
     """The choice of the window length for the search."""
 
-    horizons: tuple[int, ...] = (1, 5, 20)
-    """Window lengths to choose from, in control steps, ascending."""
-    windows: int = 60
-    """Number of windows screened at each length; longer windows are considered only if there are as many."""
-    entries_followed: int = 60
-    """Number of most promising entries that are screened again at the next length."""
-    clear_promise: float = 0.5
-    """Promise of the best entry, as a share of the loss, beyond which windows of greater length are not tried."""
-    longer_gain: float = 1.3
-    """Factor by which the promise must grow to justify longer windows, which cost more and amplify contact errors."""
+    seconds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+    """Window lengths to choose from, in s, ascending; one control step is always among them."""
+    windows: int = 100
+    """Largest number of windows by which a length is judged."""
+    min_fitted: int = 20
+    """Smallest number of windows for fits that a length must leave."""
+    min_selected: int = 8
+    """Smallest number of windows for the selection of effects that a length must leave."""
+    stands_out: float = 10.0
+    """Median error over the median error that sensor noise alone causes, beyond which no longer windows are tried."""
+    least_ratio: float = 1.5
+    """Smallest such ratio of windows longer than one step; a smaller one is chance."""
+    longer_gain: float = 1.2
+    """Factor by which this ratio must grow to justify longer windows, which cost more and amplify contact errors."""
 
 
 @dataclass(frozen=True)
@@ -136,11 +144,11 @@ class TraceSettings:
     """Largest number of rounds of growing and simplifying."""
     screened_steps: int = 400
     """Control steps, over all windows, on which entries are screened."""
-    min_screened: int = 100
+    min_screened: int = 60
     """Smallest number of windows on which entries are screened."""
     fitted_steps: int = 1200
     """Control steps, over all windows, in a fit during the search."""
-    min_fitted: int = 200
+    min_fitted: int = 120
     """Smallest number of windows in a fit during the search."""
     leads_combined: int = 60
     """Number of most promising leads from which sets are formed."""
@@ -262,6 +270,14 @@ class JudgeSettings:
 
     horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     """Control steps ahead at which errors are reported."""
+    headline_seconds: tuple[float, ...] = (0.1, 0.2, 0.5, 1.0)
+    """Times ahead, in s, from which that of the report's sentence is chosen."""
+    headline_windows: int = 8
+    """Smallest number of held-out windows for such a time."""
+    headline_stands_out: float = 3.0
+    """Median error over the median error by sensor noise at which the sentence's time is chosen."""
+    noise_windows: int = 100
+    """Largest number of windows by which this is decided."""
     max_rejected: int = 30
     """Largest number of rejected effects in the report."""
     rounding: float = 1e-5
@@ -290,6 +306,34 @@ class JudgeSettings:
     """Difference of predictions, in spreads, below which they count as equal."""
     separation_factor: float = 1.5
     """Factor by which a coordinate must differ from its usual size to be named in the description."""
+
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """The tests of whether something is missing, and of whether an explanation should be used."""
+
+    auc: float = 0.65
+    """Held-out AUC above which a classifier tells measured from simulated; noise and contacts alone give up to 0.56."""
+    autocorrelation: float = 0.2
+    """Rank correlation of successive residuals above which they are not noise."""
+    far_windows: int = 8
+    """Smallest number of windows by which the error far ahead is judged."""
+    far_ratio: float = 2.0
+    """Median error far ahead, in multiples of the median error by sensor noise, above which something is missing."""
+    far_negligible: float = 0.01
+    """Median error far ahead, in spreads, that is negligible without sensor noise."""
+    small_rest: float = 0.1
+    """Share of the error ahead below which what remains is not worth a word."""
+    level: float = 0.01
+    """Significance level of the decrease of the error on the report's data."""
+    auc_near_one: float = 0.95
+    """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
+    much_lower: float = 0.5
+    """Share of the error ahead below which an explanation counts in spite of such an AUC."""
+    extreme_factor: float = 20.0
+    """Factor on a property of the model beyond which the value is reported as implausible."""
+    blocks: int = 10
+    """Blocks of the report's data in which the largest residual is looked for."""
 
 
 @dataclass(frozen=True)
@@ -325,6 +369,8 @@ class LoopSettings:
     """Action noise."""
     judge: JudgeSettings = JudgeSettings()
     """Held-out errors and the report."""
+    verdict: VerdictSettings = VerdictSettings()
+    """The verdict."""
 
 
 DEFAULTS = LoopSettings()

@@ -30,7 +30,7 @@ from torchrl_h2o.training.real_data import cache_folder
 
 MOST_ROWS = 20_000  # a search fits and judges a few thousand windows; more rows cost time and add little precision
 BLOCK = 1_000  # rows in sequence, of data that are longer
-SEARCH = {"held_out": 0.3, "seed": 0}
+SEARCH = {"held_out": 0.25, "seed": 0}
 READ = ("observation", "action", ("next", "observation"), ("next", "done"), "time")  # by the search, if there
 
 

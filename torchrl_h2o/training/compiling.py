@@ -48,7 +48,7 @@ class _CompiledAtFirstCall:
     def __call__(self, *batches: TensorDictBase, **noise: Any) -> Mapping[str, Tensor]:
         if self._chosen is None:
             tqdm.write("compiling the losses, about half a minute (compiled=false skips this)")
-            # torch compiles a function at most eight times in a process; without this, later runs of a grid stay uncompiled
+            # torch compiles a function at most eight times; without this, later runs in the same process would be slow
             torch.compiler.reset()
             self._chosen = compiled(self._plain)
             try:

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.residuals.pendulum import three_parts
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
-from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals import Measured, Simulation, Split
 from torchrl_h2o.residuals.judge.error_ahead import horizon_errors, linear_floor
 
 
@@ -28,9 +29,16 @@ def linear_system(rows=500, noise=0.0):
     for t in range(rows):
         x[t + 1] = 0.9 * x[t] + 0.5 * action[t]
     x = x + noise * rng.standard_normal(x.shape)
-    held_out = np.arange(rows) >= 0.7 * rows
     return Measured(
-        x[:-1], action, x[1:], np.zeros(rows, int), 0.01 * np.arange(rows), np.ones(rows, bool), held_out, {}, "test"
+        x[:-1],
+        action,
+        x[1:],
+        np.zeros(rows, int),
+        0.01 * np.arange(rows),
+        np.ones(rows, bool),
+        three_parts(rows),
+        {},
+        "test",
     )
 
 
@@ -44,7 +52,7 @@ def test_the_right_simulation_has_no_error_and_a_wrong_one_has_more_further_ahea
 def test_only_held_out_windows_are_judged(simulation, measured):
     spoilt = replace(measured, following=measured.following + ~measured.held_out[:, None] * 1.0)
     assert horizon_errors(simulation, spoilt, [5])[0].rmse.max() < 1e-3
-    assert horizon_errors(simulation, spoilt, [5], held_out=False)[0].rmse.max() > 0.5
+    assert horizon_errors(simulation, spoilt, [5], split=Split.FIT)[0].rmse.max() > 0.5
 
 
 def test_states_given_are_started_from(simulation, measured):
@@ -57,7 +65,7 @@ def test_rmse_and_median_are_those_of_the_last_step(simulation, measured):
     error = horizon_errors(simulation, shifted, [5])[0]
     assert error.rmse[0] == pytest.approx(0.3, rel=1e-2)
     assert error.median[0] == pytest.approx(0.3, rel=1e-2)
-    assert error.windows == 180 - 5 + 1
+    assert error.windows == 150 - 5 + 1
 
 
 def test_a_horizon_longer_than_the_data_has_no_figures(simulation, measured):

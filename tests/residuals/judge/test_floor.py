@@ -4,12 +4,12 @@ import numpy as np
 import torch
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.residuals import residuals
+from torchrl_h2o.residuals import Split, residuals
 from torchrl_h2o.residuals.judge.floor import explainable_floor
 
 
 def held_out_error(simulation, measured) -> np.ndarray:
-    return np.sqrt((residuals(simulation, measured, measured.windows(1, held_out=True))[:, 0] ** 2).mean(0))
+    return np.sqrt((residuals(simulation, measured, measured.windows(1, split=Split.REPORT))[:, 0] ** 2).mean(0))
 
 
 def test_floor_of_an_unknown_force_lies_near_the_noise():

@@ -100,7 +100,7 @@ def test_every_run_is_estimated_by_itself(simulation, recorded):
         noisy,
         **{name: getattr(noisy, name)[400:] for name in ("observation", "action", "following", "run", "time")},
         usable=noisy.usable[400:],
-        held_out=noisy.held_out[400:],
+        split=noisy.split[400:],
     )
     levels = noise_levels(simulation, noisy)
     together = estimate_states(simulation, noisy, levels)[400:]

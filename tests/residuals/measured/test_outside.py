@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.residuals.pendulum import three_parts
 from torchrl_h2o.effects import Gravity, JointFrictionLoss, JointRange
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
@@ -30,9 +31,8 @@ def swings(simulation, pushes=(), noise=1e-3, torque=1.0):
         force[:, start:stop] = 3.0
     reached = simulation.rollout(np.array([[0.4, 0.0]]), action[None], applied=force)[0]
     whole = np.vstack([[0.4, 0.0], reached]) + noise * rng.standard_normal((ROWS + 1, 2))
-    held_out = np.arange(ROWS) >= 0.7 * ROWS
     return Measured(
-        whole[:-1], action, whole[1:], np.zeros(ROWS, int), time, np.ones(ROWS, bool), held_out, {}, "swings"
+        whole[:-1], action, whole[1:], np.zeros(ROWS, int), time, np.ones(ROWS, bool), three_parts(ROWS), {}, "swings"
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.envs import GymEnv, TransformedEnv
 
-from tests.residuals.pendulum import UnknownForce, pendulum, recorded
+from tests.residuals.pendulum import UnknownForce, pendulum, recorded, three_parts
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionNoise,
@@ -97,7 +97,7 @@ def exact_wheel_legged(*effects, steps=80):
         run=0 * rows,
         time=rows * simulation.control_step,
         usable=rows >= 0,
-        held_out=rows >= 0.7 * steps,
+        split=three_parts(steps),
         left_out={},
         source="wheel-legged robot",
     )

@@ -7,7 +7,7 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import Gravity
-from torchrl_h2o.residuals import residuals
+from torchrl_h2o.residuals import Split, residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
 
 SIMULATION = pendulum()
@@ -29,8 +29,8 @@ def test_nothing_is_missing_from_a_stand_in(horizon):
     """The stand-in is made from data measured under another gravity, but is simulated without this gap."""
     measured = recorded(SIMULATION.with_effects(Gravity(1.5)), 600)
     data = stand_in(SIMULATION, measured, np.zeros(2), np.random.default_rng(0), horizon)
-    for part in (False, True):
-        starts = data.windows(horizon, horizon, held_out=part)
+    for split in (Split.FIT, Split.SELECTION):
+        starts = data.windows(horizon, horizon, split=split)
         assert np.abs(residuals(SIMULATION, data, starts, horizon)).max() < 1e-9
         assert np.abs(residuals(SIMULATION, measured, starts, horizon)).max() > 1e-3
 

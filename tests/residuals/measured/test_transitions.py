@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from tests.residuals.pendulum import pendulum
 from torchrl_h2o.data import DataError
-from torchrl_h2o.residuals import Measured
+from torchrl_h2o.residuals import Measured, Split
 
 SIMULATION = pendulum()
 
@@ -74,24 +74,41 @@ def test_windows_cross_no_run_nor_unusable_row_nor_the_held_out_border(breaks, u
         of(ted(60)),
         run=np.isin(rows, breaks).cumsum(),
         usable=~np.isin(rows, unusable),
-        held_out=rows >= border,
+        split=np.where(rows >= border, Split.REPORT, Split.FIT),
     )
-    for part in (False, True, None):
-        starts = measured.windows(horizon, stride, held_out=part)
+    for split in (Split.FIT, Split.REPORT, None):
+        starts = measured.windows(horizon, stride, split=split)
         expected = []
         for start in range(0, 60 - horizon + 1, stride):
             window = slice(start, start + horizon)
             one_run = np.ptp(measured.run[window]) == 0
-            right_part = part is None or (measured.held_out[window] == part).all()
+            right_part = split is None or (measured.split[window] == split).all()
             if one_run and right_part and measured.usable[window].all():
                 expected.append(start)
         assert starts.tolist() == expected
 
 
-def test_the_last_rows_are_held_out():
-    held_out = of(ted(), held_out=0.3).held_out
-    assert not held_out[:210].any()
-    assert held_out[210:].all()
+def test_rows_for_fits_then_for_selection_then_for_the_report():
+    split = of(ted(), held_out=0.3).split
+    assert (np.diff(split) >= 0).all()
+    assert np.bincount(split).tolist() == [153, 57, 90]
+
+
+def test_borders_move_to_the_ends_of_runs_that_are_near():
+    data = ted()
+    for last in (159, 219):
+        data["next", "truncated"][last] = data["next", "done"][last] = True
+    assert np.bincount(of(data, held_out=0.3).split).tolist() == [160, 60, 80]
+
+
+def test_named_logs_are_reported_on_and_chosen_by_no_fit():
+    data = ted()
+    data["log"] = torch.arange(300) // 75
+    split = of(data, held_out=[1]).split
+    assert (split[75:150] == Split.REPORT).all()
+    assert not (np.delete(split, slice(75, 150)) == Split.REPORT).any()
+    with pytest.raises(DataError, match="leave no log for fits"):
+        of(data, held_out=[0, 1, 2, 3])
 
 
 def test_time_is_read_and_otherwise_counted_in_control_steps():

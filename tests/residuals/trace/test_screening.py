@@ -13,6 +13,7 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointFrictionLoss,
 )
+from torchrl_h2o.residuals import Split
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import free_parameters, screen
 
@@ -25,7 +26,7 @@ DELAY = CatalogueEntry(ActionDelay(), ({"delay": 0.006}, {"delay": 0.02}))
 
 def screened(truth, entries, known=(), **kwargs):
     problem = Problem.pose(SIMULATION, recorded(SIMULATION.with_effects(*truth), 600))
-    return screen(problem, known, entries, problem.measured.windows(1, held_out=False), **kwargs)
+    return screen(problem, known, entries, problem.measured.windows(1, split=Split.FIT), **kwargs)
 
 
 @pytest.mark.parametrize(

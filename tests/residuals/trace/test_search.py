@@ -20,7 +20,7 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
     JointSpring,
 )
-from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals import Split, trace_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import screen
 from torchrl_h2o.residuals.trace.simplify import simplify_one
@@ -138,9 +138,9 @@ def test_what_was_tried_is_told_with_its_loss_and_chance():
 
 
 def test_an_effect_that_only_the_fitted_rows_have_is_not_kept():
-    """The held-out rows have no friction, so its fit increases their loss."""
+    """The other rows have no friction, so its fit increases their loss."""
     rough, smooth = (recorded(SIMULATION.with_effects(*e), 1000) for e in ((JointFrictionLoss(0.05),), ()))
-    late = smooth.held_out[:, None]
+    late = (smooth.split != Split.FIT)[:, None]
     changed = {
         name: np.where(late, getattr(smooth, name), getattr(rough, name)) for name in ("observation", "following")
     }

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.residuals import residuals
+from torchrl_h2o.residuals import Split, residuals
 from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 LAWS = {
     "torque ripple": (0.2, lambda q, v, t: np.sin(7.0 * q + 0.5)),
     "wind": (-0.002, lambda q, v, t: v**3),
     "a spring to a moving point": (-0.5, lambda q, v, t: q - 0.4 * np.sin(2.3 * t)),
-    "a force that starts late": (0.2, lambda q, v, t: (t >= 13.7) + 0.0 * q),
+    "a force that starts late": (0.2, lambda q, v, t: (t >= 9.7) + 0.0 * q),
     "friction that depends on position": (-0.08, lambda q, v, t: np.sign(v) * (1.0 + 0.8 * np.cos(5.0 * q))),
 }
 
@@ -22,7 +22,7 @@ def test_force_that_no_catalogue_holds_is_found(name, noise):
     simulation, truth = pendulum(), UnknownForce(size, law)
     measured = recorded(simulation.with_effects(truth), noise=noise)
     found = find_undeclared(simulation, measured)
-    left = residuals(simulation.with_effects(truth), measured, measured.windows(1, held_out=True))[:, 0]
+    left = residuals(simulation.with_effects(truth), measured, measured.windows(1, split=Split.REPORT))[:, 0]
     least = np.sqrt((left**2).mean(0))
     explained = (found.error_before - found.error_after) / (found.error_before - least)
     assert explained[1] > 0.8
@@ -52,8 +52,8 @@ def test_perfect_simulator_lacks_nothing():
     assert find_undeclared(simulation, recorded(simulation)) is None
 
 
-def test_force_that_ceases_before_the_held_out_data_is_not_kept():
-    """The force explains the fitted rows but increases the error of the held-out rows."""
+def test_force_that_ceases_before_the_selection_data_is_not_kept():
+    """The force explains the fitted rows but increases the error of the rows of the selection."""
     simulation = pendulum()
-    burst = UnknownForce(0.2, lambda q, v, t: (t < 21.0) * np.sin(5.0 * q))
+    burst = UnknownForce(0.2, lambda q, v, t: (t < 15.0) * np.sin(5.0 * q))
     assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 _RIDGE = 1e-9  # share of each regressor's variance; keeps the equations solvable with constant regressors
@@ -38,7 +38,7 @@ def horizon_errors(
     measured: Measured,
     horizons: Sequence[int],
     *,
-    held_out: bool | None = True,
+    split: Split | None = Split.REPORT,
     states: np.ndarray | None = None,
     stride: int = 1,
 ) -> list[ErrorAhead]:
@@ -48,7 +48,7 @@ def horizon_errors(
         simulation: the simulator.
         measured: the data.
         horizons: control steps ahead.
-        held_out: True for windows of held-out rows only, False for windows without held-out rows, None for all.
+        split: windows of this part only, None for all.
         states: (T, nq + nv), start states; the measured ones by default.
         stride: rows from the start of one window to the next.
 
@@ -57,7 +57,7 @@ def horizon_errors(
     """
     errors = []
     for horizon in horizons:
-        starts = measured.windows(horizon, stride, held_out=held_out)
+        starts = measured.windows(horizon, stride, split=split)
         if not len(starts):
             errors.append(_summary(horizon, np.zeros((0, measured.observation.shape[1]))))
             continue
@@ -92,7 +92,7 @@ def linear_floor(measured: Measured, horizon: int, *, recent: int = 0, stride: i
         >>> bool((floor.rmse < 0.05).all())
         True
     """
-    fitted, judged = (_with_past(measured, horizon, recent, stride, held_out) for held_out in (False, True))
+    fitted, judged = (_with_past(measured, horizon, recent, stride, split) for split in (Split.FIT, Split.REPORT))
     regressors = _regressors(measured, fitted, horizon, recent)
     if regressors.shape[0] < regressors.shape[1]:
         raise ValueError(
@@ -108,9 +108,9 @@ def linear_floor(measured: Measured, horizon: int, *, recent: int = 0, stride: i
     return _summary(horizon, measured.following[judged + horizon - 1] - measured.observation[judged] - predicted)
 
 
-def _with_past(measured: Measured, horizon: int, recent: int, stride: int, held_out: bool) -> np.ndarray:
+def _with_past(measured: Measured, horizon: int, recent: int, stride: int, split: Split) -> np.ndarray:
     """First rows of the windows that have ``recent`` rows of the same run before them."""
-    starts = measured.windows(horizon, stride, held_out=held_out)
+    starts = measured.windows(horizon, stride, split=split)
     starts = starts[starts >= recent]
     return starts[measured.run[starts - recent] == measured.run[starts]]
 

@@ -37,7 +37,7 @@ def explainable_floor(
     Returns:
         RMSE of each dimension, (n), in its unit: at most that of the residual itself.
     """
-    fitted, judged = measured.fitted(), measured.judged()
+    fitted, judged = measured.fitted(), measured.reported_on()
     inputs = _standard(_inputs(simulation, measured), fitted, settings.floor_clip)
     targets = np.full_like(measured.observation, np.nan)
     for rows in (fitted, judged):

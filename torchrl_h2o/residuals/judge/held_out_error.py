@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_h2o.residuals.judge.floor import explainable_floor
+from torchrl_h2o.residuals.judge.headline import headline_error, headline_horizon
 from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.contents import DimensionError, ErrorSummary, HorizonError
 from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -28,6 +29,7 @@ def error_summary(
     """
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
+    ahead = headline_horizon(simulation, measured, settings)
     floor = explainable_floor(mended, measured, settings=settings)
     whiteness = autocorrelation(mended, measured, settings)
     columns = (values.tolist() for values in (before, after, floor, whiteness))
@@ -39,6 +41,7 @@ def error_summary(
         floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
         per_dimension=tuple(map(DimensionError, names, units, *columns)),
         horizons=_horizons(simulation, mended, measured, settings),
+        headline=None if ahead is None else headline_error(simulation, mended, measured, ahead),
     )
 
 
@@ -49,7 +52,7 @@ def overall_error(simulation: Simulation, measured: Measured) -> float:
 
 def spread(measured: Measured) -> np.ndarray:
     """Standard deviation of each dimension's one-step change, (n), over the rows that are not held out."""
-    change = (measured.following - measured.observation)[measured.usable & ~measured.held_out]
+    change = (measured.following - measured.observation)[measured.usable & (measured.split == Split.FIT)]
     return np.maximum(change.std(0), 1e-12)
 
 
@@ -59,7 +62,7 @@ def _horizons(
     """Errors at each horizon with at least two held-out windows."""
     names, found = simulation.state_map.names, []
     for steps in settings.horizons:
-        if len(measured.judged(steps)) < 2:
+        if len(measured.reported_on(steps)) < 2:
             break
         ahead = [
             dict(zip(names, _rmse(which, measured, steps).tolist(), strict=True)) for which in (simulation, mended)
@@ -70,7 +73,7 @@ def _horizons(
 
 def _rmse(simulation: Simulation, measured: Measured, horizon: int) -> np.ndarray:
     """Held-out RMSE at the end of windows, (n), in units of the observations."""
-    starts = measured.judged(horizon)
+    starts = measured.reported_on(horizon)
     # the simulator's own action noise is drawn, because it is part of the simulator's error
     missed = residuals(simulation, measured, starts, horizon, rng=np.random.default_rng(0))[:, -1]
     return np.sqrt(np.nanmean(missed**2, axis=0))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
 
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.evidence import Evidence
@@ -10,12 +13,14 @@ from torchrl_h2o.residuals.explanation import Explanation, adds_noise
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
 from torchrl_h2o.residuals.judge.separation import separated_by
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
+from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.contents import ErrorSummary, TwoSample
+from torchrl_h2o.residuals.report.contents import ErrorSummary, TwoSample, Verdict
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.outcome import Attempt
@@ -49,6 +54,8 @@ class Judgement:
         alternatives: an entry for each part that has alternatives.
         two_sample: AUC of a classifier before and after.
         trace: the residual over time.
+        verdict: what these figures say.
+        failures: attempts that failed with an error, and why.
     """
 
     measured: Measured
@@ -59,6 +66,8 @@ class Judgement:
     alternatives: tuple[Alternatives, ...]
     two_sample: TwoSample
     trace: ResidualTrace
+    verdict: Verdict
+    failures: tuple[str, ...] = ()
 
 
 def judge(
@@ -76,22 +85,27 @@ def judge(
     disturbed = _remaining_disturbances(evidence, explanation, settings)
     measured = without_intervals(evidence.measured, disturbed)
     mended = simulation.with_effects(*_without_noise(effects))
+    error = error_summary(simulation, mended, measured, settings.judge)
+    two_sample = _two_sample(simulation, mended, measured, seed, settings)
+    rejected, failures = _rejected(simulation, measured, explanation, settings)
     return Judgement(
         measured=measured,
         disturbed=tuple(disturbed),
-        error=error_summary(simulation, mended, measured, settings.judge),
+        error=error,
         errors_after=tuple(
             overall_error(simulation.with_effects(*_without_noise(effects[: index + 1])), measured)
             for index in range(len(effects))
         ),
-        rejected=_rejected(simulation, measured, explanation, settings),
+        rejected=rejected,
         alternatives=tuple(
             _alternatives(simulation, measured, effects, index, part.alike, settings)
             for index, part in enumerate(explanation.parts)
             if part.alike
         ),
-        two_sample=_two_sample(simulation, mended, measured, seed, settings),
+        two_sample=two_sample,
         trace=_residual_trace(simulation, mended, measured),
+        verdict=reach_verdict(simulation, mended, measured, effects, error, two_sample, settings),
+        failures=(*explanation.failures, *failures),
     )
 
 
@@ -109,11 +123,20 @@ def _without_noise(effects: tuple[Effect, ...]) -> list[Effect]:
 
 def _rejected(
     simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
-) -> tuple[tuple[Attempt, float], ...]:
+) -> tuple[tuple[tuple[Attempt, float], ...], tuple[str, ...]]:
+    """The attempts that are not part of the explanation, with the error of each alone; and those that failed."""
     trace = explanation.trace
     found = {entry.name for entry in trace.entries}
     listed = [attempt for attempt in trace.attempts[: settings.judge.max_rejected] if attempt.entry.name not in found]
-    return tuple((attempt, overall_error(simulation.with_effects(attempt.effect), measured)) for attempt in listed)
+    rejected, failures = [], []
+    for attempt in listed:
+        try:
+            error = overall_error(simulation.with_effects(attempt.effect), measured)
+        except (ValueError, np.linalg.LinAlgError) as reason:  # it was fitted beside other effects, and needs them
+            error = math.nan
+            failures.append(f"{effect_words(attempt.effect)} cannot be put into the model alone: {reason}")
+        rejected.append((attempt, error))
+    return tuple(rejected), tuple(failures)
 
 
 def _alternatives(

@@ -51,14 +51,14 @@ def separated_by(
     dimension = int(difference[most].mean(0).argmax())
     name, unit = simulation.state_map.names[dimension], simulation.state_map.units[dimension]
     by = difference[most, dimension].mean() * spread[dimension]
-    where = _where(simulation, measured, rows, size, most, settings.separation_factor)
+    where = where_it_is_large(simulation, measured, rows, size, most, settings.separation_factor)
     return (
         f"more data{where}, because the predictions differ most in {name}, by {quantity(by, unit, 2)} per step; or a "
         "direct measurement of one of the quantities"
     )
 
 
-def _where(
+def where_it_is_large(
     simulation: Simulation,
     measured: Measured,
     rows: np.ndarray,

@@ -42,7 +42,7 @@ def two_sample_auc(
 
     Source: H2O+ (Niu et al., 2023, arXiv 2309.12716), Eq. (9).
     """
-    fitted, judged = measured.fitted(), measured.judged()
+    fitted, judged = measured.fitted(), measured.reported_on()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         train = _real_and_simulated(simulation, measured, fitted, fitted, sensor_std)

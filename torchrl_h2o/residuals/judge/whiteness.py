@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -25,9 +25,9 @@ def autocorrelation(simulation: Simulation, measured: Measured, settings: JudgeS
     Returns:
         Spearman's correlation, because single contacts do not dominate ranks; NaN if the residual is within rounding.
     """
-    rows = measured.windows(2, held_out=True)
+    rows = measured.windows(2, split=Split.REPORT)
     first, second = (residuals(simulation, measured, rows + later)[:, 0] for later in (0, 1))
-    change = (measured.following - measured.observation)[measured.usable & ~measured.held_out]
+    change = (measured.following - measured.observation)[measured.usable & (measured.split == Split.FIT)]
     least = settings.rounding * np.maximum(change.std(0), 1e-12)
     left = np.abs(first).mean(0) > least if len(rows) > 1 else np.zeros(first.shape[1], bool)
     return np.array(

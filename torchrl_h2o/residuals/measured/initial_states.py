@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.residuals.measured.linearised import Linearised
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -91,7 +91,7 @@ def noise_levels(simulation: Simulation, measured: Measured) -> NoiseLevels:
 
 def _noise_levels(linearised: Linearised, measured: Measured) -> NoiseLevels:
     settings = measured.settings
-    known, n = linearised.known & measured.usable & ~measured.held_out, linearised.observed.shape[1]
+    known, n = linearised.known & measured.usable & (measured.split == Split.FIT), linearised.observed.shape[1]
     rows = np.flatnonzero(known[:-1] & known[1:] & linearised.follows[:-1])
     residual = np.zeros_like(linearised.observed)
     residual[rows] = linearised.observed[rows + 1] - linearised.reached[rows]

@@ -48,7 +48,7 @@ def stand_in(
         states = start_states(simulation, measured)
     following = measured.following.copy()
     actions = executed_actions(simulation, measured)
-    for starts in (measured.fitted(horizon), measured.judged(horizon)):
+    for starts in (measured.fitted(horizon), measured.selected_on(horizon)):
         rows = starts[:, None] + np.arange(horizon)
         reached = simulation.rollout(states[starts], actions[rows], time=measured.time[starts])
         following[rows] = simulation.state_map.observations(reached)

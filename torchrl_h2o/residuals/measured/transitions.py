@@ -1,9 +1,10 @@
-"""Measured transitions as float64 arrays, cut into unbroken runs, with masks for usable and held-out rows."""
+"""Measured transitions as float64 arrays, cut into unbroken runs and into three parts: fit, selection and report."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import cast
 
 import numpy as np
@@ -14,6 +15,19 @@ from torchrl_h2o.data import DataError
 from torchrl_h2o.data.readers.ted import require_ted
 from torchrl_h2o.residuals.settings import DEFAULTS, MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+HELD_OUT = 0.25  # share of the transitions on which errors are reported
+
+
+class Split(IntEnum):
+    """What a transition is used for. A figure of a part says nothing about the parts that chose what it measures."""
+
+    FIT = 0
+    """Parameters are fitted to it."""
+    SELECTION = 1
+    """Effects are chosen by it."""
+    REPORT = 2
+    """Errors are reported on it, after everything has been chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +41,7 @@ class Measured:
         run: (T), index of the unbroken run that each transition belongs to.
         time: (T), time of the observation, in s from the start of the data.
         usable: (T), True for transitions that may be fitted and judged.
-        held_out: (T), True for transitions that are reserved for the judgement.
+        split: (T), the :class:`Split` of each transition.
         left_out: number of excluded rows by reason.
         source: name of the data in reports and errors.
         settings: sampling of windows, noise estimation and state estimation.
@@ -39,7 +53,7 @@ class Measured:
     run: np.ndarray
     time: np.ndarray
     usable: np.ndarray
-    held_out: np.ndarray
+    split: np.ndarray
     left_out: dict[str, int]
     source: str
     settings: MeasuredSettings = DEFAULTS.measured
@@ -51,20 +65,25 @@ class Measured:
         simulation: Simulation,
         *,
         source: str = "transitions",
-        held_out: float = 0.3,
+        held_out: float | Collection[int] = HELD_OUT,
         settings: MeasuredSettings = DEFAULTS.measured,
     ) -> Measured:
-        """Converts a TED TensorDict and checks its widths against the simulation.
+        """Converts a TED TensorDict, checks its widths against the simulation, and divides it into three parts.
+
+        The parts are consecutive rows: those for fits, those for the selection of effects, those for the report. A
+        border moves to the nearest end of a run if there is one near it.
 
         Args:
-            data: batch size (T,), as the readers of :mod:`torchrl_h2o.data` return it.
+            data: batch size (T,), as the readers of :mod:`torchrl_h2o.data` return it; with the entry ``"log"`` if the
+                data are several logs: the index of each transition's log.
             simulation: simulator that the data will be compared with.
             source: name of the data in reports and errors.
-            held_out: share of the transitions, taken from the end, that is reserved for the judgement.
+            held_out: share of the transitions, taken from the end, on which errors are reported; or the indices of
+                the logs on which they are. Of the rest, ``settings.selection`` is for the selection of effects.
             settings: sampling of windows, noise estimation and state estimation.
 
         Raises:
-            DataError: if observations or actions do not have the simulation's width.
+            DataError: if observations or actions do not have the simulation's width, or no log is left for fits.
         """
         require_ted(data, source=source)
         observation, action = _float64(data["observation"]), _float64(data["action"])
@@ -75,7 +94,7 @@ class Measured:
         breaks = ends[:-1] | (following[:-1] != observation[1:]).any(1)
         run = np.concatenate([[0], np.cumsum(breaks)])
         clipped = simulation.state_map.clipped(observation) | simulation.state_map.clipped(following)
-        judged = np.arange(len(run)) >= round((1.0 - held_out) * len(run))
+        logs = cast("torch.Tensor", data["log"]).flatten().numpy() if "log" in data.keys() else np.zeros(len(run), int)
         step = np.arange(len(run)) * simulation.control_step
         return cls(
             observation,
@@ -84,7 +103,7 @@ class Measured:
             run,
             _float64(data["time"]).flatten() if "time" in data.keys() else step,
             ~clipped,
-            judged,
+            divided(run, logs, held_out, settings, source=str(source)),
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
             settings,
@@ -94,23 +113,28 @@ class Measured:
         return len(self.observation)
 
     @property
+    def held_out(self) -> np.ndarray:
+        """Mask, (T), of the transitions on which errors are reported."""
+        return self.split == Split.REPORT
+
+    @property
     def runs(self) -> list[slice]:
         """Rows of each unbroken run."""
         edges = np.flatnonzero(np.diff(self.run)) + 1
         starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(self)]
         return [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
 
-    def windows(self, horizon: int, stride: int = 1, *, held_out: bool | None = None) -> np.ndarray:
+    def windows(self, horizon: int, stride: int = 1, *, split: Split | None = None) -> np.ndarray:
         """First rows, (W), of all windows that consist of usable transitions of a single run.
 
         Args:
             horizon: transitions per window.
             stride: rows from the start of one window to the next.
-            held_out: True for windows of held-out transitions only, False for windows without them, None for all.
+            split: windows of this part only; None for all, also those across the border between two parts.
         """
         good = self.usable.copy()
-        if held_out is not None:
-            good &= self.held_out == held_out
+        if split is not None:
+            good &= self.split == split
         starts = np.arange(0, len(self) - horizon + 1, stride)
         bad_before = np.concatenate([[0], np.cumsum(~good)])
         whole = bad_before[starts + horizon] == bad_before[starts]
@@ -118,15 +142,22 @@ class Measured:
 
     def fitted(self, horizon: int = 1) -> np.ndarray:
         """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``settings.max_windows``."""
-        return thinned(self.windows(horizon, horizon, held_out=False), self.settings.max_windows)
+        return self._thinned(Split.FIT, horizon)
 
-    def judged(self, horizon: int = 1) -> np.ndarray:
-        """First rows, (W), of the held-out windows: not overlapping, evenly thinned to ``settings.max_windows``."""
-        return thinned(self.windows(horizon, horizon, held_out=True), self.settings.max_windows)
+    def selected_on(self, horizon: int = 1) -> np.ndarray:
+        """First rows, (W), of the windows by which effects are chosen, as :meth:`fitted`."""
+        return self._thinned(Split.SELECTION, horizon)
+
+    def reported_on(self, horizon: int = 1) -> np.ndarray:
+        """First rows, (W), of the windows on which errors are reported, as :meth:`fitted`."""
+        return self._thinned(Split.REPORT, horizon)
+
+    def _thinned(self, split: Split, horizon: int) -> np.ndarray:
+        return thinned(self.windows(horizon, horizon, split=split), self.settings.max_windows)
 
     def part(self, rows: slice) -> Measured:
-        """A contiguous part of the transitions."""
-        arrays = ("observation", "action", "following", "run", "time", "usable", "held_out")
+        """A contiguous piece of the transitions."""
+        arrays = ("observation", "action", "following", "run", "time", "usable", "split")
         return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
     def without(self, rows: np.ndarray, reason: str) -> Measured:
@@ -151,6 +182,59 @@ class Measured:
                 "a fit would explain them by effects that do not exist; repair these sensors or leave the columns out"
             )
         return None
+
+
+def divided(
+    run: np.ndarray,
+    logs: np.ndarray,
+    held_out: float | Collection[int],
+    settings: MeasuredSettings = DEFAULTS.measured,
+    *,
+    source: str = "transitions",
+) -> np.ndarray:
+    """Divides transitions into the parts for fits, for the selection of effects, and for the report.
+
+    Args:
+        run: (T), index of each transition's run, ascending.
+        logs: (T), index of each transition's log.
+        held_out: share of the transitions, from the end, on which errors are reported, or the indices of these logs.
+        settings: share of the selection, and how far a border moves to the end of a run.
+        source: name of the data in errors.
+
+    Returns:
+        (T), the :class:`Split` of each transition.
+
+    Raises:
+        DataError: if the logs of the report are all logs, or none.
+
+    Examples:
+        >>> divided(np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2]), np.zeros(10, int), 0.3).tolist()
+        [0, 0, 0, 0, 0, 1, 1, 2, 2, 2]
+    """
+    split = np.full(len(run), Split.FIT)
+    if isinstance(held_out, float | int):
+        split[_border(run, 1.0 - held_out, settings) :] = Split.REPORT
+    else:
+        split[np.isin(logs, list(held_out))] = Split.REPORT
+        if (split == split[0]).all():
+            raise DataError(
+                "leave no log for fits, or none for the report" if len(split) else "are empty",
+                "name in held_out some of the logs, not all of them",
+                source=source,
+            )
+    rest = np.flatnonzero(split == Split.FIT)
+    split[rest[_border(run[rest], 1.0 - settings.selection, settings) :]] = Split.SELECTION
+    return split
+
+
+def _border(run: np.ndarray, share: float, settings: MeasuredSettings) -> int:
+    """Row at a share of the rows, or the nearest first row of a run, if one is near enough."""
+    wanted = round(share * len(run))
+    firsts = np.flatnonzero(np.diff(run)) + 1
+    if not 0 < wanted < len(run) or not len(firsts):
+        return wanted
+    nearest = int(firsts[np.abs(firsts - wanted).argmin()])
+    return nearest if abs(nearest - wanted) <= settings.border_moves * len(run) else wanted
 
 
 def thinned(starts: np.ndarray, most: int) -> np.ndarray:

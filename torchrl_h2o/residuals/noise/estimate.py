@@ -55,7 +55,7 @@ def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSet
     """
     rules = settings.noise
     fitted = Scatter.of(simulation, measured, measured.fitted(), settings=rules)
-    judged = Scatter.of(simulation, measured, measured.judged(), fitted.scale, settings=rules)
+    judged = Scatter.of(simulation, measured, measured.selected_on(), fitted.scale, settings=rules)
     # noise with opposite signs in successive residuals is attributed to the sensors, even if action noise could fit it
     sensor_std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
     estimate, left_out = fitted_variances(fitted, sensor_std, rules)

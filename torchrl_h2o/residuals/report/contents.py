@@ -7,6 +7,10 @@ from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_words
 
+NOTHING_MISSING, EXPLAINED = "nothing missing", "explained"
+EXPLAINED_IN_PART, NOT_EXPLAINED = "explained in part", "not explained"
+VERDICTS = (NOTHING_MISSING, EXPLAINED, EXPLAINED_IN_PART, NOT_EXPLAINED)
+
 Intervals = Mapping[str, tuple[float, float]]  # 95 % interval of each parameter by name, in the parameter's unit
 Fitted = tuple[tuple[Effect, Intervals], ...]  # effects that were fitted together, each with its intervals
 
@@ -138,6 +142,25 @@ class HorizonError:
 
 
 @dataclass(frozen=True)
+class HeadlineError:
+    """Median absolute error of one quantity some time ahead, on held-out data: the figure of the report's sentence.
+
+    Args:
+        name: name of the quantity.
+        unit: its unit.
+        seconds: how far ahead, in s.
+        before: error without the effects, in the unit.
+        after: error with all of them.
+    """
+
+    name: str
+    unit: str
+    seconds: float
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
 class ErrorSummary:
     """Held-out error before and after the effects are put in.
 
@@ -149,6 +172,7 @@ class ErrorSummary:
         floor: estimated error of the best possible model; None if there is no estimate.
         per_dimension: errors of each dimension.
         horizons: errors several steps ahead.
+        headline: error of the quantity that the sentence names; None in reports of earlier versions.
     """
 
     metric: str
@@ -158,6 +182,31 @@ class ErrorSummary:
     floor: float | None = None
     per_dimension: tuple[DimensionError, ...] = ()
     horizons: tuple[HorizonError, ...] = ()
+    headline: HeadlineError | None = None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the held-out data say of an explanation.
+
+    Args:
+        kind: one of :data:`VERDICTS`.
+        reasons: figures that the kind follows from, in words.
+        recommended: whether the effects should be put into a simulator for training.
+        where: when and at which states the unexplained part is largest; empty if nothing is unexplained.
+
+    Raises:
+        ValueError: for an unknown kind.
+    """
+
+    kind: str
+    reasons: tuple[str, ...] = ()
+    recommended: bool = True
+    where: str = ""
+
+    def __post_init__(self):
+        if self.kind not in VERDICTS:
+            raise ValueError(f"kind={self.kind!r}: choose {', '.join(VERDICTS)}")
 
 
 @dataclass(frozen=True)
@@ -213,6 +262,10 @@ class ReportContents:
         stop_test: description of the test by which the search stopped.
         wall_s: duration in s; None if not timed.
         conclusion: reason why there is no conclusion; None if effects were found or nothing is missing.
+        verdict: what the held-out data say of the explanation; None for an unfinished report, and in files of earlier
+            versions.
+        failures: attempts that failed with an error, and why.
+        unfinished: stage in which the run stopped or was when the report was written; None for a finished report.
         trace: residual over time, for the pictures; None for a report without pictures. It is ignored by ``==``.
 
     Raises:
@@ -230,6 +283,9 @@ class ReportContents:
     stop_test: str = ""
     wall_s: float | None = None
     conclusion: str | None = None
+    verdict: Verdict | None = None
+    failures: tuple[str, ...] = ()
+    unfinished: str | None = None
     trace: ResidualTrace | None = field(default=None, compare=False)
 
     def __post_init__(self):

@@ -16,12 +16,14 @@ from torchrl_h2o.residuals.report.contents import (
     DimensionError,
     ErrorSummary,
     FoundEffect,
+    HeadlineError,
     HorizonError,
     IndistinguishableGroup,
     Interval,
     RejectedEffect,
     ReportContents,
     TwoSample,
+    Verdict,
 )
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.sentence import sentence
@@ -91,6 +93,9 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
                 for group in report.indistinguishable
             ],
             "error": None if report.error is None else dataclasses.asdict(report.error),
+            "verdict": None if report.verdict is None else dataclasses.asdict(report.verdict),
+            "failures": report.failures,
+            "unfinished": report.unfinished,
             "two_sample": dataclasses.asdict(report.two_sample),
             "unexplained_intervals": [dataclasses.asdict(interval) for interval in report.unexplained_intervals],
             "data": dataclasses.asdict(report.data),
@@ -116,6 +121,9 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         ),
         "indistinguishable": tuple(_group(entry) for entry in entries["indistinguishable"]),
         "error": None if entries["error"] is None else _error(entries["error"]),
+        "verdict": None if entries.get("verdict") is None else _verdict(entries["verdict"]),
+        "failures": tuple(entries.get("failures", ())),
+        "unfinished": entries.get("unfinished"),
         "two_sample": _read(TwoSample, entries["two_sample"]),
         "unexplained_intervals": tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
         "data": _read(DataSummary, entries["data"]),
@@ -222,7 +230,12 @@ def _error(entry: Mapping[str, Any]) -> ErrorSummary:
         for horizon in entry["horizons"]
     )
     per_dimension = tuple(_read(DimensionError, dimension) for dimension in entry["per_dimension"])
-    return _read(ErrorSummary, entry, per_dimension=per_dimension, horizons=horizons)
+    headline = None if entry.get("headline") is None else _read(HeadlineError, entry["headline"])
+    return _read(ErrorSummary, entry, per_dimension=per_dimension, horizons=horizons, headline=headline)
+
+
+def _verdict(entry: Mapping[str, Any]) -> Verdict:
+    return _read(Verdict, entry, reasons=tuple(entry["reasons"]))
 
 
 def _trace(entry: Mapping[str, Any]) -> ResidualTrace:

@@ -5,20 +5,50 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from torchrl_h2o.residuals.report.contents import ErrorSummary, FoundEffect, ReportContents
-from torchrl_h2o.residuals.report.words import change, effect_name, number, quantity
+from torchrl_h2o.residuals.report.contents import (
+    EXPLAINED_IN_PART,
+    NOT_EXPLAINED,
+    ErrorSummary,
+    FoundEffect,
+    HeadlineError,
+    ReportContents,
+    Verdict,
+)
+from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
+
+NOT_IN_CATALOGUE = "Something is missing that this catalogue does not explain"
 
 
 def sentence(report: ReportContents) -> str:
     """The whole report in one sentence."""
-    error = _error_words(report.error) if report.error else ""
     if report.conclusion is not None:
         return f"No conclusion: {report.conclusion.rstrip('. ')}."
+    if report.unfinished is not None:
+        so_far = (
+            f"so far the simulator lacks {_listed(_found_words(report))}" if report.found else "nothing was found yet"
+        )
+        return f"Unfinished, when {report.unfinished}: {so_far}."
+    error = _error_words(report.error) if report.error else ""
+    words = _listed(_found_words(report)) if report.found else ""
+    kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
+    if kind == NOT_EXPLAINED:
+        attempt = words and f"the best attempt, {words}, is not recommended"
+        return f"{NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."
     if report.found:
-        lacking = "; ".join(part for part in (_listed(_found_words(report)), error) if part)
-        return f"Your simulator lacks: {lacking}."
-    reason = "the effects tried explain no more than chance"
-    return f"Nothing is missing: {'; '.join(part for part in (reason, error) if part)}."
+        rest = unknown and f"something else is missing that this catalogue does not explain: {unknown}"
+        return f"Your simulator lacks: {_joined(words, error, rest)}."
+    return f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
+
+
+def _unknown_words(verdict: Verdict) -> str:
+    """Why something is missing and where it shows; empty if the effects found explain everything."""
+    if verdict.kind not in (EXPLAINED_IN_PART, NOT_EXPLAINED):
+        return ""
+    return _joined(*verdict.reasons, verdict.where and f"it shows {verdict.where}")
+
+
+def _joined(*parts: str) -> str:
+    return "; ".join(part for part in parts if part)
 
 
 def _found_words(report: ReportContents) -> list[str]:
@@ -40,6 +70,8 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _error_words(error: ErrorSummary) -> str:
+    if error.headline is not None:
+        return headline_words(error.headline)
     if not (math.isfinite(error.before) and math.isfinite(error.after)):
         return ""
     floor = "" if number(error.floor) == "–" else f", floor {number(error.floor, 2)}"
@@ -48,3 +80,18 @@ def _error_words(error: ErrorSummary) -> str:
     percent = change(error.before, error.after)
     percent = f" ({percent})" if percent else ""
     return f"one-step error {number(error.before, 2)} → {quantity(error.after, error.unit, 2)}{percent}{floor}"
+
+
+def headline_words(error: HeadlineError) -> str:
+    """The error of one quantity some time ahead, in words.
+
+    Examples:
+        >>> headline_words(HeadlineError("elbow", "rad", 0.1, before=0.074, after=0.014))
+        'elbow 100 ms ahead: 74 → 14 mrad (−81 %)'
+    """
+    what = f"{error.name} {duration(error.seconds)} ahead"
+    unit, (before, after) = in_readable_unit(error.unit, error.before, error.after)
+    if error.after == error.before:
+        return f"{what}: error {quantity(after, unit, 2)}"
+    percent = change(before, after)
+    return f"{what}: {number(before, 2)} → {quantity(after, unit, 2)}{percent and f' ({percent})'}"

@@ -48,6 +48,32 @@ def quantity(value: float | None, unit: str, digits: int = 3) -> str:
     return text if unit in ("", "1") or text == "–" else f"{text} {unit}"
 
 
+_SMALL = {"rad": "mrad", "m": "mm", "s": "ms"}
+
+
+def in_readable_unit(unit: str, *values: float) -> tuple[str, tuple[float, ...]]:
+    """Converts values that are all below 0.1 to thousandths of their unit, if that unit is usual.
+
+    Examples:
+        >>> in_readable_unit("rad", 0.074, 0.014), in_readable_unit("rad", 0.5), in_readable_unit("N", 0.01)
+        (('mrad', (74.0, 14.0)), ('rad', (0.5,)), ('N', (0.01,)))
+    """
+    finite = [abs(value) for value in values if math.isfinite(value)]
+    if unit not in _SMALL or not finite or not 0.0 < max(finite) < 0.1:
+        return unit, values
+    return _SMALL[unit], tuple(1e3 * value for value in values)
+
+
+def duration(seconds: float) -> str:
+    """Formats a time: milliseconds below one second.
+
+    Examples:
+        >>> duration(0.1), duration(1.0)
+        ('100 ms', '1 s')
+    """
+    return quantity(1e3 * seconds, "ms") if seconds < 1.0 else quantity(seconds, "s")
+
+
 def change(before: float, after: float) -> str:
     """Formats the change of an error in per cent; empty if it is not defined.
 

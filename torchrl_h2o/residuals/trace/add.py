@@ -51,8 +51,8 @@ def best_addition(state: SearchState, leads: Sequence[Lead], rng: np.random.Gene
         The state with the set added, or without it if no set passes the tests; its attempts include the sketches.
     """
     rules, effects = state.settings.trace, state.fit.effects
-    before = state.held_out_losses(effects)
-    present = _Candidate(state.entries, state.fit, 0, before, state.first.held_out_loss(effects))
+    before = state.selection_losses(effects)
+    present = _Candidate(state.entries, state.fit, 0, before, state.first.selection_loss(effects))
     best = present
     for size, count in rules.set_sizes:
         among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
@@ -87,10 +87,10 @@ def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], 
 
 def _remember(state: SearchState, sketches: Sequence[Sketch]) -> SearchState:
     """Records what single entries explain in addition to the effects found, for the report."""
-    before, index = state.held_out_losses(state.fit.effects), len(state.fit.effects)
+    before, index = state.selection_losses(state.fit.effects), len(state.fit.effects)
     attempts = dict(state.attempts)
     for (lead,), sketch in sketches:
-        after = state.held_out_losses(sketch.effects)
+        after = state.selection_losses(sketch.effects)
         p = state.p_value(before, after)
         attempts[lead.entry.name] = Attempt(lead.entry, sketch, index, float(after.mean()), p)
     return replace(state, attempts=attempts)
@@ -103,11 +103,11 @@ def _best_of(state: SearchState, sketches: Sequence[Sketch], present: _Candidate
     for chosen, start in sketches:
         entries = (*state.entries, *(lead.entry for lead in chosen))
         fitted = state.refitted(entries, start.effects)
-        first_loss = state.first.held_out_loss(fitted.effects)
+        first_loss = state.first.selection_loss(fitted.effects)
         # each added effect must contribute its share; a set that fails this does not count as a finalist
         if not matters(nothing, present.first_loss, first_loss, len(chosen) * rules.min_share):
             continue
-        candidate = _Candidate(entries, fitted, len(chosen), state.held_out_losses(fitted.effects), first_loss)
+        candidate = _Candidate(entries, fitted, len(chosen), state.selection_losses(fitted.effects), first_loss)
         if _pays(state, best, candidate):
             best = candidate
         finalists += 1
@@ -141,5 +141,5 @@ def _explained_by_noise(state: SearchState, best: _Candidate, rng: np.random.Gen
     free = [free_parameters(entry) for entry in best.entries[-best.added :]]
     effects = best.fit.effects[-best.added :]
     refitted = fit(posed, effects, free, state.windows.fitted, settings=state.settings.fit)
-    before = losses(posed.residual((), state.windows.judged)).mean()
-    return 1.0 - float(losses(posed.residual(refitted.effects, state.windows.judged)).mean() / before)
+    before = losses(posed.residual((), state.windows.selected_on)).mean()
+    return 1.0 - float(losses(posed.residual(refitted.effects, state.windows.selected_on)).mean() / before)

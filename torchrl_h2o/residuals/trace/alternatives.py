@@ -30,8 +30,8 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     """
     kept = [effect for i, effect in enumerate(state.fit.effects) if i != index]
     state = state.rescaled(state.posed_at(kept))
-    with_it = state.held_out_losses(state.fit.effects)
-    explained = state.held_out_losses(kept).mean() - with_it.mean()
+    with_it = state.selection_losses(state.fit.effects)
+    explained = state.selection_losses(kept).mean() - with_it.mean()
     if explained <= 0.0:
         return state, ()  # an effect without a gain has no meaningful alternatives
     attempts = [_attempt(state, index, rival, with_it) for rival in _sketched_rivals(state, index)]
@@ -41,7 +41,7 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
 
 def p_value_between(state: SearchState, problem: Problem, worse: Fit, better: Fit) -> float:
     """p-value of the difference between two fits on held-out windows, with residuals scaled as in a problem."""
-    judged = state.windows.judged
+    judged = state.windows.selected_on
     before, after = (losses(problem.residual(fitted.effects, judged)) for fitted in (worse, better))
     return state.p_value(before, after)
 
@@ -82,7 +82,7 @@ def _attempt(state: SearchState, index: int, rival: tuple[Lead, Fit], with_it: n
     """A rival fitted in the effect's place, with the p-value of being worse than the effect."""
     lead, sketch = rival
     candidate = state.refitted(_entries_with(state, index, lead), sketch.effects)
-    after = state.held_out_losses(candidate.effects)
+    after = state.selection_losses(candidate.effects)
     p = state.p_value(after, with_it)
     simpler = len(lead.free) < len(free_parameters(state.entries[index]))
     if p <= state.settings.significance.level and simpler:
@@ -99,7 +99,7 @@ def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explain
 
 def _p_value_of_loss_gap(state: SearchState, worse: Fit, better: Fit) -> float:
     """p-value of the loss gap, rescaled by the better fit; 0 above the reporting threshold."""
-    worse_loss, better_loss = (state.first.held_out_loss(fitted.effects) for fitted in (worse, better))
+    worse_loss, better_loss = (state.first.selection_loss(fitted.effects) for fitted in (worse, better))
     if matters(state.first_loss, worse_loss, better_loss, state.settings.trace.min_share):
         return 0.0
     rescaled = replace(state.posed_at(better.effects), simulation=state.problem.simulation)

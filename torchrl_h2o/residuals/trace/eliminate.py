@@ -17,13 +17,13 @@ def eliminate(state: SearchState) -> SearchState:
 
 def _without_one(state: SearchState) -> SearchState | None:
     """The state without the first effect that is not needed; None if all are needed."""
-    before = state.held_out_losses(state.fit.effects)
+    before = state.selection_losses(state.fit.effects)
     most = before.mean() / (1.0 - state.settings.trace.min_gain)
     for index in range(len(state.entries)):
         entries = (*state.entries[:index], *state.entries[index + 1 :])
         kept = (*state.fit.effects[:index], *state.fit.effects[index + 1 :])
         fitted = state.refitted(entries, kept)
-        after = state.held_out_losses(fitted.effects)
+        after = state.selection_losses(fitted.effects)
         needed = after.mean() > most and state.p_value(after, before) < state.settings.significance.level
         if not needed:
             return state.with_found(entries, fitted)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +15,19 @@ from torchrl_h2o.residuals.trace.screening import Lead, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
-def grow(state: SearchState, rng: np.random.Generator, progress: tqdm) -> SearchState:
+def grow(
+    state: SearchState,
+    rng: np.random.Generator,
+    progress: tqdm,
+    found: Callable[[SearchState], object] = lambda state: None,
+) -> SearchState:
     """Adds effects until no addition passes the tests, the limit is reached, or the residual is within rounding.
 
     Args:
         state: effects found so far.
         rng: generator of synthetic noise.
         progress: bar that counts screened entries and names the effects found.
+        found: called after each addition.
     """
     state = _rescale(state)
     while not state.exact and len(state.entries) < state.settings.trace.max_effects:
@@ -33,6 +39,7 @@ def grow(state: SearchState, rng: np.random.Generator, progress: tqdm) -> Search
         grown = _remember_leads(grown, leads, grown.entries[len(state.entries) :])
         state = _rescale(reorder(eliminate(grown)))
         progress.set_postfix_str(", ".join(entry.name for entry in state.entries))
+        found(state)
     return state
 
 

@@ -10,7 +10,7 @@ from torchrl_h2o.residuals.trace.state import SearchState
 
 def reorder(state: SearchState) -> SearchState:
     """Swaps pairs of action effects, and of observation effects, if that lowers the held-out loss significantly."""
-    lowest = state.held_out_losses(state.fit.effects)
+    lowest = state.selection_losses(state.fit.effects)
     for kind in (ActionEffect, ObservationEffect):
         places = [index for index, entry in enumerate(state.entries) if isinstance(entry.effect, kind)]
         for one, other in combinations(places, 2):
@@ -18,7 +18,7 @@ def reorder(state: SearchState) -> SearchState:
             order[one], order[other] = other, one
             swapped = tuple(state.entries[index] for index in order)
             fitted = state.refitted(swapped, [state.fit.effects[index] for index in order])
-            after = state.held_out_losses(fitted.effects)
+            after = state.selection_losses(fitted.effects)
             significant = state.p_value(lowest, after) < state.settings.significance.level
             if after.mean() < lowest.mean() and significant:
                 state, lowest = state.with_found(swapped, fitted), after

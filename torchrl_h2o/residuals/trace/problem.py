@@ -68,7 +68,7 @@ class Problem:
         if sensor_std is None:
             sensor_std = sensor_noise(simulation, measured)
         fitted = measured.fitted(horizon)
-        states = start_states(simulation, measured, np.concatenate([fitted, measured.judged(horizon)]))
+        states = start_states(simulation, measured, np.concatenate([fitted, measured.selected_on(horizon)]))
         one = np.ones((1, 1, measured.observation.shape[1]))
         problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std, settings)
         found, rounding = problem._missed((), fitted), problem._rounding(fitted)
@@ -98,9 +98,9 @@ class Problem:
         """Expected size of the windows' residuals, (W, H, n) or (1, 1, n), in units of the observations."""
         return self.scale[starts] if len(self.scale) > 1 else self.scale
 
-    def held_out_loss(self, effects: Sequence[Effect]) -> float:
-        """Mean robust loss on held-out windows with effects put in."""
-        return float(losses(self.residual(effects, self.measured.judged(self.horizon))).mean())
+    def selection_loss(self, effects: Sequence[Effect]) -> float:
+        """Mean robust loss on the windows by which effects are chosen, with effects put in."""
+        return float(losses(self.residual(effects, self.measured.selected_on(self.horizon))).mean())
 
     @property
     def within_rounding(self) -> bool:
@@ -135,7 +135,7 @@ class Problem:
         """Mean square of the residual that sensor noise causes in each window, (T, H, n)."""
         measured, rng = self.measured, np.random.default_rng(0)
         sensor_std = cast("np.ndarray", self.sensor_std)  # called only with noisy sensors
-        starts = np.concatenate([measured.fitted(self.horizon), measured.judged(self.horizon)])
+        starts = np.concatenate([measured.fitted(self.horizon), measured.selected_on(self.horizon)])
         squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
         for _ in range(self.settings.noise_draws):
             noise = sensor_std * rng.standard_normal(measured.observation.shape)

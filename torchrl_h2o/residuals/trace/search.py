@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from tqdm import tqdm
 
-from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.begin import begin_with
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.grow import grow
 from torchrl_h2o.residuals.trace.outcome import Trace
+from torchrl_h2o.residuals.trace.per_joint import divide_by_element
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.simplify import simplify
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -26,6 +28,8 @@ def trace_effects(
     *,
     rng: np.random.Generator,
     progress: tqdm,
+    known: Sequence[Effect] = (),
+    found: Callable[[Trace], object] = lambda trace: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Trace:
     """Traces the residual between data and a simulation to effects of a catalogue.
@@ -36,23 +40,26 @@ def trace_effects(
         catalogue: effects that the simulator may lack.
         rng: generator for screened windows and synthetic noise.
         progress: bar that counts screened entries.
+        known: effects from which the search begins, such as those of an unfinished run; those that are not in the
+            catalogue are left out.
+        found: called with the preliminary result whenever an effect has been found.
         settings: thresholds and budgets.
 
     Returns:
         The effects found, the other effects tried, and equivalent alternatives.
     """
-    horizon = choose_horizon(simulation, measured, catalogue, rng, settings)
+    horizon = choose_horizon(simulation, measured, rng, settings)
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
-    state = SearchState.begin(problem, catalogue, rng, settings)
+    state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
     for _ in range(settings.trace.rounds):
-        before, state = state, grow(state, rng, progress)
+        before, state = state, grow(state, rng, progress, lambda grown: found(_outcome(grown)))
         if state.entries == before.entries:
             break
         grown, state = state, simplify(state)
         # a further round helps only where a simpler effect has replaced one with many parameters
         if state.exact or state.entries == grown.entries:
             break
-    return _outcome(_fitted_to_all(state))
+    return _outcome(_fitted_to_all(divide_by_element(state)))
 
 
 def _fitted_to_all(state: SearchState) -> SearchState:
@@ -65,4 +72,5 @@ def _outcome(state: SearchState) -> Trace:
     names = {entry.name for entry in state.entries}
     tried = sorted(state.attempts.values(), key=lambda attempt: attempt.loss)
     attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
-    return Trace(state.entries, state.fit, attempts, state.groups, state.exact)
+    groups = state.groups or ((),) * len(state.entries)  # alternatives are looked for after the effects
+    return Trace(state.entries, state.fit, attempts, groups, state.exact)

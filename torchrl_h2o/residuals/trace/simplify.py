@@ -1,9 +1,10 @@
-"""Replaces each effect by the simplest one with an equivalent held-out loss, and records the alternatives."""
+"""Replaces each effect by the simplest and most usual one with an equivalent loss, and records the alternatives."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.screening import free_parameters
@@ -20,7 +21,10 @@ def simplify(state: SearchState) -> SearchState:
 
 
 def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
-    """Replaces one effect by the equivalent one with the fewest parameters.
+    """Replaces one effect by the equivalent one with the fewest parameters, and among these by the most usual one.
+
+    What is usual on real machines decides where the data cannot: rotor inertia before a body with three times its
+    inertia, friction before a motor at 30 % of its gain.
 
     Args:
         state: effects found so far.
@@ -30,10 +34,9 @@ def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
         The state, with residuals scaled by their size without the effect, and the other equivalent effects.
     """
     state, as_good = _with_better_alternative(state, index)
-    own_loss = float(state.held_out_losses(state.fit.effects).mean())
+    own_loss = float(state.selection_losses(state.fit.effects).mean())
     group = [Attempt(state.entries[index], state.fit, index, own_loss, 1.0), *as_good]
-    place = {entry.name: position for position, entry in enumerate(state.catalogue)}
-    simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), place[a.entry.name]))
+    simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), surprise(a.effect), a.loss))
     rest = tuple(attempt for attempt in group if attempt is not simplest)
     return _replaced(state, index, simplest), rest
 

@@ -28,22 +28,22 @@ class SearchWindows:
         all: windows for the final fit.
         fitted: part of them, for fits during the search.
         screened: part of ``fitted``, for screening and sketches.
-        judged: held-out windows.
+        selected_on: windows by which effects are chosen.
     """
 
     all: np.ndarray
     fitted: np.ndarray
     screened: np.ndarray
-    judged: np.ndarray
+    selected_on: np.ndarray
 
     @classmethod
     def draw(cls, problem: Problem, rng: np.random.Generator, settings: LoopSettings) -> SearchWindows:
         """Chooses the windows of a problem; the screened ones are drawn at random."""
         rules, horizon = settings.trace, problem.horizon
-        every, judged = problem.measured.fitted(horizon), problem.measured.judged(horizon)
+        every, chosen_by = problem.measured.fitted(horizon), problem.measured.selected_on(horizon)
         fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon))
         few = min(max(rules.min_screened, rules.screened_steps // horizon), len(fitted))
-        return cls(every, fitted, np.sort(rng.choice(fitted, few, replace=False)), judged)
+        return cls(every, fitted, np.sort(rng.choice(fitted, few, replace=False)), chosen_by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class SearchState:
         problem: residuals, scaled by their size with these effects put in.
         catalogue: all entries, each with the trials that later screenings use.
         first: the problem before the first effect was found.
-        first_loss: mean held-out loss of ``first`` without any effects.
+        first_loss: mean loss of ``first`` on the selection windows without any effects.
         windows: the windows of the search.
         settings: thresholds and budgets.
         attempts: entries that were sketched in addition to the effects found, by name.
@@ -89,7 +89,7 @@ class SearchState:
         """State of a search that has found nothing yet."""
         windows = SearchWindows.draw(problem, rng, settings)
         nothing = _no_effects(problem, windows.fitted)
-        return cls((), nothing, problem, tuple(catalogue), problem, problem.held_out_loss(()), windows, settings)
+        return cls((), nothing, problem, tuple(catalogue), problem, problem.selection_loss(()), windows, settings)
 
     @property
     def others(self) -> tuple[CatalogueEntry, ...]:
@@ -122,12 +122,12 @@ class SearchState:
             settings=self.settings.fit,
         )
 
-    def held_out_losses(self, effects: Sequence[Effect]) -> np.ndarray:
-        """Robust loss of each held-out window, (W), with effects put in."""
-        return losses(self.problem.residual(effects, self.windows.judged))
+    def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
+        """Robust loss of each selection window, (W), with effects put in."""
+        return losses(self.problem.residual(effects, self.windows.selected_on))
 
     def p_value(self, before: np.ndarray, after: np.ndarray) -> float:
-        """p-value of a decrease of held-out losses, (W) each."""
+        """p-value of a decrease of losses on the selection windows, (W) each."""
         return p_value_of_losses(before, after, self.settings.significance)
 
     def posed_at(self, effects: Sequence[Effect]) -> Problem:

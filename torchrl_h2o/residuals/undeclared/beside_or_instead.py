@@ -70,10 +70,10 @@ def add_undeclared_force(
     compared = [parts, *(candidate.parts for candidate in candidates)]
     problem = _with_least_noise(simulation, measured, compared, settings)
     first = Problem.pose(simulation, measured, settings=settings.residual)
-    before = _held_out_losses(problem, parts)
+    before = _selection_losses(problem, parts)
     paying = []
     for candidate in candidates:
-        after = _held_out_losses(problem, candidate.parts)
+        after = _selection_losses(problem, candidate.parts)
         pays = _pays(first, before, after, parts, candidate.parts, settings)
         if pays and _beyond_noise(candidate, measured, rng, settings):
             paying.append((candidate.parts, after.mean()))
@@ -131,8 +131,8 @@ def _with_least_noise(
     return replace(posed, simulation=simulation)
 
 
-def _held_out_losses(problem: Problem, parts: Parts) -> np.ndarray:
-    return losses(problem.residual([part.effect for part in parts], problem.measured.judged()))
+def _selection_losses(problem: Problem, parts: Parts) -> np.ndarray:
+    return losses(problem.residual([part.effect for part in parts], problem.measured.selected_on()))
 
 
 def _pays(
@@ -143,7 +143,7 @@ def _pays(
     gains = after.mean() < (1.0 - rules.min_gain_over_catalogue) * before.mean()
     if not (gains and p_value_of_losses(before, after, test) < test.level):
         return False
-    none, present, proposed = (first.held_out_loss([part.effect for part in some]) for some in ((), parts, candidate))
+    none, present, proposed = (first.selection_loss([part.effect for part in some]) for some in ((), parts, candidate))
     return matters(none, present, proposed, rules.min_share)
 
 

@@ -70,7 +70,7 @@ def find_undeclared(
     found = _grown(regression, progress or (lambda words: None))
     if found is None:
         return None
-    judged = measured.judged()
+    judged = measured.selected_on()
     before, after = problem.residual((), judged), problem.residual(found.effects, judged)
     gain = losses(before) - losses(after)
     p_one_step = p_value_of_losses(losses(before), losses(after), settings.significance)
@@ -151,7 +151,7 @@ def _p_value_further(
 ) -> float:
     """p-value of the decrease of the loss several steps ahead, from one force to another."""
     measured, steps = regression.problem.measured, regression.settings.undeclared.further_steps
-    starts = measured.judged(steps) if held_out else measured.fitted(steps)
+    starts = measured.selected_on(steps) if held_out else measured.fitted(steps)
     loss_before, loss_after = (losses(regression.further.residual(forces, starts)) for forces in (before, after))
     return p_value_of_losses(loss_before, loss_after, regression.settings.significance)
 

@@ -52,4 +52,4 @@ def _refitted(
         Part(effect, parts[i].declared, result.ci95(position), parts[i].alike)
         for position, (i, effect) in enumerate(zip(chosen, result.effects, strict=True))
     )
-    return refitted, losses(problem.residual(result.effects, problem.measured.judged()))
+    return refitted, losses(problem.residual(result.effects, problem.measured.selected_on()))

@@ -1,0 +1,75 @@
+"""The verdict: nothing missing, explained, explained in part, or not explained."""
+
+import pytest
+
+from tests.residuals.pendulum import UnknownForce, pendulum, recorded
+from torchrl_h2o.effects import Gravity, JointDamping, JointFrictionLoss
+from torchrl_h2o.residuals.judge.held_out_error import error_summary
+from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
+from torchrl_h2o.residuals.judge.verdict import reach_verdict
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
+from torchrl_h2o.residuals.report.contents import (
+    EXPLAINED,
+    EXPLAINED_IN_PART,
+    NOT_EXPLAINED,
+    NOTHING_MISSING,
+    TwoSample,
+    Verdict,
+)
+
+SIMULATION = pendulum()
+
+
+def verdict(truth, found=(), noise=0.01, rows=3000):
+    measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
+    mended = SIMULATION.with_effects(*found)
+    error = error_summary(SIMULATION, mended, measured)
+    auc = two_sample_auc(mended, measured, sensor_std=sensor_noise(mended, measured))
+    return reach_verdict(SIMULATION, mended, measured, found, error, TwoSample(None, auc))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_nothing_is_missing_from_an_equal_simulator(noise):
+    assert verdict((), noise=noise) == Verdict(NOTHING_MISSING)
+
+
+def test_a_slow_effect_shows_far_ahead():
+    """One step ahead, the noise of the sensors hides it."""
+    slow = verdict((JointDamping(0.02),), noise=0.003)
+    assert slow.kind == NOT_EXPLAINED
+    assert any("ahead" in reason for reason in slow.reasons)
+
+
+def test_an_effect_that_was_not_found_is_said_to_be_missing_and_where_it_shows():
+    late = UnknownForce(0.3, lambda q, v, t: (t > 27.0) + 0.0 * q)
+    missing = verdict((late,))
+    assert missing.kind == NOT_EXPLAINED
+    assert not missing.recommended
+    assert missing.where.startswith("most in elbow")
+
+
+def test_the_right_effect_explains_and_is_recommended():
+    right = verdict((Gravity(1.3),), (Gravity(1.3),))
+    assert (right.kind, right.recommended) == (EXPLAINED, True)
+
+
+def test_half_an_explanation_is_called_that():
+    half = verdict((Gravity(1.5), JointFrictionLoss(0.1)), (Gravity(1.5),))
+    assert half.kind == EXPLAINED_IN_PART
+    assert half.recommended
+
+
+def test_an_effect_that_does_not_lower_the_error_is_not_recommended():
+    wrong = verdict((JointFrictionLoss(0.1),), (Gravity(0.8),))
+    assert wrong.kind == NOT_EXPLAINED
+    assert not wrong.recommended
+    assert "do not lower the error" in wrong.reasons[0]
+
+
+def test_a_value_beyond_belief_is_not_recommended():
+    assert not verdict((Gravity(0.02),), (Gravity(0.02),), noise=0.0).recommended
+
+
+def test_an_unknown_kind_is_refused():
+    with pytest.raises(ValueError, match="choose nothing missing"):
+        Verdict("fine")

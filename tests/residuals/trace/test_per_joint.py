@@ -1,0 +1,46 @@
+"""One value for all joints against one value each: decided by the data."""
+
+import numpy as np
+import pytest
+from tqdm import tqdm
+
+from tests.residuals.pendulum import double_pendulum, recorded
+from torchrl_h2o.effects import CatalogueEntry, JointFrictionLoss
+from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals.trace.per_joint import entries_of_elements
+
+SIMULATION = double_pendulum()
+TRIALS = ({"torque": 0.02}, {"torque": 0.1})
+ALL, SHOULDER, ELBOW = (CatalogueEntry(JointFrictionLoss(joints=j), TRIALS) for j in ("*", "shoulder", "elbow"))
+CATALOGUE = (SHOULDER, ELBOW, ALL)
+
+
+def friction(shoulder, elbow, noise):
+    truth = (JointFrictionLoss(shoulder, "shoulder"), JointFrictionLoss(elbow, "elbow"))
+    measured = recorded(SIMULATION.with_effects(*truth), 3000, noise=noise)
+    with tqdm(disable=True) as progress:
+        trace = trace_effects(SIMULATION, measured, CATALOGUE, rng=np.random.default_rng(0), progress=progress)
+    return trace.fit.effects
+
+
+def torques(effects):
+    """Friction added to each joint, by all effects together."""
+    model = SIMULATION.with_effects(*effects).model
+    return [float(model.dof_frictionloss[model.joint(joint).dofadr[0]]) for joint in ("shoulder", "elbow")]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_joints_that_differ_have_a_value_each(noise):
+    assert torques(friction(0.15, 0.03, noise)) == pytest.approx([0.15, 0.03], rel=0.1)
+
+
+def test_joints_that_are_equal_share_a_value():
+    effects = friction(0.08, 0.08, 0.002)
+    assert [effect.joints for effect in effects] == ["*"]
+    assert torques(effects) == pytest.approx([0.08, 0.08], rel=0.05)
+
+
+def test_elements_of_an_effect_on_several_joints():
+    assert entries_of_elements(ALL, CATALOGUE, SIMULATION) == (SHOULDER, ELBOW)
+    assert entries_of_elements(ALL, (SHOULDER, ALL), SIMULATION) == ()
+    assert entries_of_elements(ELBOW, CATALOGUE, SIMULATION) == ()

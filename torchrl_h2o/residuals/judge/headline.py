@@ -1,0 +1,72 @@
+"""The error that the report's sentence names: one quantity, some time ahead, before and after."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
+from torchrl_h2o.residuals.measured.transitions import Measured, thinned
+from torchrl_h2o.residuals.report.contents import HeadlineError
+from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+_VELOCITY = ("rad/s", "m/s")
+
+
+def headline_horizon(
+    simulation: Simulation, measured: Measured, settings: JudgeSettings = DEFAULTS.judge
+) -> int | None:
+    """Control steps ahead at which the sentence reports the error; None if the data hold too few windows.
+
+    The shortest of the settings' times at which the simulator's error stands out of the sensors' noise, on the part of
+    the data for fits; the longest possible one if it never does.
+
+    Args:
+        simulation: the simulator before effects are put in.
+        measured: the data.
+        settings: times to choose from.
+    """
+    sensor_std, rng = sensor_noise(simulation, measured), np.random.default_rng(0)
+    chosen = None
+    for seconds in settings.headline_seconds:
+        steps = max(1, round(seconds / simulation.control_step))
+        if len(measured.reported_on(steps)) < settings.headline_windows:
+            break
+        chosen, starts = steps, thinned(measured.fitted(steps), settings.noise_windows)
+        if sensor_std is None or not len(starts):
+            break
+        if error_over_noise(simulation, measured, starts, steps, sensor_std, rng).max() > settings.headline_stands_out:
+            break
+    return chosen
+
+
+def headline_error(simulation: Simulation, mended: Simulation, measured: Measured, steps: int) -> HeadlineError:
+    """The median error some steps ahead of the quantity in which it is largest, in units of the quantity's spread.
+
+    A position is preferred to a velocity, because it is easier to picture.
+
+    Args:
+        simulation: the simulator before effects are put in.
+        mended: the simulator with them.
+        measured: the data.
+        steps: control steps ahead.
+    """
+    starts = measured.reported_on(steps)
+    before, after = (_median(which, measured, starts, steps) for which in (simulation, mended))
+    names, units = simulation.state_map.names, simulation.state_map.units
+    spread = np.maximum(measured.observation.std(0), 1e-12)
+    positions = np.array([unit not in _VELOCITY for unit in units])
+    if not positions.any():
+        positions[:] = True
+    index = int(np.where(positions, before / spread, -1.0).argmax())
+    return HeadlineError(
+        names[index], units[index], steps * simulation.control_step, float(before[index]), float(after[index])
+    )
+
+
+def _median(simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:
+    # the simulator's own action noise is drawn, because it is part of the simulator's error
+    missed = residuals(simulation, measured, starts, steps, rng=np.random.default_rng(0))[:, -1]
+    return np.nanmedian(np.abs(missed), axis=0)

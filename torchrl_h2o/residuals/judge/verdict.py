@@ -1,0 +1,186 @@
+"""The verdict: whether anything is missing, whether the effects explain it, and whether to put them in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import mannwhitneyu
+
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.judge.separation import where_it_is_large
+from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.contents import (
+    EXPLAINED,
+    EXPLAINED_IN_PART,
+    NOT_EXPLAINED,
+    NOTHING_MISSING,
+    ErrorSummary,
+    TwoSample,
+    Verdict,
+)
+from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+
+
+def reach_verdict(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    effects: Sequence[Effect],
+    error: ErrorSummary,
+    two_sample: TwoSample,
+    settings: LoopSettings = DEFAULTS,
+) -> Verdict:
+    """Reaches a verdict from the part of the data that neither a fit nor a choice has used.
+
+    Nothing is missing only if a classifier, the autocorrelation of the residuals and the error far ahead agree.
+    Otherwise something is missing, and effects that were found explain it wholly, in part or not at all.
+
+    Args:
+        simulation: the simulator before effects are put in.
+        mended: the simulator with them.
+        measured: the data.
+        effects: the effects.
+        error: errors before and after.
+        two_sample: AUC of the classifier before and after.
+        settings: thresholds.
+    """
+    rules = settings.verdict
+    signs = signs_of_something_missing(mended, measured, error, two_sample, settings)
+    if not effects:
+        if not signs:
+            return Verdict(NOTHING_MISSING)
+        return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
+    against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
+    small = error.headline is not None and error.headline.after < rules.small_rest * error.headline.before
+    if signs and not small:
+        where = where_most(mended, measured, settings)
+        kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
+        return Verdict(kind, (*against, *signs), recommended=not against, where=where)
+    return Verdict(NOT_EXPLAINED if against else EXPLAINED, against, recommended=not against)
+
+
+def signs_of_something_missing(
+    simulation: Simulation,
+    measured: Measured,
+    error: ErrorSummary,
+    two_sample: TwoSample,
+    settings: LoopSettings = DEFAULTS,
+) -> tuple[str, ...]:
+    """The tests by which a simulation with all effects still differs from the data, each in words with its figure."""
+    rules, signs = settings.verdict, []
+    auc = two_sample.auc_after
+    if auc is not None and auc > rules.auc:
+        signs.append(f"a classifier tells measured from simulated transitions (AUC {number(auc, 2)})")
+    correlations = {d.name: d.autocorrelation for d in error.per_dimension if d.autocorrelation is not None}
+    high = {name: value for name, value in correlations.items() if np.isfinite(value) and value > rules.autocorrelation}
+    if high:
+        name = max(high, key=lambda name: high[name])
+        signs.append(f"successive residuals of {name} are alike (rank correlation {number(high[name], 2)})")
+    far = _far_ahead(simulation, measured, settings)
+    return (*signs, *far)
+
+
+def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSettings) -> tuple[str, ...]:
+    """Whether the error far ahead exceeds what the sensors' noise causes."""
+    rules, names, units = settings.verdict, simulation.state_map.names, simulation.state_map.units
+    times = [max(1, round(seconds / simulation.control_step)) for seconds in settings.horizon.seconds]
+    possible = [steps for steps in times if len(measured.reported_on(steps)) >= rules.far_windows]
+    if not possible:
+        return ()
+    steps = max(possible)
+    spread = np.maximum(measured.observation.std(0), 1e-12)
+    sensor_std = sensor_noise(simulation, measured)
+    if sensor_std is None:
+        sensor_std = np.zeros(len(names))
+    starts, rng = measured.reported_on(steps), np.random.default_rng(0)
+    error, by_noise = errors_and_noise(simulation, measured, starts, steps, sensor_std, rng)
+    if len(error) < rules.far_windows:
+        return ()
+    usual = np.maximum(np.median(by_noise, axis=0), rules.far_negligible * spread)
+    ratio = np.median(error, axis=0) / usual
+    worst = int(ratio.argmax())
+    p = mannwhitneyu(error[:, worst], np.maximum(by_noise[:, worst], usual[worst]), alternative="greater").pvalue
+    if ratio[worst] <= rules.far_ratio or p >= settings.significance.level / len(names):
+        return ()
+    missed, noise = (quantity(v, units[worst], 2) for v in (np.median(error[:, worst]), usual[worst]))
+    ahead = duration(steps * simulation.control_step)
+    return (f"{names[worst]} is wrong by {missed} {ahead} ahead, where the sensors' noise explains {noise}",)
+
+
+def reasons_against(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    effects: Sequence[Effect],
+    error: ErrorSummary,
+    two_sample: TwoSample,
+    settings: LoopSettings = DEFAULTS,
+) -> tuple[str, ...]:
+    """Reasons against putting effects into a simulator for training; empty if there are none."""
+    rules, reasons = settings.verdict, []
+    acting = [effect for effect in effects if not effect.random]
+    if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
+        reasons.append("the effects found do not lower the error on data that chose nothing")
+    head, auc = error.headline, two_sample.auc_after
+    halved = head is not None and head.after < rules.much_lower * head.before
+    if auc is not None and auc > rules.auc_near_one and not halved:
+        reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")
+    reasons += [
+        f"{effect_words(effect)} is at the end of what was allowed" for effect in effects if _extreme(effect, rules)
+    ]
+    return tuple(reasons)
+
+
+def _lowers_the_error(
+    simulation: Simulation, mended: Simulation, measured: Measured, error: ErrorSummary, settings: LoopSettings
+) -> bool:
+    """Whether the error on the report's data falls significantly, one step ahead or as far as the sentence says."""
+    ahead = {1} if error.headline is None else {1, max(1, round(error.headline.seconds / simulation.control_step))}
+    spread = np.maximum(measured.observation.std(0), 1e-12)
+    for steps in ahead:
+        starts = measured.reported_on(steps)
+        sizes = []
+        for which in (simulation, mended):
+            missed = residuals(which, measured, starts, steps)[:, -1] / spread
+            sizes.append(np.nan_to_num(np.abs(missed), nan=settings.residual.worst).mean(1))
+        level = settings.verdict.level / len(ahead)
+        if len(starts) >= 2 and p_value_of_losses(sizes[0], sizes[1], settings.significance) < level:
+            return True
+    return False
+
+
+def _extreme(effect: Effect, rules) -> bool:
+    """Whether a parameter is at a bound, or a property of the model differs by an implausible factor."""
+    for parameter in effect.parameters.values():
+        low, high = parameter.bounds
+        width = 1e-3 * (high - low) if np.isfinite(high - low) else 0.0
+        scale = parameter.neutral == 1.0 and parameter.value > 0.0
+        if scale and not 1.0 / rules.extreme_factor < parameter.value < rules.extreme_factor:
+            return True
+        inner = parameter.value - low > width and high - parameter.value > width
+        if not scale and not inner and parameter.value != parameter.neutral:
+            return low != parameter.neutral or high - parameter.value <= width
+    return False
+
+
+def where_most(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> str:
+    """When, in which quantity and at which states the remaining one-step residual is largest, as a clause."""
+    rows = measured.reported_on()
+    missed = np.abs(residuals(simulation, measured, rows)[:, 0])
+    change = np.maximum((measured.following - measured.observation)[rows].std(0), 1e-12)
+    size = np.nan_to_num(missed / change, nan=0.0)
+    dimension = int(size.mean(0).argmax())
+    blocks = np.array_split(np.arange(len(rows)), settings.verdict.blocks)
+    block = max(blocks, key=lambda part: size[part, dimension].mean() if len(part) else -1.0)
+    begin, end = (number(float(measured.time[rows[edge]]), 3) for edge in (block[0], block[-1]))
+    rules = settings.judge
+    most = np.argsort(size[:, dimension])[-max(1, round(rules.separation_share * len(rows))) :]
+    where = where_it_is_large(simulation, measured, rows, size[:, dimension], most, rules.separation_factor)
+    return f"most in {simulation.state_map.names[dimension]}, between {begin} and {end} s{where and ',' + where}"
