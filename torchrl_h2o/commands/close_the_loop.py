@@ -82,7 +82,7 @@ def main(cfg: DictConfig) -> None:
         recording.transitions,
         chosen_entries(cfg, simulation),
         source=recording.source,
-        held_out=recording.held_out_indices,
+        held_out=recording.reported_on,
         seed=cfg.seed,
     )
     report.save(directory)

@@ -33,7 +33,7 @@ class Recording:
         source: name of the data and the range of the selected rows.
         columns: description of the log's columns; None if the data are not a log.
         logs: names of the logs, or of the data set.
-        held_out: what no fit and no choice uses: a share of the transitions, from the end, or the names of logs.
+        held_out: what neither a fit nor a choice uses: a share of the transitions, from the end, or the names of logs.
     """
 
     transitions: TensorDictBase
@@ -48,8 +48,8 @@ class Recording:
         return self.held_out if isinstance(self.held_out, tuple) else ()
 
     @property
-    def held_out_indices(self) -> float | tuple[int, ...]:
-        """The share, or the indices in ``logs`` of the logs that are held out, as ``close_the_loop`` takes them."""
+    def reported_on(self) -> float | tuple[int, ...]:
+        """What errors are reported on: a share of the transitions, from the end, or the indices of logs."""
         if not isinstance(self.held_out, tuple):
             return self.held_out
         return tuple(self.logs.index(name) for name in self.held_out)
