@@ -16,12 +16,12 @@ import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages whose warning
 import time
 from pathlib import Path
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.objectives import SoftUpdate
 
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate, make_actor, make_qvalue, total_loss
 from torchrl_h2o.training.collection import simulated_transitions
@@ -41,7 +41,7 @@ from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resum
 from torchrl_h2o.training.task import Task
 
 
-@hydra.main(config_path="config", config_name="h2o_plus", version_base=None)
+@hydra_main("config", "h2o_plus")
 def main(cfg: DictConfig) -> None:
     cfg, folder = open_run(cfg)
     with claimed(folder), resumable(folder):

@@ -15,16 +15,16 @@ import torchrl_h2o.quiet  # noqa: F401, I001  (must precede the packages that it
 import sys
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.comparison.grids import check_overrides, chosen_grid, group_name
 from torchrl_h2o.comparison.launching import GridLauncher, shared_overrides
 from torchrl_h2o.comparison.recorded_run import train_grid_run
 
 
-@hydra.main(config_path="config", config_name="paper", version_base=None)
+@hydra_main("config", "paper")
 def main(cfg: DictConfig) -> None:
     shared = shared_overrides(HydraConfig.get().overrides.task)
     try:

@@ -13,9 +13,9 @@ import torchrl_h2o.quiet  # noqa: F401, I001  (before the packages that it keeps
 import sys
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.comparison.results_file import read_rows
 from torchrl_h2o.comparison.robot_figures import draw_robot
 from torchrl_h2o.comparison.robot_trajectories import kept_results
@@ -23,7 +23,7 @@ from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
 from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_seeds
 
 
-@hydra.main(config_path="config", config_name="report", version_base=None)
+@hydra_main("config", "report")
 def main(cfg: DictConfig) -> None:
     results = Path(cfg.results or Path(__file__).parent / "results")
     to = Path(cfg.to or results)

@@ -11,17 +11,17 @@ python recipes/train.py resume=outputs/wheel_legged/...                    # con
 
 import torchrl_h2o.quiet  # noqa: F401, I001  (must precede the packages that it silences)
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.comparison.recorded_run import train_and_record
 from torchrl_h2o.training.populations.job import run_population
 from torchrl_h2o.training.populations.loop import members_of
 from torchrl_h2o.training.run_folder import claimed, open_run, resumable
 
 
-@hydra.main(config_path="config", config_name="train", version_base=None)
+@hydra_main("config", "train")
 def main(cfg: DictConfig) -> None:
     if OmegaConf.is_missing(cfg, "resume"):
         cfg.overrides = list(HydraConfig.get().overrides.task)

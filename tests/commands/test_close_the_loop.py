@@ -1,5 +1,6 @@
 """The close-the-loop command: its report, its errors, and training in the mended simulator."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -7,6 +8,7 @@ import sys
 from pathlib import Path
 
 import hydra
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -15,10 +17,12 @@ from torchrl_h2o.commands.close_the_loop import chosen_entries, expanded, make_s
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import LogColumns, write_ted
 from torchrl_h2o.data.readers.ted import to_ted
-from torchrl_h2o.effects import Gravity, JointDamping
+from torchrl_h2o.effects import Gravity, JointDamping, JointForce
 from torchrl_h2o.envs import WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import DataSummary, DimensionError, ErrorSummary, FoundEffect
+from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
+from torchrl_h2o.residuals.report.words import effect_units, effect_words
 from torchrl_h2o.training.environments import make_simulator
 
 ROOT = Path(__file__).parents[2]
@@ -111,6 +115,11 @@ def test_an_mjcf_file_and_a_log_are_enough(robot):
     assert written["sentence"] in done.stdout
     assert "N·m·s/rad" in done.stdout
     assert "out/report.html" in done.stdout
+    assert written["mended_model"] == {"file": "mended.xml", "failure": None, "left_out": [], "remedy": None}
+    assert "out/mended.xml" in done.stdout
+    mended = mujoco.MjModel.from_xml_path(str(robot / "out" / "mended.xml"))
+    assert mended.dof_damping[0] == pytest.approx(0.12, rel=0.02)
+    assert [window["rank"] for window in written["windows"]] == ["worst", "median", "best"]
 
 
 def test_the_overrides_of_a_task_work_as_they_are_said(compose, tmp_path):
@@ -240,6 +249,17 @@ def test_what_is_printed_is_short_and_has_units(capsys, tmp_path):
         assert part in printed
     assert "gap_fix=" in printed
     assert len(printed.splitlines()) < 20
+
+
+def test_units_and_effects_that_the_model_s_file_lacks_are_printed(capsys, tmp_path):
+    names = {"joints": ["rail"], "joint_bodies": ["cart"], "joint_types": ["slide"]}
+    push = JointForce(6.72, "rail")
+    found = FoundEffect(push, True, {"torque": (6.5, 6.9)}, 0.1, effect_words(push, names), effect_units(push, names))
+    mended = MendedModel("mended.xml", (LeftOut(push, "MJCF has no such force", effect_words(push, names)),))
+    print_report(dataclasses.replace(report(), found=(found,), mended_model=mended), tmp_path)
+    printed = capsys.readouterr().out
+    assert "force" + " " * 17 + "6.72  6.5 to 6.9 N\n" in printed
+    assert "not in mended.xml: constant force of 6.72 N on joints rail" in printed
 
 
 def test_a_report_mends_the_simulator_behind_its_own_gap(compose, tmp_path):

@@ -10,20 +10,22 @@ close-the-loop --guess data=log.csv simulator=robot.xml                # writes 
 import os
 import re
 import sys
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.envs import TransformedEnv
 
 from torchrl_h2o.commands.guess import GUESS, guess_columns
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.commands.recording import Recording, read_recording
-from torchrl_h2o.effects import CatalogueEntry, paper_gap
+from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
+from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
 
 
 def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
@@ -71,7 +73,7 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
     return [entry for entry in entries if any(fnmatchcase(names[entry.name], pattern) for pattern in patterns)]
 
 
-@hydra.main(config_path="../config", config_name="close_the_loop", version_base=None)
+@hydra_main("../config", "close_the_loop")
 def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
@@ -85,6 +87,8 @@ def main(cfg: DictConfig) -> None:
         held_out=recording.reported_on,
         seed=cfg.seed,
     )
+    if report.found:
+        report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
     report.save(directory)
     print_report(report, directory)
 
@@ -96,16 +100,25 @@ def print_report(report: Report, directory: Path) -> None:
         print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
     for found in report.found:
         for row, (name, parameter) in enumerate(found.effect.parameters.items()):
-            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            symbol = found.units[name]
+            unit = "" if symbol == "1" else f" {symbol}"
             low, high = found.ci95.get(name, (float("nan"), float("nan")))
             label = found.name if row == 0 else ""
-            print(f"{label:<48}{name:<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}")
+            print(
+                f"{label:<48}{quantity_name(name, symbol):<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}"
+            )
     if report.error is not None:
         print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
         for dimension in report.error.per_dimension:
             print(f"{dimension.name:<48}{dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
     folder = os.path.relpath(directory)
     print(f"\nresults    {folder}/report.json\nreport     {folder}/report.html")
+    mended = report.mended_model
+    if mended is not None and mended.file is not None:
+        print(f"model      {folder}/{mended.file}")
+    if mended is not None and mended.left_out:
+        where = f"not in {mended.file}" if mended.file else f"no {FILE} ({mended.failure})"
+        print(f"           {where}: {'; '.join(left.words for left in mended.left_out)}")
     if report.found:
         print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")
 

@@ -8,9 +8,9 @@ h2o-evaluate checkpoint=... method="SAC in the simulator" film=frames   # a fold
 import json
 from pathlib import Path
 
-import hydra
 from omegaconf import DictConfig
 
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of, task_of
 from torchrl_h2o.training.film import film
 from torchrl_h2o.training.methods import method_named
@@ -21,7 +21,7 @@ from torchrl_h2o.training.trained_policy import load_policy
 WORLDS = {"reality": make_reality, "simulator": make_simulator}
 
 
-@hydra.main(config_path="../config", config_name="evaluate", version_base=None)
+@hydra_main("../config", "evaluate")
 def main(options: DictConfig) -> None:
     directory, world = Path(options.checkpoint), options["in"]
     if world not in WORLDS:

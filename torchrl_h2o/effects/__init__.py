@@ -19,6 +19,7 @@ from torchrl_h2o.effects.effect import (
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.force.residual_force import ResidualForce
 from torchrl_h2o.effects.indices import Indices
+from torchrl_h2o.effects.joint_units import joint_names, quantity_name
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
@@ -32,6 +33,7 @@ from torchrl_h2o.effects.model.joint import (
 )
 from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
 from torchrl_h2o.effects.model.timestep import Timestep
+from torchrl_h2o.effects.negligible import is_negligible
 from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation.sensor import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
@@ -96,6 +98,9 @@ __all__ = [
     "compile_model",
     "effect_from_dict",
     "effect_to_dict",
+    "is_negligible",
+    "joint_names",
     "paper_gap",
     "parameter",
+    "quantity_name",
 ]

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects.indices import Indices, checked_indices
+from torchrl_h2o.effects.joint_units import motion, unit_under
 from torchrl_h2o.effects.parameter import Parameter
 from torchrl_h2o.effects.selection import Names, checked_names
 
@@ -34,8 +35,8 @@ class Effect(ABC):
 
     A subclass is a frozen dataclass. Fields made by :func:`parameter` are its parameters; all other fields select what
     it acts on, by name patterns (``Names``) or indices (``Indices``). The class attribute ``wording`` describes the
-    effect, with the fields' names in braces. ``random`` marks effects that draw from the generator that
-    :meth:`process` receives.
+    effect, with the fields' names in braces, and ``{load}`` for "torque" or "force". ``random`` marks effects that draw
+    from the generator that :meth:`process` receives.
 
     Raises:
         ValueError: for a parameter that is not a number within its bounds, or a field of type ``Names`` or
@@ -96,6 +97,24 @@ class Effect(ABC):
             if "unit" in field.metadata
         }
 
+    def parameters_on(self, names: EntryNames) -> dict[str, Parameter]:
+        """The parameters by name, with the units of the joints that the effect acts on.
+
+        Args:
+            names: the joints of the model, as for :meth:`describe`.
+
+        Examples:
+            >>> from torchrl_h2o.effects import JointDamping
+            >>> joints = {"joints": ["rail"], "joint_bodies": ["cart"], "joint_types": ["slide"]}
+            >>> str(JointDamping(0.1, "rail").parameters_on(joints)["damping"])
+            '0.1 N·s/m'
+        """
+        moving = motion(getattr(self, "joints", None), names)
+        return {
+            name: dataclasses.replace(parameter, unit=unit_under(moving, parameter.unit))
+            for name, parameter in self.parameters.items()
+        }
+
     @property
     def is_neutral(self) -> bool:
         """Whether every parameter has its neutral value, so that the effect changes nothing."""
@@ -113,27 +132,30 @@ class Effect(ABC):
         """Describes the effect in words with units.
 
         Args:
-            names: names for the entries that are selected by index, by field (``"actuators"``, ``"entries"``).
+            names: names for the entries that are selected by index, by field (``"actuators"``, ``"entries"``), and
+                the joints of the model, from :func:`~torchrl_h2o.effects.joint_names`. Without the joints, units are
+                those of hinges.
 
         Examples:
             >>> from torchrl_h2o.effects import ActionGain
             >>> ActionGain(0.7, (0, 1)).describe(), ActionGain(0.7, (0, 1)).describe({"actuators": ["hip", "knee"]})
             ('actuators 0, 1 × 0.7', 'actuators hip, knee × 0.7')
         """
-        parameters = self.parameters
+        parameters = self.parameters_on(names)
         chosen = {
             field.name: _in_words(field.name, getattr(self, field.name), names.get(field.name, ()))
             for field in dataclasses.fields(self)
             if field.name not in parameters
         }
-        return self.wording.format(**parameters, **chosen)
+        load = motion(getattr(self, "joints", None), names).value
+        return self.wording.format(**parameters, **chosen, load=load)
 
 
-def _in_words(field: str, chosen: str | tuple | None, names: Sequence[str]) -> str:
+def _in_words(field: str, chosen: Any, names: Sequence[str]) -> str:
     """Words for a selection: "all joints" for ``"*"``; "actuators 0, 2" for ``(0, 2)``, or their names."""
     if chosen is None or chosen == "*":
         return f"all {field}"
-    selected: tuple[Any, ...] = (chosen,) if isinstance(chosen, str) else chosen
+    selected = chosen if isinstance(chosen, tuple) else (chosen,)
     return f"{field} {', '.join(names[int(i)] if i in range(len(names)) else str(i) for i in selected)}"
 
 

@@ -20,7 +20,7 @@ from torchrl_h2o.residuals.report.contents import (
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
-from torchrl_h2o.residuals.report.words import UNDECLARED, effect_words
+from torchrl_h2o.residuals.report.words import UNDECLARED, effect_units, effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.significance import stop_test
@@ -44,8 +44,7 @@ def compose_report(
         settings: thresholds, for the description of the stop test.
     """
     simulation, measured = evidence.simulation, judgement.measured
-    names = {"entries": simulation.state_map.names, "actuators": simulation.actuators}
-    words = partial(effect_words, names=names)
+    words, units = partial(effect_words, names=simulation.names), partial(effect_units, names=simulation.names)
     together = _fitted_together(explanation)
     return Report(
         simulator=simulation.name,
@@ -58,10 +57,11 @@ def compose_report(
                 part.ci95,
                 error_after,
                 words(part.effect) if part.declared else f"{UNDECLARED}: {words(part.effect)}",
+                units(part.effect),
             )
             for part, error_after in zip(explanation.parts, judgement.errors_after, strict=True)
         ),
-        rejected=_rejected(explanation, judgement, words),
+        rejected=_rejected(explanation, judgement, words, units),
         indistinguishable=tuple(
             IndistinguishableGroup(
                 group.effects,
@@ -76,6 +76,8 @@ def compose_report(
         unexplained_intervals=_intervals(judgement),
         stop_test=stop_test(settings),
         wall_s=wall_s,
+        windows=judgement.windows,
+        runs=judgement.runs,
         trace=judgement.trace,
         verdict=judgement.verdict,
         failures=judgement.failures,
@@ -96,12 +98,12 @@ def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) 
         stage: what was going on.
     """
     simulation = evidence.simulation
-    words = partial(effect_words, names={"entries": simulation.state_map.names, "actuators": simulation.actuators})
+    words, units = partial(effect_words, names=simulation.names), partial(effect_units, names=simulation.names)
     return Report(
         simulator=simulation.name,
         data=_data_summary(evidence.measured),
         found=tuple(
-            FoundEffect(part.effect, part.declared, part.ci95, math.nan, words(part.effect))
+            FoundEffect(part.effect, part.declared, part.ci95, math.nan, words(part.effect), units(part.effect))
             for part in explanation.parts
         ),
         failures=explanation.failures,
@@ -126,7 +128,7 @@ def _data_summary(measured: Measured) -> DataSummary:
     return DataSummary(measured.source, len(measured), int(measured.held_out.sum()), measured.left_out)
 
 
-def _rejected(explanation: Explanation, judgement: Judgement, words) -> tuple[RejectedEffect, ...]:
+def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> tuple[RejectedEffect, ...]:
     """The attempts that are not part of the explanation, each with the reason."""
     alike = {attempt.entry.name for group in explanation.trace.groups for attempt in group}
     reasons = {
@@ -135,7 +137,12 @@ def _rejected(explanation: Explanation, judgement: Judgement, words) -> tuple[Re
     }
     return tuple(
         RejectedEffect(
-            attempt.effect, error, attempt.p_value, reasons[attempt.entry.name in alike], words(attempt.effect)
+            attempt.effect,
+            error,
+            attempt.p_value,
+            reasons[attempt.entry.name in alike],
+            words(attempt.effect),
+            units(attempt.effect),
         )
         for attempt, error in judgement.rejected
     )

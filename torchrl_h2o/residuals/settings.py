@@ -278,6 +278,14 @@ class JudgeSettings:
     """Median error over the median error by sensor noise at which the sentence's time is chosen."""
     noise_windows: int = 100
     """Largest number of windows by which this is decided."""
+    shown_seconds: float = 0.1
+    """Time ahead, in s, of the windows that the report shows."""
+    shown_steps: int = 5
+    """Smallest number of control steps in these windows."""
+    shown_quantities: int = 4
+    """Largest number of quantities shown of a window, those with the largest errors."""
+    max_runs: int = 200
+    """Largest number of runs whose errors are listed."""
     max_rejected: int = 30
     """Largest number of rejected effects in the report."""
     rounding: float = 1e-5

@@ -17,7 +17,9 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
 )
 from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.windows import RunError, ShownWindow, WindowQuantity
 
 DATA = DataSummary("swing_up.csv", 5000, 1500, {"a gap in time": 12, "velocity clipped at ±10 rad/s": 3})
 
@@ -48,6 +50,25 @@ def full_report() -> Report:
         wall_s=84.2,
         trace=trace(),
     )
+
+
+def windowed() -> Report:
+    """The full report with windows, runs and a model, as a file of today has them."""
+    ahead = tuple(0.02 * i for i in range(6))
+
+    def quantity(name: str, unit: str, size: float) -> WindowQuantity:
+        measured, before, after = (tuple(size * gain * t for t in ahead) for gain in (1.0, 1.9, 1.05))
+        return WindowQuantity(name, unit, measured, (*before[:-1], float("nan")), after)
+
+    quantities = (quantity("elbow angle", "rad", 1.0), quantity("elbow velocity", "rad/s", 10.0))
+    shown = (
+        ShownWindow(rank, run, 100 * run, 2.0 * run, ahead, float("nan"), 0.1 / (1 + run), quantities)
+        for run, rank in enumerate(("worst", "median", "best"))
+    )
+    runs = (RunError("0", 3500, 0.031, 0.004, False), RunError("1", 1500, 0.029, 0.0041, True))
+    left = LeftOut(JointFrictionLoss(0.0412, "elbow"), "MJCF has no such force")
+    mended = MendedModel("mended.xml", (left,))
+    return dataclasses.replace(full_report(), windows=tuple(shown), runs=runs, mended_model=mended)
 
 
 def error() -> ErrorSummary:

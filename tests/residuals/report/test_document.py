@@ -6,13 +6,26 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from torchrl.envs import GymEnv, TransformedEnv
 
-from tests.residuals.report.made_up_reports import DATA, full_report, no_conclusion, nothing_missing, trace
+from tests.residuals.report.made_up_reports import DATA, full_report, no_conclusion, nothing_missing, trace, windowed
 from torchrl_h2o.data import DataError
-from torchrl_h2o.effects import ActionGain, BodyMass, Effect, Gravity, JointFrictionLoss, ResidualForce, paper_gap
-from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.effects import (
+    ActionBias,
+    ActionGain,
+    BodyMass,
+    Effect,
+    Gravity,
+    JointForce,
+    JointFrictionLoss,
+    ObservationBias,
+    ResidualForce,
+    paper_gap,
+)
+from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals.report.contents import (
     ErrorSummary,
     FoundEffect,
@@ -21,7 +34,7 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
 )
 from torchrl_h2o.residuals.report.document import Report
-from torchrl_h2o.residuals.report.words import effect_words, interval
+from torchrl_h2o.residuals.report.words import effect_units, effect_words, interval
 
 NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])
 
@@ -124,14 +137,68 @@ def test_an_interval_in_words_tells_its_ends_apart(low, share):
 
 
 def test_a_saved_report_is_loaded_as_it_was(tmp_path):
-    for report in (full_report(), nothing_missing(), no_conclusion()):
-        path = report.save(tmp_path / report.simulator)
+    for i, report in enumerate((full_report(), windowed(), nothing_missing(), no_conclusion())):
+        path = report.save(tmp_path / str(i))
         assert {file.name for file in path.parent.iterdir()} == {"report.json", "report.html"}
         for place in (path, path.parent, str(path)):
             loaded = Report.load(place)
             assert loaded.sentence() == report.sentence()
             assert loaded.to_json() == report.to_json()
             assert loaded.effects == report.effects
+
+
+def test_a_file_of_an_earlier_version_is_loaded():
+    entries = windowed().to_json()
+    for name in ("windows", "runs", "mended_model"):
+        del entries[name]
+    assert same(without_trace(Report.from_json(entries)), without_trace(full_report_as_read()))
+
+
+def full_report_as_read():
+    return Report.from_json(full_report().to_json())
+
+
+def test_windows_runs_and_the_model_are_kept():
+    report = windowed()
+    read = Report.from_json(json.loads(json.dumps(report.to_json(), allow_nan=False)))
+    for name in ("windows", "runs", "mended_model"):
+        assert same(getattr(read, name), getattr(report, name))
+    assert "Report.load(folder).mended(env)" in report.to_json()["mended_model"]["remedy"]
+    assert read.mended_model.effects == (JointFrictionLoss(0.0412, "elbow"),)
+
+
+def test_the_units_of_a_sliding_joint_are_kept(tmp_path):
+    names = {"joints": ["rail"], "joint_bodies": ["cart"], "joint_types": ["slide"]}
+    push = JointForce(6.72, "rail")
+    found = FoundEffect(push, True, {"torque": (6.5, 6.9)}, 0.1, effect_words(push, names), effect_units(push, names))
+    report = Report(simulator="a", data=DATA, found=(found,))
+    assert report.to_json()["effects"][0]["parameters"]["torque"]["unit"] == "N"
+    loaded = Report.load(report.save(tmp_path))
+    assert loaded == report
+    assert loaded.sentence() == "Your simulator lacks: constant force of 6.72 N on joints rail."
+
+
+@pytest.mark.parametrize("make", [lambda: GymEnv("HalfCheetah-v5"), WheelLeggedEnv])
+def test_a_report_mends_an_env(make):
+    gain = FoundEffect(ActionGain(0.5), True, {}, 0.1)
+    report = Report(simulator="a", data=DATA, found=(FoundEffect(Gravity(0.5), True, {}, 0.1), gain))
+    own = (Gravity(2.0), ObservationBias(0.1))
+    env = report.mended(TransformedEnv(make(), DynamicsGap(*own)))
+    by_hand = TransformedEnv(make(), DynamicsGap(*own, *report.effects))
+    assert mujoco_model(env).opt.gravity[2] == pytest.approx(-9.81)
+    paths = []
+    for mended in (env, by_hand):
+        mended.set_seed(0)
+        torch.manual_seed(0)
+        paths.append(mended.rollout(20, break_when_any_done=False)["next", "observation"])
+    assert Report(simulator="a", data=DATA).mended(make()).rollout(2).shape == (2,)
+    torch.testing.assert_close(*paths)
+
+
+def test_effects_on_actions_that_would_come_before_those_of_the_env_are_refused():
+    report = Report(simulator="a", data=DATA, found=(FoundEffect(ActionGain(0.5), True, {}, 0.1),))
+    with pytest.raises(ValueError, match="has to come first"):
+        report.mended(TransformedEnv(GymEnv("HalfCheetah-v5"), DynamicsGap(ActionBias(0.1))))
 
 
 @given(number=NUMBERS, optional=st.none() | NUMBERS, low=NUMBERS)
@@ -175,6 +242,7 @@ def test_the_file_holds_what_a_reader_of_it_looks_for():
     assert set(entries) == {
         *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "two_sample"),
         *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "trace"),
+        *("windows", "runs", "mended_model"),
     }
     assert {"name", "declared", "parameters", "error_after"} <= set(entries["effects"][0])
     assert entries["effects"][2]["name"] == "JointFrictionLoss[elbow]"

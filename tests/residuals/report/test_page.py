@@ -9,11 +9,19 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from tests.residuals.report.made_up_reports import full_report, no_conclusion, nothing_missing, renamed, trace
-from torchrl_h2o.effects import Gravity
+from tests.residuals.report.made_up_reports import full_report, no_conclusion, nothing_missing, renamed, trace, windowed
+from torchrl_h2o.effects import Gravity, JointForce, Payload
 from torchrl_h2o.residuals.report import plots
-from torchrl_h2o.residuals.report.contents import DataSummary, DimensionError, ErrorSummary, FoundEffect, TwoSample
+from torchrl_h2o.residuals.report.contents import (
+    DataSummary,
+    DimensionError,
+    ErrorSummary,
+    FoundEffect,
+    RejectedEffect,
+    TwoSample,
+)
 from torchrl_h2o.residuals.report.page import report_page
+from torchrl_h2o.residuals.report.words import effect_units, effect_words
 
 HOSTILE = "<script>alert(1)</script>\"'$x_1$&{{ 7 * 7 }}"
 
@@ -87,7 +95,53 @@ def test_every_dimension_is_drawn(full):
         assert f"residual of {name} (" in full.text
 
 
-@pytest.mark.parametrize("make", [full_report, nothing_missing, no_conclusion])
+def test_windows_are_drawn_with_units_and_their_errors():
+    parsed = Page(report_page(windowed()))
+    assert parsed.count("svg") == 2 + 4 + 4 + 12 + 3 * 2
+    assert "Measured against simulated, 0.1 s ahead" in parsed.text
+    assert "Worst window: – → 0.1 σ" in parsed.text
+    assert "from 2 s, row 100, run 1" in parsed.text
+    assert "elbow velocity (rad/s)" in parsed.text
+
+
+def test_the_error_of_each_run_is_a_table_with_the_worst_first():
+    text = Page(report_page(windowed())).text
+    assert text.index("1 1500 0.029") < text.index("0 3500 0.031")
+    assert re.search(r"1 1500 0.029 \S+ 0.0041 \S+ −86 % held out", text)
+    (only,) = windowed().runs[:1]
+    assert "The error by run" not in Page(report_page(dataclasses.replace(windowed(), runs=(only,)))).text
+
+
+def test_the_page_says_what_the_model_s_file_lacks():
+    text = Page(report_page(windowed())).text
+    assert "mended.xml holds gravity × 0.5, mass of bodies pole × 1.2." in text
+    assert "dry friction of joints elbow + 0.0412 N·m MJCF has no such force" in text
+    assert "Report.load(folder).mended(env)" in text
+
+
+def test_every_error_has_a_unit(full):
+    for error in (full_report().error, *full_report().found):
+        value = getattr(error, "before", None) or error.error_after
+        assert re.search(rf"{value:g} (σ|rad)", full.text), value
+
+
+def test_units_are_those_of_the_joint():
+    names = {"joints": ["rail"], "joint_bodies": ["cart"], "joint_types": ["slide"]}
+    push = JointForce(6.72, "rail")
+    found = FoundEffect(push, True, {"torque": (6.5, 6.9)}, 0.1, effect_words(push, names), effect_units(push, names))
+    text = Page(report_page(dataclasses.replace(full_report(), found=(found,)))).text
+    assert "constant force of 6.72 N on joints rail" in text
+    assert "force 6.72 N between 6.5 and 6.9 N" in text
+
+
+def test_attempts_of_no_size_are_left_out_of_the_ranking():
+    nothing = RejectedEffect(Payload(1e-18, x=0.2), 0.01, 0.5, "explains no more than chance")
+    report = full_report()
+    text = Page(report_page(dataclasses.replace(report, rejected=(*report.rejected, nothing)))).text
+    assert "payload" not in text
+
+
+@pytest.mark.parametrize("make", [full_report, windowed, nothing_missing, no_conclusion])
 def test_the_page_is_whole_and_asks_for_nothing(make):
     page = report_page(make())
     parsed = Page(page)

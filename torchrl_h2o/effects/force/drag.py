@@ -29,7 +29,7 @@ class JointForce(ForceEffect):
         'constant torque of -0.5 N·m on joints *knee*'
     """
 
-    wording: ClassVar[str] = "constant torque of {torque} on {joints}"
+    wording: ClassVar[str] = "constant {load} of {torque} on {joints}"
     torque: float = parameter(unit="N·m", bounds=(-1000.0, 1000.0), neutral=0.0)
     joints: Names = "*"
 

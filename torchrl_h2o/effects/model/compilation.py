@@ -1,7 +1,8 @@
 """Compiles a MuJoCo specification with the edits of model effects."""
 
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import mujoco
 
@@ -28,10 +29,16 @@ def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco
         array([  0.  ,   0.  , -19.62])
     """
     edit_spec(spec, effects)
-    with warnings.catch_warnings():
-        # Gymnasium's HalfCheetah file uses this attribute, and the user cannot change that file
-        warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")
+    with accepting_total_mass():
         return spec.compile()
+
+
+@contextmanager
+def accepting_total_mass() -> Iterator[None]:
+    """Suppresses the warning about ``settotalmass``, which Gymnasium's HalfCheetah file uses."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")  # not the user's file
+        yield
 
 
 def edit_spec(spec: mujoco.MjSpec, effects: Iterable[Effect]) -> None:

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import Effect, is_negligible
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
+from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import separated_by
+from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
@@ -20,6 +22,7 @@ from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import ErrorSummary, TwoSample, Verdict
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -56,6 +59,8 @@ class Judgement:
         trace: the residual over time.
         verdict: what these figures say.
         failures: attempts that failed with an error, and why.
+        windows: worst, median and best window, measured against simulated.
+        runs: error of each run.
     """
 
     measured: Measured
@@ -66,6 +71,8 @@ class Judgement:
     alternatives: tuple[Alternatives, ...]
     two_sample: TwoSample
     trace: ResidualTrace
+    windows: tuple[ShownWindow, ...]
+    runs: tuple[RunError, ...]
     verdict: Verdict
     failures: tuple[str, ...] = ()
 
@@ -106,6 +113,8 @@ def judge(
         trace=_residual_trace(simulation, mended, measured),
         verdict=reach_verdict(simulation, mended, measured, effects, error, two_sample, settings),
         failures=(*explanation.failures, *failures),
+        windows=shown_windows(simulation, mended, measured, settings=settings.judge),
+        runs=run_errors(simulation, mended, measured, settings=settings.judge),
     )
 
 
@@ -127,7 +136,8 @@ def _rejected(
     """The attempts that are not part of the explanation, with the error of each alone; and those that failed."""
     trace = explanation.trace
     found = {entry.name for entry in trace.entries}
-    listed = [attempt for attempt in trace.attempts[: settings.judge.max_rejected] if attempt.entry.name not in found]
+    sized = [attempt for attempt in trace.attempts if not is_negligible(attempt.effect, attempt.entry.trials)]
+    listed = [attempt for attempt in sized[: settings.judge.max_rejected] if attempt.entry.name not in found]
     rejected, failures = [], []
     for attempt in listed:
         try:

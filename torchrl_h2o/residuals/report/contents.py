@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.report.mended_model import MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
-from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_words
+from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
+from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_units, effect_words
 
 NOTHING_MISSING, EXPLAINED = "nothing missing", "explained"
 EXPLAINED_IN_PART, NOT_EXPLAINED = "explained in part", "not explained"
@@ -26,6 +28,7 @@ class FoundEffect:
         error_after: held-out error with the effects up to and including this one, in the summary's unit.
         words: description with units; by default the effect's own, without the simulator's names of sensors and
             actuators; an undeclared effect is marked.
+        units: unit of each parameter by name, on the joints of this simulator; by default the effect's own.
     """
 
     effect: Effect
@@ -33,8 +36,11 @@ class FoundEffect:
     ci95: Intervals
     error_after: float
     words: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
+        if not self.units:
+            object.__setattr__(self, "units", effect_units(self.effect))
         if not self.words:
             words = effect_words(self.effect)
             object.__setattr__(self, "words", words if self.declared else f"{UNDECLARED}: {words}")
@@ -55,6 +61,7 @@ class RejectedEffect:
         p_value: p-value of its gain on held-out data; None if no test was made.
         reason: reason why it was not put in, such as "explains no more than chance".
         words: description with units; by default the effect's own.
+        units: unit of each parameter by name, on the joints of this simulator; by default the effect's own.
     """
 
     effect: Effect
@@ -62,8 +69,11 @@ class RejectedEffect:
     p_value: float | None
     reason: str
     words: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
+        if not self.units:
+            object.__setattr__(self, "units", effect_units(self.effect))
         if not self.words:
             object.__setattr__(self, "words", effect_words(self.effect))
 
@@ -266,6 +276,9 @@ class ReportContents:
             versions.
         failures: attempts that failed with an error, and why.
         unfinished: stage in which the run stopped or was when the report was written; None for a finished report.
+        windows: worst, median and best window by the error with the effects, measured against simulated.
+        runs: error of each run.
+        mended_model: the MJCF file with the effects; None if none was asked for.
         trace: residual over time, for the pictures; None for a report without pictures. It is ignored by ``==``.
 
     Raises:
@@ -286,6 +299,9 @@ class ReportContents:
     verdict: Verdict | None = None
     failures: tuple[str, ...] = ()
     unfinished: str | None = None
+    windows: tuple[ShownWindow, ...] = ()
+    runs: tuple[RunError, ...] = ()
+    mended_model: MendedModel | None = None
     trace: ResidualTrace | None = field(default=None, compare=False)
 
     def __post_init__(self):

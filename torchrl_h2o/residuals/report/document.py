@@ -7,7 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_h2o.effects import Effect
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_h2o.effects import ActionEffect, Effect
+from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.envs.dynamics_gap import transforms_of
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.report.json_file import entries_from_json, read_json, report_to_json, write_json
 from torchrl_h2o.residuals.report.page import write_page
@@ -17,7 +21,7 @@ from torchrl_h2o.residuals.report.sentence import sentence
 
 @dataclass(frozen=True, kw_only=True)
 class Report(ReportContents):
-    """Result of closing the loop; ``DynamicsGap(*report.effects)`` mends the simulator.
+    """Result of closing the loop; :meth:`mended` mends the simulator.
 
     The fields are those of :class:`ReportContents`.
 
@@ -40,6 +44,43 @@ class Report(ReportContents):
     def sentence(self) -> str:
         """The whole report in one sentence."""
         return sentence(self)
+
+    def mended(self, env: EnvBase) -> TransformedEnv:
+        """Puts the effects found into an env of the simulator that the report is about.
+
+        Args:
+            env: the simulator: a GymEnv of a MuJoCo task or a :class:`~torchrl_h2o.envs.WheelLeggedEnv`, with the
+                dynamics gaps that it had when the loop was closed. The env must not be used by itself afterwards,
+                because its model is replaced.
+
+        Returns:
+            The env with ``DynamicsGap(*report.effects)``; without effects, the env with a gap that changes nothing.
+
+        Raises:
+            ValueError: if the model has no element that an effect could act on, if the env is batched or does not run
+                on MuJoCo, if it has transforms other than dynamics gaps and an effect alters actions or observations,
+                or if an effect and a gap of the env both alter actions, because the gap would come second.
+
+        Examples:
+            >>> from torchrl.envs import GymEnv
+            >>> from torchrl_h2o.effects import Gravity
+            >>> from torchrl_h2o.envs import mujoco_model
+            >>> from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
+            >>> found = FoundEffect(Gravity(0.5), declared=True, ci95={"scale": (0.49, 0.51)}, error_after=0.004)
+            >>> report = Report(simulator="HalfCheetah-v5", data=DataSummary("run.csv", 5000, 1500), found=(found,))
+            >>> env = report.mended(GymEnv("HalfCheetah-v5"))
+            >>> float(mujoco_model(env).opt.gravity[2])
+            -4.905
+            >>> env.rollout(3)["next", "reward"].shape
+            torch.Size([3, 1])
+        """
+        own = [effect for gap in transforms_of(env) if isinstance(gap, DynamicsGap) for effect in gap.effects]
+        if all(any(isinstance(effect, ActionEffect) for effect in effects) for effects in (own, self.effects)):
+            raise ValueError(
+                "a gap of the env and an effect of the report both alter actions, and the gap has to come first: put "
+                "both into one gap of a new env, TransformedEnv(env, DynamicsGap(*gap.effects, *report.effects))"
+            )
+        return TransformedEnv(env, DynamicsGap(*self.effects))
 
     def sample(self, n: int, *, seed: int = 0) -> list[tuple[Effect, ...]]:
         """Draws lists of effects from what the data leave open, for domain randomisation.

@@ -11,6 +11,7 @@ import numpy as np
 
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
+from torchrl_h2o.residuals.report.atomic import write_text
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     DimensionError,
@@ -25,8 +26,10 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
     Verdict,
 )
+from torchrl_h2o.residuals.report.mended_model import REMEDY, LeftOut, MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.sentence import sentence
+from torchrl_h2o.residuals.report.windows import RunError, ShownWindow, WindowQuantity
 from torchrl_h2o.residuals.report.words import effect_name
 
 FILE = "report.json"
@@ -36,11 +39,8 @@ Read = TypeVar("Read")
 
 def write_json(report: ReportContents, folder: str | Path) -> Path:
     """Writes ``report.json`` into a folder, which is created if it does not exist, and returns the file's path."""
-    path = Path(folder) / FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(report_to_json(report), ensure_ascii=False, allow_nan=False, indent=1)
-    path.write_text(text + "\n", encoding="utf-8")
-    return path
+    return write_text(Path(folder) / FILE, text + "\n")
 
 
 def read_json(path: str | Path, build: Callable[[Mapping[str, Any]], Read]) -> Read:
@@ -102,6 +102,9 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "stop_test": report.stop_test,
             "conclusion": report.conclusion,
             "wall_s": report.wall_s,
+            "windows": [dataclasses.asdict(window) for window in report.windows],
+            "runs": [dataclasses.asdict(run) for run in report.runs],
+            "mended_model": None if report.mended_model is None else _mended_to_json(report.mended_model),
             "trace": None if report.trace is None else _trace_to_json(report.trace),
         }
     )
@@ -117,7 +120,8 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "simulator": entries["simulator"],
         "found": tuple(_found(entry) for entry in entries["effects"]),
         "rejected": tuple(
-            _read(RejectedEffect, entry, effect=effect_from_dict(entry["effect"])) for entry in entries["rejected"]
+            _read(RejectedEffect, entry, effect=effect_from_dict(entry["effect"]), units=_units(entry))
+            for entry in entries["rejected"]
         ),
         "indistinguishable": tuple(_group(entry) for entry in entries["indistinguishable"]),
         "error": None if entries["error"] is None else _error(entries["error"]),
@@ -130,6 +134,10 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "stop_test": entries["stop_test"],
         "conclusion": entries["conclusion"],
         "wall_s": entries["wall_s"],
+        # not in files of earlier versions
+        "windows": tuple(_window(entry) for entry in entries.get("windows", ())),
+        "runs": tuple(_read(RunError, entry) for entry in entries.get("runs", ())),
+        "mended_model": _mended(entries.get("mended_model")),
         "trace": None if entries["trace"] is None else _trace(entries["trace"]),
     }
 
@@ -137,11 +145,11 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
 def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict[str, Any]:
     """An effect with its description, its parameters, its errors, and the entry that rebuilds it."""
     rest = {field.name: getattr(tried, field.name) for field in dataclasses.fields(tried)}
-    ci95 = rest.pop("ci95", {})
+    ci95, units = rest.pop("ci95", {}), rest.pop("units")
     return {
         "name": effect_name(effect),
         "parameters": {
-            name: {"value": parameter.value, "unit": parameter.unit, "ci95": ci95.get(name)}
+            name: {"value": parameter.value, "unit": units.get(name, parameter.unit), "ci95": ci95.get(name)}
             for name, parameter in effect.parameters.items()
         },
         **rest,
@@ -202,7 +210,11 @@ def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
 def _found(entry: Mapping[str, Any]) -> FoundEffect:
     effect = effect_from_dict(entry["effect"])
     ci95 = _intervals({name: parameter["ci95"] for name, parameter in entry["parameters"].items()})
-    return _read(FoundEffect, entry, effect=effect, ci95=ci95)
+    return _read(FoundEffect, entry, effect=effect, ci95=ci95, units=_units(entry))
+
+
+def _units(entry: Mapping[str, Any]) -> dict[str, str]:
+    return {name: parameter["unit"] for name, parameter in entry["parameters"].items()}
 
 
 def _intervals(entries: Mapping[str, Sequence[float | None] | None]) -> dict[str, tuple[float, float]]:
@@ -236,6 +248,39 @@ def _error(entry: Mapping[str, Any]) -> ErrorSummary:
 
 def _verdict(entry: Mapping[str, Any]) -> Verdict:
     return _read(Verdict, entry, reasons=tuple(entry["reasons"]))
+
+
+def _window(entry: Mapping[str, Any]) -> ShownWindow:
+    quantities = tuple(
+        WindowQuantity(
+            quantity["name"],
+            quantity["unit"],
+            *(tuple(map(_float, quantity[name])) for name in ("measured", "before", "after")),
+        )
+        for quantity in entry["quantities"]
+    )
+    return _read(ShownWindow, entry, ahead=tuple(entry["ahead"]), quantities=quantities)
+
+
+def _mended_to_json(mended: MendedModel) -> dict[str, Any]:
+    """The name of the file, and what is not in it, with how to add it."""
+    return {
+        "file": mended.file,
+        "failure": mended.failure,
+        "left_out": [
+            {"name": effect_name(left.effect), "words": left.words, "reason": left.reason}
+            | {"effect": effect_to_dict(left.effect)}
+            for left in mended.left_out
+        ],
+        "remedy": REMEDY if mended.left_out else None,
+    }
+
+
+def _mended(entry: Mapping[str, Any] | None) -> MendedModel | None:
+    if entry is None:
+        return None
+    left_out = (LeftOut(effect_from_dict(left["effect"]), left["reason"], left["words"]) for left in entry["left_out"])
+    return MendedModel(entry["file"], tuple(left_out), entry["failure"])
 
 
 def _trace(entry: Mapping[str, Any]) -> ResidualTrace:

@@ -1,5 +1,6 @@
 """Writes ``report.html``: a single file without references to other resources."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -8,9 +9,13 @@ from typing import Any
 
 import jinja2
 
+from torchrl_h2o.effects import is_negligible, quantity_name
 from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.atomic import write_text
 from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
+from torchrl_h2o.residuals.report.mended_model import REMEDY
 from torchrl_h2o.residuals.report.sentence import sentence
+from torchrl_h2o.residuals.report.windows import RunError
 from torchrl_h2o.residuals.report.words import (
     change,
     interval,
@@ -20,6 +25,7 @@ from torchrl_h2o.residuals.report.words import (
 )
 
 FILE = "report.html"
+SHOWN_RUNS = 12  # those with the largest errors; the others are in a list that opens
 _TEMPLATE = "report.html.jinja"
 
 
@@ -36,10 +42,7 @@ class _Tried:
 
 def write_page(report: ReportContents, folder: str | Path) -> Path:
     """Writes ``report.html`` into a folder, which is created if it does not exist, and returns the file's path."""
-    path = Path(folder) / FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(report_page(report), encoding="utf-8")
-    return path
+    return write_text(Path(folder) / FILE, report_page(report))
 
 
 def report_page(report: ReportContents) -> str:
@@ -65,6 +68,9 @@ def report_page(report: ReportContents) -> str:
         change=change,
         parameters=_parameters,
         ranking=_ranking(report),
+        shown_runs=sorted(report.runs, key=_worst_first)[:SHOWN_RUNS],
+        remedy=REMEDY,
+        held=_held(report),
         pictures=_pictures(report),
         colours={"before": plots.BEFORE, "after": plots.AFTER},
     )
@@ -75,8 +81,9 @@ def _parameters(found: FoundEffect) -> list[tuple[str, str, str]]:
     rows = []
     for name, parameter in found.effect.parameters.items():
         low, high = found.ci95.get(name, (float("nan"), float("nan")))
-        value = quantity(parameter.value, parameter.unit, interval_digits(low, high))
-        rows.append((name, value, interval(low, high, parameter.unit)))
+        unit = found.units.get(name, parameter.unit)
+        value = quantity(parameter.value, unit, interval_digits(low, high))
+        rows.append((quantity_name(name, unit), value, interval(low, high, unit)))
     return rows
 
 
@@ -86,14 +93,29 @@ def _ranking(report: ReportContents) -> list[_Tried]:
         _Tried(f.words, f.error_after, None, "put in" if k == 0 else "put in, with those above", True)
         for k, f in enumerate(report.found)
     ]
-    rejected = [_Tried(r.words, r.error_after, r.p_value, r.reason, False) for r in report.rejected]
+    rejected = [
+        _Tried(r.words, r.error_after, r.p_value, r.reason, False)
+        for r in report.rejected
+        if not is_negligible(r.effect)  # as in reports of earlier versions
+    ]
     # NaN, the error of a divergence, sorts last
     return found + sorted(rejected, key=lambda tried: (number(tried.error) == "–", tried.error))
 
 
-def _pictures(report: ReportContents) -> Mapping[str, list[str]]:
-    """The pictures as SVG, by section of the page."""
-    pictures: dict[str, Any] = {"dimensions": [], "horizons": [], "time": [], "states": []}
+def _held(report: ReportContents) -> str:
+    """The effects found that the file with the mended model holds."""
+    left_out = () if report.mended_model is None else report.mended_model.effects
+    return ", ".join(found.words for found in report.found if found.effect not in left_out) or "none of them"
+
+
+def _worst_first(run: RunError) -> tuple[bool, float]:
+    return math.isfinite(run.after), -run.after
+
+
+def _pictures(report: ReportContents) -> Mapping[str, Any]:
+    """The pictures as SVG, by section of the page; those of the windows by window."""
+    pictures: dict[str, Any] = {"dimensions": [], "horizons": [], "windows": [], "time": [], "states": []}
+    pictures["windows"] = [[plots.window_lines(window, q) for q in window.quantities] for window in report.windows]
     if report.error is not None:
         by_unit = sorted(report.error.per_dimension, key=lambda dimension: dimension.unit)
         pictures["dimensions"] = [

@@ -17,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 from torchrl_h2o.residuals.report.contents import DimensionError, HorizonError, Interval
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
+from torchrl_h2o.residuals.report.windows import ShownWindow, WindowQuantity
 from torchrl_h2o.residuals.report.words import number
 
 # placeholder colours, and the page variables that replace them
@@ -72,6 +73,31 @@ def horizon_lines(horizons: Sequence[HorizonError], dimension: DimensionError) -
         axes.set_title(f"{dimension.name} ({_unit(dimension.unit)})")
         axes.set_xlabel("predicted ahead (s)")
         return _svg(figure, f"error of {dimension.name} against the horizon")
+
+
+def window_lines(window: ShownWindow, quantity: WindowQuantity) -> str:
+    """Draws one quantity in a window: measured, and simulated before and after the effects are put in."""
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure(height=2.1)
+        axes.plot(window.ahead, quantity.measured, "o", color=_INK, markersize=3.0, mew=0, zorder=3)
+        for values, colour in ((quantity.before, BEFORE), (quantity.after, AFTER)):
+            axes.plot(window.ahead, values, "-", color=colour, linewidth=1.8)
+        axes.set_ylim(*_frame(quantity))
+        _plain_ticks(axes)
+        axes.set_title(f"{quantity.name} ({_unit(quantity.unit)})")
+        axes.set_xlabel("time since the start of the window (s)")
+        return _svg(figure, f"{quantity.name}, measured and simulated, in the {window.rank} window")
+
+
+def _frame(quantity: WindowQuantity) -> tuple[float, float]:
+    """Limits that show the measured values and the simulation with the effects, but not all of one that diverges."""
+    measured, simulated = np.array(quantity.measured), np.array([*quantity.before, *quantity.after])
+    low, high = measured.min(), measured.max()
+    simulated = simulated[np.isfinite(simulated)]
+    reach = 10.0 * max(high - low, 1e-9 + 1e-3 * np.abs(measured).max())
+    shown = np.concatenate([measured, np.clip(simulated, low - reach, high + reach)])
+    margin = 0.06 * (np.ptp(shown) or 1.0)
+    return float(shown.min() - margin), float(shown.max() + margin)
 
 
 def residual_in_time(trace: ResidualTrace, dimension: int, aside: Sequence[Interval] = ()) -> str:
@@ -146,11 +172,16 @@ def _points(axes: Axes, x: np.ndarray, trace: ResidualTrace, dimension: int, fra
     limit = 1.5 * np.quantile(sizes, 0.99) if len(sizes) else 0.0
     axes.set_ylim(*((-limit, limit) if limit > 0.0 else (-1.0, 1.0)))
     axes.axhline(0.0, color=_MUTED, linewidth=0.6)
+    _plain_ticks(axes)
+    axes.set_title(f"residual of {trace.names[dimension]} ({_unit(trace.units[dimension])})")
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Sets few ticks in plain numbers on both axes."""
     axes.yaxis.set_major_locator(MaxNLocator(5))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 4)))
-    axes.set_title(f"residual of {trace.names[dimension]} ({_unit(trace.units[dimension])})")
 
 
 def _figure(width: float = 4.0, height: float = 2.4) -> tuple[Figure, Axes]:

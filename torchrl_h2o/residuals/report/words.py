@@ -157,6 +157,11 @@ def effect_words(effect: Effect, names: EntryNames = NO_NAMES) -> str:
         return effect.describe(names)
 
 
+def effect_units(effect: Effect, names: EntryNames = NO_NAMES) -> dict[str, str]:
+    """Returns the unit of each parameter by name; names are those of :func:`effect_words`."""
+    return {name: parameter.unit for name, parameter in effect.parameters_on(names).items()}
+
+
 def _rounded(parameter: Parameter) -> float:
     value, neutral = parameter.value, parameter.neutral
     rounded = float(f"{value:.3g}")

@@ -17,7 +17,7 @@ import numpy as np
 from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue
+from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
 from torchrl_h2o.envs.physics import FULL_PHYSICS, roll_out
 from torchrl_h2o.residuals.simulation.from_env import source_of_env
 from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
@@ -118,6 +118,11 @@ class Simulation:
     def actuators(self) -> tuple[str, ...]:
         """The names of the action's entries; the index of an entry without a name."""
         return tuple(self.model.actuator(i).name or str(i) for i in range(self.model.nu))
+
+    @property
+    def names(self) -> dict[str, Sequence[str]]:
+        """The names of observations, actuators and joints, for :meth:`Effect.describe`."""
+        return {"entries": self.state_map.names, "actuators": self.actuators, **joint_names(self.model)}
 
     @cached_property
     def _data(self) -> list[mujoco.MjData]:

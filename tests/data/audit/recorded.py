@@ -1,0 +1,77 @@
+"""A motored double pendulum and its recordings for the audit's tests."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.residuals import Measured, Simulation, StateMap
+
+XML = """
+<mujoco model="arm">
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="shoulder" type="hinge" axis="0 1 0" damping="0.2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1" contype="0" conaffinity="0"/>
+      <body pos="0 0 -0.4">
+        <joint name="elbow" type="hinge" axis="0 1 0" damping="0.05"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="m1" joint="shoulder"/><motor name="m2" joint="elbow"/></actuator>
+</mujoco>
+"""
+NAMES = ("shoulder", "elbow", "shoulder_velocity", "elbow_velocity")
+
+
+def arm(*effects) -> Simulation:
+    """A double pendulum that is stepped every 10 ms."""
+    state_map = StateMap.of_coordinates(NAMES, ("rad", "rad", "rad/s", "rad/s"), (0, 1, 2, 3), num_states=4)
+    return Simulation(lambda: mujoco.MjSpec.from_string(XML), 2, state_map, effects, "arm")
+
+
+def recording(*effects, seed: int = 0, rows: int = 2000, noise: float = 0.01) -> Measured:
+    """One run of the arm with effects under random torques; noise is a share of each signal's spread."""
+    rng, reality = np.random.default_rng(seed), arm(*effects)
+    action = np.zeros((rows, 2))
+    for row in range(1, rows):
+        action[row] = 0.9 * action[row - 1] + np.array([0.5, 0.12]) * rng.standard_normal(2)
+    executed = reality.executed(action, np.random.default_rng(seed))
+    reached = reality.rollout(np.zeros((1, 4)), executed[None])[0]
+    observed = np.vstack([np.zeros(4), reached])
+    return measured(observed + noise * observed.std(0) * rng.standard_normal(observed.shape), action)
+
+
+def measured(observed: np.ndarray, action: np.ndarray, time: np.ndarray | None = None) -> Measured:
+    """Transitions of one run from rows (T + 1, 4) and actions (T, 2)."""
+    rows = len(action)
+    none = np.zeros(rows, bool)
+    stamps = 0.01 * np.arange(rows) if time is None else time
+    run = np.zeros(rows, int)
+    return Measured(observed[:-1], action, observed[1:], run, stamps, ~none, none, {}, "arm")
+
+
+def rows_of(data: Measured) -> np.ndarray:
+    """Rows (T + 1, 4) of a recording of one run."""
+    return np.vstack([data.observation, data.following[-1:]])
+
+
+def changed(data: Measured, change) -> Measured:
+    """The recording with its rows changed."""
+    return measured(change(rows_of(data).copy()), data.action, data.time)
+
+
+def with_action(data: Measured, action: np.ndarray) -> Measured:
+    return replace(data, action=action)
+
+
+def scaled(columns, factor: float):
+    """A change that multiplies columns by a factor."""
+
+    def change(rows: np.ndarray) -> np.ndarray:
+        rows[:, columns] *= factor
+        return rows
+
+    return change

@@ -1,0 +1,315 @@
+"""Audits of good and of damaged logs of a motored arm."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.data.audit.recorded import NAMES, arm, changed, measured, recording, rows_of, scaled, with_action
+from torchrl_h2o.data import Audit, DataError, Finding, audit
+from torchrl_h2o.data.readers.ted import to_ted
+from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointFrictionLoss
+from torchrl_h2o.residuals import Simulation
+
+DEGREES = 180.0 / np.pi
+
+
+@pytest.fixture(scope="module")
+def good():
+    return recording()
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return arm()
+
+
+def severe(data, simulation, check: str) -> str:
+    """Words of the first severe finding of a check."""
+    found = [finding for finding in audit(data, simulation).severe if finding.check == check]
+    assert found, audit(data, simulation).words()
+    return found[0].words
+
+
+def warned(data, simulation, check: str) -> str:
+    """Words of the first severe finding or warning of a check."""
+    found = audit(data, simulation)
+    named = [finding for finding in (*found.severe, *found.warnings) if finding.check == check]
+    assert named, found.words()
+    return named[0].words
+
+
+def test_good_log_has_neither_severe_findings_nor_warnings(good, simulation):
+    found = audit(good, simulation)
+    assert found.severe == found.warnings == ()
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        JointFrictionLoss(0.15),
+        ActionGain(0.7),
+        Armature(0.02),
+        BodyMass(1.5),
+        Gravity(2.0),
+        ActionDelay(0.015),
+    ],
+    ids=lambda effect: type(effect).__name__,
+)
+def test_dynamics_gap_is_no_fault_of_the_data(effect, simulation):
+    assert audit(recording(effect), simulation).severe == ()
+
+
+def test_short_delay_of_a_drive_is_a_note(simulation):
+    found = audit(recording(ActionDelay(0.02)), simulation)
+    (late,) = [finding for finding in found.findings if finding.check == "actions"]
+    assert late.severity == "note"
+    assert "2 rows (20 ms) later" in late.words
+
+
+@pytest.mark.parametrize(
+    ("columns", "factor", "words"),
+    [
+        ([0, 1], DEGREES, "the position looks like degrees"),
+        ([2, 3], DEGREES, "the velocity looks like degrees per second"),
+        ([1], 1e3, "thousandths"),
+    ],
+)
+def test_units_of_positions_and_velocities(good, simulation, columns, factor, words):
+    assert words in severe(changed(good, scaled(columns, factor)), simulation, "kinematics")
+
+
+def test_degrees_of_positions_and_velocities_are_found_with_the_model(good, simulation):
+    words = severe(changed(good, scaled([0, 1, 2, 3], DEGREES)), simulation, "model")
+    assert "all angles and their velocities are taken as degrees" in words
+
+
+@pytest.mark.parametrize("column", [0, 3])
+def test_sign_of_a_position_or_velocity(good, simulation, column):
+    assert "wrong sign" in severe(changed(good, scaled([column], -1.0)), simulation, "kinematics")
+
+
+def test_reversed_joint_is_found_with_the_model(good, simulation):
+    assert "elbow and its velocity are reversed" in severe(changed(good, scaled([1, 3], -1.0)), simulation, "model")
+
+
+def test_exchanged_columns(good, simulation):
+    swapped = changed(good, lambda rows: rows[:, [0, 3, 2, 1]])
+    assert "elbow and elbow_velocity are exchanged" in severe(swapped, simulation, "kinematics")
+    velocities = changed(good, lambda rows: rows[:, [0, 1, 3, 2]])
+    assert "the derivative of shoulder is elbow_velocity" in severe(velocities, simulation, "kinematics")
+    joints = changed(good, lambda rows: rows[:, [1, 0, 3, 2]])
+    assert "shoulder and elbow are exchanged" in severe(joints, simulation, "model")
+
+
+def test_zero_of_an_angle(good, simulation):
+    words = warned(changed(good, lambda rows: rows + np.array([0.4, 0, 0, 0])), simulation, "model")
+    assert "the zero of shoulder is shifted by 0.4" in words
+
+
+def test_wrapped_angle(good, simulation):
+    wrapped = changed(good, lambda rows: np.hstack([np.mod(rows[:, :1], 2.0 * np.pi), rows[:, 1:]]))
+    assert "shoulder jumps by 2 π" in warned(wrapped, simulation, "kinematics")
+
+
+def test_filtered_velocity(good, simulation):
+    def late(rows: np.ndarray) -> np.ndarray:
+        rows[3:, 2] = rows[:-3, 2].copy()
+        return rows
+
+    assert "shoulder_velocity is late by 3." in warned(changed(good, late), simulation, "kinematics")
+
+
+def test_noise(good, simulation):
+    noise = 0.3 * rows_of(good).std(0) * np.random.default_rng(0).standard_normal(rows_of(good).shape)
+    found = audit(changed(good, lambda rows: rows + noise), simulation)
+    assert sum("has noise of" in finding.words for finding in (*found.severe, *found.warnings)) == 4
+
+
+def test_actions_of_another_run(good, simulation):
+    other = with_action(good, recording(seed=1).action)
+    assert "another run" in severe(other, simulation, "actions")
+
+
+@pytest.mark.parametrize("actuator", [0, 1])
+def test_sign_of_an_action(good, simulation, actuator):
+    action = good.action * np.where(np.arange(2) == actuator, -1.0, 1.0)
+    assert f"the action of m{actuator + 1} has the other sign" in severe(
+        with_action(good, action), simulation, "actions"
+    )
+
+
+def test_late_actions(good, simulation):
+    shifted = measured(rows_of(good)[:-12], good.action[12:])
+    assert "12 rows (120 ms) later" in severe(shifted, simulation, "actions")
+
+
+def test_unit_of_the_actions(good, simulation):
+    assert "looks like another unit" in severe(with_action(good, 1e3 * good.action), simulation, "actions")
+
+
+def test_exchanged_actions(good, simulation):
+    assert "exchanged" in severe(with_action(good, good.action[:, ::-1].copy()), simulation, "actions")
+
+
+def test_constant_actions_are_severe_only_if_the_motion_contradicts_them(good, simulation):
+    assert "in all rows" in severe(with_action(good, np.zeros_like(good.action)), simulation, "actions")
+    start = np.array([[1.0, 0.5, 0.0, 0.0]])
+    still = np.zeros((1500, 2))
+    swing = np.vstack([start, simulation.rollout(start, still[None])[0]])
+    assert audit(measured(swing, still), simulation).severe == ()
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1e3, "ms that are declared as s"), (2.0, "control step")])
+def test_wrong_time_stamps(good, simulation, factor, words):
+    data = measured(rows_of(good), good.action, factor * good.time)
+    assert words in severe(data, simulation, "time")
+
+
+def test_irregular_time_stamps(good, simulation):
+    steps = 0.01 * np.random.default_rng(0).uniform(0.5, 1.5, len(good))
+    data = measured(rows_of(good), good.action, np.cumsum(steps))
+    assert "differ from the usual" in severe(data, simulation, "time")
+
+
+def test_left_out_rows_are_a_wrong_time_step(good, simulation):
+    every_third = measured(rows_of(good)[::3], good.action[::3][:666])
+    assert "the time between two rows were 0.03" in severe(every_third, simulation, "time")
+
+
+def test_reversed_rows(good, simulation):
+    words = severe(measured(rows_of(good)[::-1], good.action[::-1]), simulation, "time")
+    assert "reverse order" in words
+
+
+def test_shuffled_rows(good, simulation):
+    order = np.random.default_rng(0).permutation(len(good))
+    words = severe(measured(rows_of(good)[np.append(order, 0)], good.action[order]), simulation, "rows")
+    assert "were put into another order" in words
+
+
+def test_shuffled_transitions(good, simulation):
+    order = np.random.default_rng(0).permutation(len(good))
+    ends = np.zeros(len(good), bool)
+    data = to_ted(
+        observation=good.observation[order],
+        action=good.action[order],
+        next_observation=good.following[order],
+        terminated=ends,
+        truncated=ends,
+    )
+    assert "shuffled or thinned" in severe(data, simulation, "rows")
+
+
+def test_lost_rows_are_listed(good, simulation):
+    rows = np.delete(rows_of(good), np.arange(700, 760), axis=0)
+    found = audit(measured(rows, np.delete(good.action, np.arange(700, 760), axis=0)), simulation)
+    (jump,) = [finding for finding in found.warnings if finding.check == "rows"]
+    assert jump.rows.ranges == ((699, 699),)
+
+
+def test_repeated_rows(good, simulation):
+    rng = np.random.default_rng(0)
+
+    def repeat(rows: np.ndarray) -> np.ndarray:
+        lost = rng.random(len(rows)) < 0.3
+        lost[0] = False
+        return rows[np.maximum.accumulate(np.where(lost, 0, np.arange(len(rows))))]
+
+    assert "repeat the row before" in severe(changed(good, repeat), simulation, "rows")
+
+
+def test_rows_that_were_recorded_twice(good, simulation):
+    twice = measured(np.vstack([rows_of(good)[:-1], rows_of(good)]), np.vstack([good.action, good.action]))
+    assert any("occur a second time" in finding.words for finding in audit(twice, simulation).warnings)
+
+
+@pytest.mark.parametrize("column", range(4))
+def test_frozen_column(good, simulation, column):
+    def freeze(rows: np.ndarray) -> np.ndarray:
+        rows[1000:, column] = rows[1000, column]
+        return rows
+
+    assert "is frozen" in severe(changed(good, freeze), simulation, "rows")
+
+
+@pytest.mark.parametrize("column", range(4))
+def test_clipped_column(good, simulation, column):
+    def clip(rows: np.ndarray) -> np.ndarray:
+        rows[:, column] = rows[:, column].clip(0.5 * rows[:, column].min(), 0.5 * rows[:, column].max())
+        return rows
+
+    assert "the signal is clipped" in warned(changed(good, clip), simulation, "rows")
+
+
+@pytest.mark.parametrize("column", range(4))
+def test_coarse_column(good, simulation, column):
+    def round_off(rows: np.ndarray) -> np.ndarray:
+        step = 0.25 * rows[:, column].std()
+        rows[:, column] = step * np.round(rows[:, column] / step)
+        return rows
+
+    assert "has a resolution of" in warned(changed(good, round_off), simulation, "rows")
+
+
+def test_effects_that_look_alike_come_with_what_to_record(simulation):
+    """Torques that follow the velocity look like viscous friction."""
+    rng = np.random.default_rng(0)
+    observed, action = np.zeros((2001, 4)), np.zeros((2000, 2))
+    observed[0, 0] = 1.5
+    for row in range(2000):
+        action[row] = 0.15 * np.array([1.0, 0.3]) * observed[row, 2:] + 0.02 * rng.standard_normal(2)
+        observed[row + 1] = simulation.rollout(observed[row : row + 1], action[row : row + 1][:, None])[0, -1]
+    notes = [finding for finding in audit(measured(observed, action), simulation).findings if "alike" in finding.words]
+    (note,) = [finding for finding in notes if finding.words.startswith("viscous friction and motor gain of shoulder")]
+    assert note.severity == "note"
+    assert "actions that do not follow the velocity" in note.remedy
+
+
+def test_audit_survives_json(good, simulation):
+    found = audit(changed(good, scaled([0], -1.0)), simulation)
+    assert Audit.from_dict(json.loads(json.dumps(found.to_dict()))) == found
+    assert found.words().startswith("severe, kinematics: ")
+
+
+def test_short_logs_are_not_compared_with_the_simulator(good, simulation):
+    found = audit(measured(rows_of(good)[:30], good.action[:29]), simulation)
+    assert any("too few" in finding.words for finding in found.findings)
+
+
+def test_wrong_width_is_refused(good, simulation):
+    data = measured(rows_of(good)[:, :3], good.action)
+    with pytest.raises(DataError, match="the data have 3 entries, the simulator has 4"):
+        audit(data, simulation)
+
+
+def test_unknown_severity_is_refused():
+    with pytest.raises(ValueError, match="'bad' must be one of severe, warning, note"):
+        Finding("rows", "bad", "words")
+
+
+def test_ted_and_measured_give_the_same_findings(good, simulation):
+    ends = np.zeros(len(good), bool)
+    data = to_ted(
+        observation=good.observation,
+        action=good.action,
+        next_observation=good.following,
+        terminated=ends,
+        truncated=ends,
+    )
+    data["time"] = torch.from_numpy(good.time)[:, None]
+    assert [f.words for f in audit(data, simulation).findings][:2] == [
+        f.words for f in audit(good, simulation).findings
+    ][:2]
+
+
+def test_real_log_that_cannot_tell_friction_from_gain_says_so(shared_data):
+    """In this log the torque follows the sign of the velocity, as its description says."""
+    folder = shared_data / "double_pendulum"
+    table = np.genfromtxt(folder / "trajectory_00.csv", delimiter=",", skip_header=1)[8:]
+    real = Simulation.from_mjcf(folder / "double_pendulum.xml", NAMES, 0.002)
+    found = audit(measured(table[:, 1:5], table[:-1, 7:9], table[:-1, 0]), real)
+    assert found.severe == ()
+    (note,) = [finding for finding in found.findings if finding.words.startswith("a weaker motor of shoulder")]
+    assert "friction" in note.words

@@ -1,0 +1,7 @@
+"""Audit of measured data before a search: time, rows, kinematics, units and zeros, actions, excitation."""
+
+from torchrl_h2o.data.audit.audit import Audit, audit
+from torchrl_h2o.data.audit.finding import Finding, Rows
+from torchrl_h2o.data.audit.settings import AuditSettings
+
+__all__ = ["Audit", "AuditSettings", "Finding", "Rows", "audit"]

@@ -1,0 +1,149 @@
+"""Which effects a log can tell apart: angles between their sensitivities along the log."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_h2o.data.audit.finding import Finding
+from torchrl_h2o.data.audit.response import Response, joint_of
+from torchrl_h2o.data.audit.settings import AuditSettings
+
+CHECK = "excitation"
+_JOINT = ("dry friction", "viscous friction", "armature")
+_TO_RECORD = {
+    frozenset({"dry friction", "motor gain"}): "record both directions under the same torque, such as slow reversals "
+    "beside fast swings, or let the joint swing freely",
+    frozenset({"dry friction", "viscous friction"}): "record slow and fast motion of the joint",
+    frozenset({"armature", "motor gain"}): "record a constant torque against gravity beside fast changes",
+    frozenset(
+        {"gravity", "mass"}
+    ): "record fast motion with a known torque: gravity shows at rest, mass in acceleration",
+    frozenset({"mass", "motor gain"}): "only their ratio shows in the motion: weigh the robot, or measure a torque",
+    frozenset({"mass", "armature"}): "weigh the robot",
+    frozenset({"gravity", "armature"}): "record fast and slow motion through the same angles",
+    frozenset({"gravity", "motor gain"}): "record fast motion beside holding still",
+    frozenset(
+        {"viscous friction", "motor gain"}
+    ): "record actions that do not follow the velocity, such as random ones",
+    frozenset({"viscous friction", "armature"}): "record several frequencies of motion",
+    frozenset({"dry friction", "armature"}): "record several frequencies of motion",
+    frozenset({"drive delay", "motor gain"}): "record steps of the action",
+    frozenset({"drive delay", "viscous friction"}): "record steps of the action from rest",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """What a trial of one effect changes along the log.
+
+    Args:
+        effect: such as ``"dry friction"``.
+        joint: name of the joint or actuator; empty for the whole robot.
+        response: weighted changes of the velocities, (W · m,).
+    """
+
+    effect: str
+    joint: str
+    response: np.ndarray
+
+    def __str__(self) -> str:
+        return f"{self.effect} of {self.joint}" if self.joint else self.effect
+
+
+def check_excitation(response: Response, settings: AuditSettings) -> list[Finding]:
+    """Notes which of the main effects look alike in this log, with what to record to tell them apart."""
+    found = sensitivities(response)
+    size = [float(np.sqrt((s.response**2).mean())) for s in found]
+    seen = [s for s, usual in zip(found, size, strict=True) if usual > settings.negligible]
+    notes = _pairs(seen, settings)
+    return [*notes, *_combinations(seen, notes, settings)]
+
+
+def sensitivities(response: Response) -> list[Sensitivity]:
+    """Changes of the velocities at the end of the windows for trials of the main effects.
+
+    Per joint: dry friction, viscous friction and armature; per actuator: gain and delay by one row; gravity and mass of
+    the whole robot.
+    """
+    from torchrl_h2o.effects import BodyMass, Gravity
+
+    log, found = response.log, []
+    velocity = response.before + 0.5 * response.change
+    spread = np.maximum(velocity.std(0), 1e-12)
+    seconds = response.horizon * log.dt
+
+    def add(effect: str, joint: str, change: np.ndarray) -> None:
+        weighted = np.clip(change / response.scale, -10.0, 10.0)
+        found.append(Sensitivity(effect, joint, np.nan_to_num(weighted).ravel()))
+
+    for index, pair in enumerate(log.pairs):
+        force = response.by_force[..., index]
+        add("dry friction", pair.name, -force * np.tanh(velocity[:, [index]] / (0.1 * spread[index])))
+        add("viscous friction", pair.name, -force * velocity[:, [index]])
+        add("armature", pair.name, -force * response.change[:, [index]] / seconds)
+    actions, _ = response.mean_action(0)
+    late, known = response.mean_action(1)
+    for index, name in enumerate(log.actuators):
+        joint = joint_of(response.simulation.model, index, log.pairs)
+        label = name if joint is None else log.pairs[joint].name
+        own = response.by_action[..., index]
+        add("motor gain", label, own * actions[:, [index]])
+        add("drive delay", label, own * np.where(known, late[:, index] - actions[:, index], 0.0)[:, None])
+    base = response.simulated + response.before
+    for effect, name in ((Gravity(1.1), "gravity"), (BodyMass(1.1), "mass")):
+        try:
+            other = response.simulation.with_effects(effect)
+            reached = response.reached(response.states, response.limited[response.rows], simulation=other)
+        except ValueError:  # the model has no gravity or no such body
+            continue
+        add(name, "", 10.0 * (reached[:, response.moving] - base))
+    return found
+
+
+def _pairs(found: list[Sensitivity], settings: AuditSettings) -> list[Finding]:
+    notes = []
+    for i, one in enumerate(found):
+        for other in found[i + 1 :]:
+            if one.joint != other.joint and one.joint and other.joint:
+                continue
+            cosine = _cosine(one.response, other.response)
+            if abs(cosine) < settings.alike:
+                continue
+            record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record other motion of this joint")
+            words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
+            if one.joint == other.joint != "":
+                words = f"{one.effect} and {other}{words[len(f'{one} and {other}') :]}"
+            notes.append(Finding(CHECK, "note", words, None, record))
+    return notes
+
+
+def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: AuditSettings) -> list[Finding]:
+    """Motor gains that friction, armature and gravity together can take the place of."""
+    notes = []
+    for gain in (s for s in found if s.effect == "motor gain"):
+        if any(
+            note.words.startswith(f"{effect} and motor gain of {gain.joint} ") for note in pairs for effect in _JOINT
+        ):
+            continue
+        # the whole mass and a gain always show as their ratio, which is a note of its own
+        others = [s for s in found if s.joint in (gain.joint, "") and s.effect in (*_JOINT, "gravity")]
+        if not others:
+            continue
+        design = np.stack([s.response for s in others], -1)
+        size = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
+        values = np.linalg.lstsq(design / size, gain.response, rcond=None)[0]
+        multiple = _cosine(design / size @ values, gain.response)
+        if multiple < settings.combined:
+            continue
+        strongest = [others[i].effect for i in np.argsort(-np.abs(values))[:3]]
+        words = f"a weaker motor of {gain.joint} and a combination of {', '.join(strongest)} look alike in this log "
+        record = "record torques that do not follow the motion, such as random ones"
+        notes.append(Finding(CHECK, "note", f"{words}(correlation {multiple:.2f})", None, record))
+    return notes
+
+
+def _cosine(one: np.ndarray, other: np.ndarray) -> float:
+    size = np.linalg.norm(one) * np.linalg.norm(other)
+    return float(one @ other / size) if size > 0.0 else 0.0

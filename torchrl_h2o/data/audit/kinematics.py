@@ -1,0 +1,200 @@
+"""Checks whether each velocity is the derivative of its position: exchanged columns, units, signs, lags, noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_h2o.data.audit.derivative import Derivative, deviation, related, steps_of, windowed
+from torchrl_h2o.data.audit.finding import Finding, Rows
+from torchrl_h2o.data.audit.log import Log, Pair
+from torchrl_h2o.data.audit.response import Response
+from torchrl_h2o.data.audit.settings import AuditSettings
+from torchrl_h2o.data.audit.time import common_factor
+
+CHECK = "kinematics"
+# factor between a position's derivative and its velocity -> what it looks like, for position and for velocity
+_FACTORS = (
+    (180.0 / np.pi, "the position looks like degrees, the velocity like rad/s"),
+    (np.pi / 180.0, "the velocity looks like degrees per second, the position like rad"),
+    (1000.0, "the position is in thousandths of the velocity's unit (mm and m/s, mrad and rad/s)"),
+    (0.001, "the velocity is in thousandths of the position's unit per second (mm/s and m, mrad/s and rad)"),
+    (100.0, "the position is in hundredths of the velocity's unit (cm and m/s)"),
+    (0.01, "the velocity is in hundredths of the position's unit per second (cm/s and m)"),
+    (1.0 / (2.0 * np.pi), "the position looks like revolutions, the velocity like rad/s"),
+    (2.0 * np.pi, "the velocity looks like revolutions per second, the position like rad"),
+    (np.pi / 30.0, "the velocity looks like rpm, the position like rad"),
+)
+
+
+def check_kinematics(
+    log: Log, derivatives: Sequence[Derivative], noise: np.ndarray, step: Response | None, settings: AuditSettings
+) -> list[Finding]:
+    """Compares each position with its velocity, and looks for wrapped angles and noise.
+
+    Args:
+        log: the data.
+        derivatives: fits of all pairs.
+        noise: upper estimates of the noise of each observation, (n,).
+        step: windows of one control step; None if the simulator was not consulted.
+        settings: thresholds.
+    """
+    found: list[Finding] = []
+    time_is_wrong = common_factor(derivatives, settings) is not None
+    exchanged: set[str] = set()
+    for index, derivative in enumerate(derivatives):
+        pair = derivative.pair
+        wrapped = _wrapped(log, pair, settings)
+        found += wrapped
+        if wrapped or not _moves(log, pair):
+            continue
+        filtered = _lag(log, derivative, settings)
+        if abs(derivative.correlation) < settings.related:
+            if filtered and derivative.correlation > 0.5 * settings.related:
+                found += filtered
+            elif pair.name not in exchanged:
+                found.append(_unrelated(log, index, derivatives, exchanged, settings))
+            continue
+        if not time_is_wrong and not _explained(derivative, step, settings):
+            found += _factor(log, derivative, settings)
+        found += filtered
+        found += _bias(log, derivative, step, settings)
+    return [*found, *_noisy(log, noise, settings)]
+
+
+def _moves(log: Log, pair: Pair) -> bool:
+    return bool(np.std(log.observation[:, pair.position]) > 0.0 and np.std(log.observation[:, pair.velocity]) > 0.0)
+
+
+def _explained(derivative: Derivative, step: Response | None, settings: AuditSettings) -> bool:
+    """Whether the simulator leads to the measured positions, so that a factor beside 1 is due to coarse sampling."""
+    low, high = settings.scale_severe
+    if step is None or not low <= derivative.factor <= high:
+        return False
+    log, pair = step.log, derivative.pair
+    rows = step.starts
+    displacement, integral, _ = steps_of(log, pair.position, pair.velocity)
+    plain = deviation((displacement - integral)[rows])
+    return deviation(step.error[:, pair.position]) < 0.7 * plain
+
+
+def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
+    pair, factor = derivative.pair, derivative.factor
+    speed = log.observation[:, pair.velocity]
+    coarse = np.corrcoef(speed[:-1], speed[1:])[0, 1] < settings.fine
+    low, high = settings.scale_severe if coarse else settings.scale_warning
+    if low <= factor <= high:
+        return []
+    size = abs(factor)
+    words = f"the derivative of {pair.name} is {factor:.3g} × {pair.velocity_name}"
+    if factor < 0.0:
+        words += ": one of them has the wrong sign"
+    if not low <= size <= high:
+        distance = [abs(np.log(size / known)) for known, _ in _FACTORS]
+        nearest = int(np.argmin(distance))
+        if distance[nearest] < settings.known_factor:
+            words += f": {_FACTORS[nearest][1]}"
+    far = not settings.scale_severe[0] <= factor <= settings.scale_severe[1]
+    return [
+        Finding(
+            CHECK,
+            "severe" if far else "warning",
+            words,
+            None,
+            "correct unit, scale or sign of the columns",
+        )
+    ]
+
+
+def _unrelated(
+    log: Log, index: int, derivatives: Sequence[Derivative], exchanged: set[str], settings: AuditSettings
+) -> Finding:
+    """The cause of a velocity that is not the derivative of its position."""
+    derivative = derivatives[index]
+    pair = derivative.pair
+    remedy = "correct the order of the columns"
+    factor, _, correlation = related(log, *steps_of(log, pair.velocity, pair.position), settings)
+    low, high = settings.scale_severe
+    if correlation > 0.9 and low <= factor <= high:
+        words = f"{pair.name} and {pair.velocity_name} are exchanged: the second is the integral of the first"
+        return Finding(CHECK, "severe", words, None, remedy)
+    for other in derivatives:
+        velocity = other.pair.velocity
+        if other is derivative:
+            continue
+        factor, _, correlation = related(log, *steps_of(log, pair.position, velocity), settings)
+        if abs(correlation) > 0.9 and low <= abs(factor) <= high:
+            exchanged |= {pair.name, other.pair.name}
+            words = f"the derivative of {pair.name} is {other.pair.velocity_name}, not {pair.velocity_name}: the "
+            return Finding(CHECK, "severe", words + "columns of these joints are exchanged", None, remedy)
+    words = f"{pair.velocity_name} is not the derivative of {pair.name} (correlation {derivative.correlation:.2f})"
+    displacement, _, good = steps_of(log, pair.position, pair.velocity)
+    visible = np.std(windowed(log, displacement, good, 8)) > 3.0 * derivative.position_noise
+    return Finding(
+        CHECK,
+        "severe" if visible else "warning",
+        words,
+        None,
+        "check what these columns hold; if a sensor is broken, leave it out",
+    )
+
+
+def _lag(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
+    pair, lag = derivative.pair, derivative.lag
+    if abs(lag) < 0.9:
+        return []
+    late = f"{pair.velocity_name} is {'late' if lag > 0.0 else 'early'} by {abs(lag):.1f} rows "
+    return [
+        Finding(
+            CHECK,
+            "warning" if abs(lag) >= settings.lag_warning else "note",
+            f"{late}({1e3 * abs(lag) * log.dt:.3g} ms) against the derivative of {pair.name}, as a filtered velocity",
+            None,
+            "log the velocity without its filter, or shift the column; declare a sensor delay to the simulator",
+        )
+    ]
+
+
+def _bias(log: Log, derivative: Derivative, step: Response | None, settings: AuditSettings) -> list[Finding]:
+    pair = derivative.pair
+    spread = float(log.observation[:, pair.velocity].std())
+    if abs(derivative.bias) <= settings.bias_warning * spread or _explained(derivative, step, settings):
+        return []
+    words = f"{pair.velocity_name} differs by {-derivative.bias:.3g} {pair.unit}/s from the derivative of {pair.name}"
+    return [Finding(CHECK, "warning", words, None, "subtract the sensor's offset")]
+
+
+def _wrapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
+    if not pair.angle:
+        return []
+    moved = log.following[:, pair.position] - log.observation[:, pair.position]
+    integral = 0.5 * log.dt * (log.following[:, pair.velocity] + log.observation[:, pair.velocity])
+    for turn, unit in ((2.0 * np.pi, "2 π"), (360.0, "360")):
+        turns = (np.abs(moved) > 0.5 * turn) & (np.abs(np.abs(moved) - turn) < 0.1 * turn)
+        turns &= np.abs(integral) < 0.25 * turn
+        # otherwise the position is in another unit, or its rows are out of order
+        if turns.sum() > 0.8 * (np.abs(moved) > 0.25 * turn).sum() > 0.0:
+            words = f"{pair.name} jumps by {unit}: the angle is wrapped"
+            remedy = "unwrap it (numpy.unwrap): the simulator counts turns"
+            return [Finding(CHECK, "warning", words, Rows.of(turns, settings.examples), remedy)]
+    return []
+
+
+def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding]:
+    found = []
+    for column, name in enumerate(log.names):
+        spread = float(log.observation[:, column].std())
+        if not np.isfinite(noise[column]) or noise[column] <= settings.noise_warning * spread:
+            continue
+        found.append(
+            Finding(
+                CHECK,
+                "severe" if noise[column] > settings.noise_severe * spread else "warning",
+                f"{name} has noise of {noise[column]:.3g} {log.units[column]}, {noise[column] / spread:.0%} of its "
+                "standard deviation",
+                None,
+                "use a better sensor or filter positions and velocities alike before logging",
+            )
+        )
+    return found

@@ -1,0 +1,199 @@
+"""The data of an audit as float64 arrays, with the pairs of a joint's position and velocity among its columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.ted import require_ted
+
+
+class AuditedSimulation(Protocol):
+    """What an audit needs of a simulator; ``torchrl_h2o.residuals.Simulation`` provides it."""
+
+    state_map: Any
+
+    @property
+    def model(self) -> Any: ...
+    @property
+    def control_step(self) -> float: ...
+    @property
+    def actuators(self) -> tuple[str, ...]: ...
+    @property
+    def frame_skip(self) -> int: ...
+    def with_effects(self, *effects: Any) -> Any: ...
+    def executed(self, actions: np.ndarray) -> np.ndarray: ...
+    def true_observations(self, observations: np.ndarray) -> np.ndarray: ...
+    def rollout(self, states: np.ndarray, actions: np.ndarray, *, applied: np.ndarray | None = None) -> np.ndarray: ...
+
+
+class AuditedTransitions(Protocol):
+    """Transitions as arrays; ``torchrl_h2o.residuals.Measured`` provides them."""
+
+    observation: np.ndarray
+    action: np.ndarray
+    following: np.ndarray
+    run: np.ndarray
+    time: np.ndarray
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The columns of a position and of its velocity.
+
+    Args:
+        name: name of the position.
+        velocity_name: name of the velocity.
+        position: column of the position.
+        velocity: column of the velocity.
+        coordinate: index of the position in qpos.
+        dof: index of the velocity in qvel.
+        angle: whether the position is an angle in rad; otherwise a distance in m.
+    """
+
+    name: str
+    velocity_name: str
+    position: int
+    velocity: int
+    coordinate: int
+    dof: int
+    angle: bool
+
+    @property
+    def unit(self) -> str:
+        return "rad" if self.angle else "m"
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Measured transitions and the meaning of their columns.
+
+    Args:
+        observation: (T, n), before the action.
+        action: (T, nu).
+        following: (T, n), after the action.
+        run: (T,), index of the unbroken run of each transition.
+        ended: (T,), whether the data mark the end of a run after this transition; None if they do not tell.
+        time: (T,), stamps in s; None without stamps.
+        dt: the control step of the simulator, in s.
+        names: names of the observations, (n,).
+        units: units of the observations, (n,).
+        actuators: names of the actions, (nu,).
+        pairs: positions with an observed velocity.
+        clipped: (T,), transitions with a value at the end of the range that the simulator's own sensors have.
+    """
+
+    observation: np.ndarray
+    action: np.ndarray
+    following: np.ndarray
+    run: np.ndarray
+    ended: np.ndarray | None
+    time: np.ndarray | None
+    dt: float
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    actuators: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+    clipped: np.ndarray
+
+    @classmethod
+    def of(cls, measured: TensorDictBase | AuditedTransitions, simulation: AuditedSimulation) -> Log:
+        """Converts transitions and checks their widths against the simulator.
+
+        Raises:
+            DataError: if they are no valid TED, or observations or actions do not have the simulator's width.
+        """
+        state_map, ended, time = simulation.state_map, None, None
+        if isinstance(measured, TensorDictBase):
+            require_ted(measured)
+            observation, action = _float64(measured["observation"]), _float64(measured["action"])
+            following = _float64(measured["next", "observation"])
+            ended = cast("torch.Tensor", measured["next", "done"]).flatten().numpy()
+            breaks = ended[:-1] | (following[:-1] != observation[1:]).any(1)
+            run = np.concatenate([[0], np.cumsum(breaks)])
+            if "time" in measured.keys():
+                time = _float64(measured["time"]).flatten()
+        else:
+            observation, action, following = measured.observation, measured.action, measured.following
+            run, time = measured.run, measured.time
+        _require_width(observation, state_map.names, "observation")
+        _require_width(action, simulation.actuators, "action")
+        clipped = state_map.clipped(observation) | state_map.clipped(following)
+        return cls(
+            observation,
+            action,
+            following,
+            run,
+            ended,
+            time,
+            simulation.control_step,
+            tuple(state_map.names),
+            tuple(state_map.units),
+            simulation.actuators,
+            find_pairs(state_map, simulation.model),
+            clipped,
+        )
+
+    def __len__(self) -> int:
+        return len(self.observation)
+
+    @property
+    def runs(self) -> list[slice]:
+        """Rows of each unbroken run."""
+        edges = np.flatnonzero(np.diff(self.run)) + 1
+        return [slice(a, b) for a, b in zip([0, *edges.tolist()], [*edges.tolist(), len(self)], strict=True)]
+
+    def starts(self, horizon: int, most: int, margin: int = 0) -> np.ndarray:
+        """First rows of windows that overlap by half at most, evenly thinned, (W,).
+
+        Args:
+            horizon: transitions per window.
+            most: largest number of windows.
+            margin: rows of the same run that have to precede a window.
+        """
+        starts = np.arange(margin, len(self) - horizon + 1)
+        bad = np.concatenate([[0], np.cumsum(self.clipped)])
+        whole = self.run[starts - margin] == self.run[starts + horizon - 1]
+        starts = starts[whole & (bad[starts + horizon] == bad[starts])]
+        apart = starts[:: max(1, horizon // 2)]
+        return apart[np.unique(np.linspace(0, len(apart) - 1, min(most, len(apart))).round().astype(int))]
+
+
+def find_pairs(state_map: Any, model: Any) -> tuple[Pair, ...]:
+    """Positions and velocities of the same degree of freedom among the observations.
+
+    Quaternions have no pairs, and columns that are not single coordinates of the state have none.
+    """
+    single = (np.abs(state_map.observe) == 1.0).sum(1) == (state_map.observe != 0.0).sum(1)
+    single &= (state_map.observe != 0.0).sum(1) == 1
+    column = {int(np.argmax(row)): i for i, row in enumerate(state_map.observe) if single[i] and row.max() == 1.0}
+    pairs = []
+    for joint in range(model.njnt):
+        kind, coordinate, dof = int(model.jnt_type[joint]), int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+        # mjtJoint: 0 free (its three translations pair), 1 ball, 2 slide, 3 hinge
+        for axis in range({0: 3, 1: 0}.get(kind, 1)):
+            position, velocity = coordinate + axis, model.nq + dof + axis
+            if position in column and velocity in column:
+                p, v = column[position], column[velocity]
+                names = state_map.names[p], state_map.names[v]
+                pairs.append(Pair(*names, p, v, position, dof + axis, kind == 3))
+    return tuple(pairs)
+
+
+def _float64(tensor: Any) -> np.ndarray:
+    return tensor.detach().cpu().double().numpy()
+
+
+def _require_width(values: np.ndarray, names: Sequence[str], what: str) -> None:
+    if values.shape[1] != len(names):
+        raise DataError(
+            f"the data have {values.shape[1]} entries, the simulator has {len(names)} ({', '.join(names)})",
+            "choose the simulator that matches the data, or name the columns in the simulator's order",
+            column=what,
+        )

@@ -1,0 +1,277 @@
+"""Simulated windows of a log, and what small changes of actions, forces and states do to their last velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
+from torchrl_h2o.data.audit.settings import AuditSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Windows of measured rows and their simulation.
+
+    Args:
+        log: the data.
+        simulation: the simulator.
+        settings: budgets and step sizes.
+        horizon: control steps per window, H.
+        starts: first row of each window, (W,).
+        states: start states, (W, nq + nv).
+        actions: executed actions of all rows, (T, nu).
+        moving: columns of the observed velocities, (m,).
+    """
+
+    log: Log
+    simulation: AuditedSimulation
+    settings: AuditSettings
+    horizon: int
+    starts: np.ndarray
+    states: np.ndarray
+    actions: np.ndarray
+    moving: np.ndarray
+
+    @classmethod
+    def of(
+        cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None, settings: AuditSettings
+    ) -> Response | None:
+        """Chooses windows in which the velocities change by more than their noise; None without enough of them.
+
+        Args:
+            log: the data.
+            simulation: the simulator.
+            noise: standard deviation of the noise of each observation, (n,); None for windows of one step.
+            settings: budgets.
+        """
+        moving = np.array([pair.velocity for pair in log.pairs], int)
+        if not len(moving):
+            return None
+        horizon = 1 if noise is None else _horizon(log, moving, noise, settings)
+        margin = settings.settling_steps if simulation.state_map.hidden else 0
+        most = min(settings.windows, settings.physics_steps // (simulation.frame_skip * horizon))
+        starts = log.starts(horizon, most, margin)
+        if len(starts) < settings.min_windows:
+            return None
+        true = np.concatenate([simulation.true_observations(log.observation[run]) for run in log.runs])
+        actions = np.concatenate([simulation.executed(log.action[run]) for run in log.runs])
+        states = simulation.state_map.states(true)
+        chosen = _settled(log, simulation, states, actions, starts, margin)
+        return cls(log, simulation, settings, horizon, starts, chosen, actions, moving)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows of each window, (W, H)."""
+        return self.starts[:, None] + np.arange(self.horizon)
+
+    def thinned(self, most: int) -> Response:
+        """At most ``most`` of the windows, evenly spread."""
+        chosen = np.unique(np.linspace(0, len(self.starts) - 1, min(most, len(self.starts))).round().astype(int))
+        return replace(self, starts=self.starts[chosen], states=self.states[chosen])
+
+    def for_hypotheses(self) -> Response:
+        """As many of the windows as a hypothesis may simulate."""
+        most = self.settings.hypothesis_steps // (self.simulation.frame_skip * self.horizon)
+        return self.thinned(int(np.clip(most, 40, self.settings.hypothesis_windows)))
+
+    @property
+    def before(self) -> np.ndarray:
+        """Measured velocities at the start of each window, (W, m)."""
+        return self.log.observation[self.starts][:, self.moving]
+
+    @cached_property
+    def change(self) -> np.ndarray:
+        """Measured change of the velocities within each window, (W, m)."""
+        return self.log.following[self.starts + self.horizon - 1][:, self.moving] - self.before
+
+    @cached_property
+    def scale(self) -> np.ndarray:
+        """Usual change of each velocity, (m,)."""
+        usual = np.median(np.abs(self.change), axis=0)
+        return np.where(usual > 0.0, usual, np.maximum(np.abs(self.change).mean(0), 1e-12))
+
+    @cached_property
+    def limited(self) -> np.ndarray:
+        """Executed actions within the actuators' range, (T, nu)."""
+        return np.clip(self.actions, *self._range)
+
+    @cached_property
+    def anchor(self) -> np.ndarray:
+        """Actions of the windows about which the simulation is linearised, (W, H, nu).
+
+        They are the logged ones, or zero if the simulator is far nearer to the log without actions.
+        """
+        logged = self.limited[self.rows]
+        without = self.misfit(actions=np.zeros_like)
+        return logged if without > self.settings.better * self.misfit() else np.zeros_like(logged)
+
+    @cached_property
+    def _range(self) -> tuple[np.ndarray, np.ndarray]:
+        model = self.simulation.model
+        low, high = model.actuator_ctrlrange.T
+        free = model.actuator_ctrllimited == 0
+        return np.where(free, -np.inf, low), np.where(free, np.inf, high)
+
+    @cached_property
+    def action_unit(self) -> np.ndarray:
+        """Half the range of each actuator, or twice the spread of its action without a range, (nu,)."""
+        low, high = self._range
+        spread = 2.0 * self.actions.std(0) + 1e-9
+        return np.where(np.isfinite(high - low), 0.5 * (high - low), spread)
+
+    def reached(
+        self,
+        states: np.ndarray,
+        actions: np.ndarray,
+        applied: np.ndarray | None = None,
+        simulation: AuditedSimulation | None = None,
+    ) -> np.ndarray:
+        """Simulated observations at the end of windows, (B, n), from states (B, nq + nv) and actions (B, H, nu)."""
+        chosen = self.simulation if simulation is None else simulation
+        end = chosen.rollout(states, actions, applied=applied)[:, -1]
+        return self.simulation.state_map.observations(end)
+
+    @cached_property
+    def simulated(self) -> np.ndarray:
+        """Simulated change of the velocities under the actions of :attr:`anchor`, (W, m)."""
+        return self._velocities(self.anchor) - self.before
+
+    @cached_property
+    def target(self) -> np.ndarray:
+        """Change of the velocities that the actions have to explain, linearised, (W, m)."""
+        effect = (self.by_action * self.anchor.mean(1)[:, None]).sum(-1)
+        return self.change - self.simulated + effect
+
+    @cached_property
+    def error(self) -> np.ndarray:
+        """Measured minus simulated observation at the end of each window, (W, n)."""
+        last = self.log.following[self.starts + self.horizon - 1]
+        return last - self.reached(self.states, self.limited[self.rows])
+
+    def _velocities(self, actions: np.ndarray, applied: np.ndarray | None = None) -> np.ndarray:
+        copies = len(actions) // len(self.states)
+        return self.reached(np.tile(self.states, (copies, 1)), actions, applied)[:, self.moving]
+
+    @cached_property
+    def by_action(self) -> np.ndarray:
+        """Derivative of the change by a constant offset of each action, (W, m, nu), by differences inside its range."""
+        base, unit = self.anchor, self.settings.nudge * self.action_unit
+        inward = np.where(base.mean(1) > 0.5 * sum(np.nan_to_num(self._range, posinf=0.0, neginf=0.0)), -1.0, 1.0)
+        steps = inward * unit  # (W, nu)
+        moved = np.concatenate([base + (steps * row)[:, None] for row in np.eye(base.shape[-1])])
+        reached = self._velocities(moved).reshape(base.shape[-1], *self.change.shape)
+        return np.moveaxis(reached - self.before - self.simulated, 0, -1) / steps[:, None]
+
+    @cached_property
+    def by_force(self) -> np.ndarray:
+        """Derivative of the change by a constant force on each pair's degree of freedom, (W, m, pairs)."""
+        pairs, nv = self.log.pairs, self.simulation.model.nv
+        size = self._force_nudge()
+        actions = np.tile(self.anchor, (len(pairs), 1, 1))
+        applied = np.zeros((len(pairs), len(self.starts), self.horizon, nv))
+        for index, pair in enumerate(pairs):
+            applied[index, ..., pair.dof] = size[index]
+        reached = self._velocities(actions, applied.reshape(-1, self.horizon, nv))
+        reached = reached.reshape(len(pairs), *self.change.shape)
+        return np.moveaxis(reached - self.before - self.simulated, 0, -1) / size
+
+    def _force_nudge(self) -> np.ndarray:
+        """Forces that change a velocity by a small share of its usual change, (pairs,), from the diagonal inertia."""
+        model = self.simulation.model
+        inertia = np.array([1.0 / max(float(model.dof_invweight0[pair.dof]), 1e-9) for pair in self.log.pairs])
+        return np.maximum(self.settings.nudge * inertia * self.scale / (self.horizon * self.log.dt), 1e-9)
+
+    @cached_property
+    def by_zero(self) -> np.ndarray:
+        """Derivative of the change by the zero of each pair's position, (W, m, pairs)."""
+        pairs, actions = self.log.pairs, self.anchor
+        size, moved = self.settings.zero_nudge, []
+        for pair in pairs:
+            moved.append(self.states.copy())
+            moved[-1][:, pair.coordinate] += size
+        reached = self.reached(np.concatenate(moved), np.tile(actions, (len(pairs), 1, 1)))[:, self.moving]
+        reached = reached.reshape(len(pairs), *self.change.shape)
+        return np.moveaxis(reached - self.before - self.simulated, 0, -1) / size
+
+    def mean_action(self, lag: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean action of each window if actions act ``lag`` rows late, (W, nu), and which windows have it, (W,)."""
+        sums = np.concatenate([np.zeros((1, self.actions.shape[1])), np.cumsum(self.limited, axis=0)])
+        first = self.starts - lag
+        inside = np.clip(first, 0, len(self.log) - self.horizon)
+        known = (first == inside) & (self.log.run[inside] == self.log.run[self.starts])
+        known &= self.log.run[inside + self.horizon - 1] == self.log.run[self.starts]
+        return (sums[inside + self.horizon] - sums[inside]) / self.horizon, known
+
+    def misfit(
+        self,
+        actions: Callable[[np.ndarray], np.ndarray] | None = None,
+        observations: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> float:
+        """Unexplained share of the change of the velocities: median error over median change, mean over velocities.
+
+        Args:
+            actions: changes the actions (W, H, nu) first, also to another number of steps; None for none.
+            observations: changes the observations (..., n) first; None for none.
+        """
+        executed = self.limited[self.rows]
+        if actions is not None:
+            executed = np.clip(actions(executed), *self._range)
+        states, before, change = self.states, self.before, self.change
+        if observations is not None:
+            first = self.log.observation[self.starts]
+            last = self.log.following[self.starts + self.horizon - 1]
+            moved = observations(first)
+            states = states + (moved - first) @ self.simulation.state_map.restore.T
+            before = moved[:, self.moving]
+            change = observations(last)[:, self.moving] - before
+        error = np.abs(change - (self.reached(states, executed)[:, self.moving] - before))
+        error = np.where(np.isfinite(error), error, np.inf)
+        usual = np.median(np.abs(change), axis=0)
+        share = np.median(error, axis=0) / np.where(usual > 0.0, usual, np.inf)
+        return float(np.minimum(share, 3.0).mean())
+
+
+def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, settings: AuditSettings) -> int:
+    """Shortest window in which the median velocity changes by a multiple of its noise."""
+    longest = max(1, int(settings.longest_window / log.dt))
+    horizon = 1
+    while horizon < longest:
+        starts = log.starts(horizon, 2000)
+        if not len(starts):
+            break
+        change = (log.following[starts + horizon - 1] - log.observation[starts])[:, moving]
+        usual = np.median(np.abs(change), axis=0)
+        if np.median(usual / np.maximum(noise[moving], 1e-12)) >= settings.signal_to_noise:
+            break
+        horizon = min(2 * horizon, longest)
+    return horizon
+
+
+def _settled(
+    log: Log, simulation: AuditedSimulation, states: np.ndarray, actions: np.ndarray, starts: np.ndarray, steps: int
+) -> np.ndarray:
+    """States of some rows; unobserved coordinates are simulated from some steps before, with the others measured."""
+    hidden = list(simulation.state_map.hidden)
+    if not hidden:
+        return states[starts]
+    carried = states[starts - steps][:, hidden]
+    for step in range(steps):
+        row = starts - steps + step
+        now = states[row]
+        now[:, hidden] = carried
+        carried = simulation.rollout(now, actions[row][:, None])[:, 0, hidden]
+    chosen = states[starts]
+    chosen[:, hidden] = carried
+    return chosen
+
+
+def joint_of(model, actuator: int, pairs: tuple[Pair, ...]) -> int | None:
+    """Index of the pair whose joint an actuator drives; None if there is none."""
+    if int(model.actuator_trntype[actuator]) not in (0, 1):  # mjtTrn: joint, joint in parent frame
+        return None
+    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
+    return next((index for index, pair in enumerate(pairs) if pair.dof == dof), None)

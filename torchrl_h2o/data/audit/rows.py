@@ -1,0 +1,306 @@
+"""Checks of the rows: their order, repetitions and jumps; frozen, clipped and quantised columns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.data.audit.derivative import deviation
+from torchrl_h2o.data.audit.finding import Finding, Rows
+from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
+from torchrl_h2o.data.audit.settings import AuditSettings
+
+CHECK = "rows"
+_SLOPE_ROWS = 10  # over which a position is differentiated beside a frozen velocity
+
+
+def check_rows(log: Log, simulation: AuditedSimulation, settings: AuditSettings) -> list[Finding]:
+    """Order and repetition of rows, and each column's readings."""
+    found = [*_order(log, settings), *_repeated(log, settings), *_duplicates(log, settings)]
+    ends = at_extremes(log, settings)
+    found += _jumps(log, simulation, ends, settings)
+    for column in range(len(log.names)):
+        known = log.clipped & ends[:, column]
+        if ends[:, column].sum() > 1.1 * known.sum():
+            found.append(_clipped(log, column, ends[:, column], settings))
+        found += _quantised(log, column, settings)
+    return [*found, *_frozen(log, ends, settings), *_sensor_ranges(log, settings)]
+
+
+def _order(log: Log, settings: AuditSettings) -> list[Finding]:
+    """Rows that do not continue the row before although no episode ended there."""
+    breaks = log.run[1:] != log.run[:-1]
+    if log.ended is not None:
+        breaks &= ~log.ended[:-1]
+    if breaks.sum() <= settings.broken_runs * len(log):
+        return []
+    rows = np.flatnonzero(breaks) + 1
+    return [
+        Finding(
+            CHECK,
+            "severe",
+            f"{breaks.mean():.0%} of the rows do not begin where the row before ended: the transitions are shuffled or "
+            "thinned",
+            Rows.of(rows, settings.examples),
+            "give the transitions in the order of their recording",
+        )
+    ]
+
+
+def _repeated(log: Log, settings: AuditSettings) -> list[Finding]:
+    same = (log.following == log.observation).all(1)
+    moving = np.zeros(len(log), bool)
+    for pair in log.pairs:
+        velocity = 0.5 * (log.observation[:, pair.velocity] + log.following[:, pair.velocity])
+        step = _resolution(log.observation[:, pair.position])
+        fast = np.abs(velocity) > settings.moving * log.observation[:, pair.velocity].std()
+        moving |= fast & (np.abs(velocity) * log.dt > 3.0 * step)
+    if not log.pairs:
+        moving[:] = True
+    repeated, share = same & moving, (same & moving).sum() / max(1, moving.sum())
+    if share <= settings.repeated:
+        return []
+    return [
+        Finding(
+            CHECK,
+            "severe" if share > settings.many_repeated else "warning",
+            f"{share:.1%} of the rows in motion repeat the row before in every sensor, as after a lost packet",
+            Rows.of(repeated, settings.examples),
+            "remove the repeated rows and split the log there, or log at the rate of the sensors",
+        )
+    ]
+
+
+def _duplicates(log: Log, settings: AuditSettings) -> list[Finding]:
+    """Stretches of rows that occur twice, such as a file that was appended to itself."""
+    together = np.hstack([log.observation, log.action])
+    _, first, inverse = np.unique(together, axis=0, return_index=True, return_inverse=True)
+    back = np.arange(len(log)) - first[inverse.ravel()]
+    again = np.zeros(len(log), bool)
+    continued = (back[1:] == back[:-1]) & (back[1:] > settings.duplicate_block)
+    for start, stop in _stretches(continued, settings.duplicate_block):
+        again[start : stop + 1] = bool(np.any(np.ptp(log.observation[start : stop + 1], axis=0)))
+    if not again.any():
+        return []
+    return [
+        Finding(
+            CHECK,
+            "warning",
+            f"{again.mean():.0%} of the rows occur a second time, in the same order",
+            Rows.of(again, settings.examples),
+            "remove them: fitted and held-out rows would be the same",
+        )
+    ]
+
+
+def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: AuditSettings) -> list[Finding]:
+    """Rows after which positions are where neither their velocities nor the simulator lead."""
+    size = np.zeros(len(log))
+    repeated = (log.following == log.observation).all(1)
+    known = log.clipped | repeated | np.append(False, repeated[:-1])
+    for pair in log.pairs:
+        at_end = np.asarray(ends[:, pair.position] | ends[:, pair.velocity])
+        left_out = known | at_end | np.append(at_end[1:], False)
+        error = np.abs(_deviations(log, pair))
+        spread = position_spread(log, pair)
+        # where most rows jump, the usual deviation is that of jumps
+        usual = max(min(settings.jump_noise * deviation(error), spread), settings.jump * spread)
+        # a velocity that changes within the row accounts for as much
+        speed = np.maximum(
+            2.0 * np.abs(log.following[:, pair.velocity] - log.observation[:, pair.velocity]),
+            1.5 * log.observation[:, pair.velocity].std(),
+        )
+        size = np.maximum(size, np.where(left_out, 0.0, error / np.maximum(np.maximum(usual, log.dt * speed), 1e-12)))
+    suspects = np.flatnonzero(size > 1.0)
+    if not len(suspects):
+        return []
+    seen = suspects[np.unique(np.linspace(0, len(suspects) - 1, settings.max_suspects).astype(int))]
+    seen = seen[_surprising(log, simulation, seen, settings)] if simulation.frame_skip < 100 else seen
+    share = len(seen) / min(len(suspects), settings.max_suspects) * len(suspects) / len(log)
+    if not len(seen):
+        return []
+    spikes = _spikes(log, seen, settings)
+    if spikes > 0.8:
+        what, remedy = "single readings lie far beside their neighbours", "remove these readings and split the log"
+    else:
+        what = "positions jump to where neither their velocities nor the simulator lead: rows are missing, were put "
+        what += "into another order, or belong to another run"
+        remedy = "restore the order of the rows; where a run ends, mark it with done or a jump of time"
+    return [
+        Finding(
+            CHECK,
+            "severe" if share > settings.many_jumps else "warning",
+            f"after {share:.2%} of the rows {what}",
+            Rows.of(seen, settings.examples),
+            remedy,
+        )
+    ]
+
+
+def position_spread(log: Log, pair: Pair) -> float:
+    """Standard deviation of a position; of an angle that turns over and over, that within one turn."""
+    spread = float(log.observation[:, pair.position].std())
+    return min(spread, 2.0 * np.pi / np.sqrt(12.0)) if pair.angle and spread < 50.0 else spread
+
+
+def _deviations(log: Log, pair: Pair) -> np.ndarray:
+    """Displacement minus the integral of the velocity, (T,); turns of an angle by 2 π are removed."""
+    moved = log.following[:, pair.position] - log.observation[:, pair.position]
+    error = moved - 0.5 * log.dt * (log.following[:, pair.velocity] + log.observation[:, pair.velocity])
+    if pair.angle:
+        turns = np.round(error / (2.0 * np.pi))
+        near = np.abs(error - 2.0 * np.pi * turns) < 0.5
+        error = np.where(near, error - 2.0 * np.pi * turns, error)
+    return error
+
+
+def _surprising(log: Log, simulation: AuditedSimulation, rows: np.ndarray, settings: AuditSettings) -> np.ndarray:
+    """Which rows the simulator does not lead to either, from a state with the position or velocity measured."""
+    states = simulation.state_map.states(log.observation[rows])
+    reached = simulation.state_map.observations(simulation.rollout(states, log.action[rows][:, None])[:, 0])
+    surprising = np.zeros(len(rows), bool)
+    for pair in log.pairs:
+        error = log.following[rows, pair.position] - reached[:, pair.position]
+        if pair.angle:
+            error = error - 2.0 * np.pi * np.round(error / (2.0 * np.pi))
+        limit = settings.jump * position_spread(log, pair)
+        surprising |= ~(np.abs(error) <= limit) & (np.abs(_deviations(log, pair)[rows]) > limit)
+    return surprising
+
+
+def _spikes(log: Log, rows: np.ndarray, settings: AuditSettings) -> float:
+    """Share of jumps that return within one row."""
+    rows = rows[(rows > 0) & (rows < len(log) - 1)]
+    positions = [pair.position for pair in log.pairs]
+    to = np.abs(log.following[rows] - log.observation[rows])[:, positions]
+    back = np.abs(log.following[rows + 1] - log.observation[rows])[:, positions]
+    before = np.abs(log.following[rows] - log.observation[rows - 1])[:, positions]
+    largest = to.argmax(1)
+    pick = np.arange(len(rows)), largest
+    return float((np.minimum(back, before)[pick] < settings.spike * to[pick]).mean()) if len(rows) else 0.0
+
+
+def at_extremes(log: Log, settings: AuditSettings) -> np.ndarray:
+    """Readings that equal the extreme of their column, in columns where these pile up, (T, n)."""
+    found = np.zeros(log.observation.shape, bool)
+    for column in range(log.observation.shape[1]):
+        values = np.round(log.observation[:, column], 6)
+        levels, counts = np.unique(values, return_counts=True)
+        if len(levels) < 8:
+            continue
+        for end, beside in ((0, slice(1, 4)), (-1, slice(-4, -1))):
+            many = counts[end] > max(5.0, settings.at_end * len(log))
+            if not many or counts[end] <= 4.0 * counts[beside].max():
+                continue
+            at_end = values == levels[end]
+            # one long stretch is a frozen sensor that happens to stop at an extreme
+            longest = max((b - a for a, b in _stretches(at_end, 1)), default=0)
+            if longest <= 0.5 * counts[end]:
+                found[:, column] |= at_end
+    return found
+
+
+def _clipped(log: Log, column: int, ends: np.ndarray, settings: AuditSettings) -> Finding:
+    values = np.unique(log.observation[ends, column])
+    places = " and ".join(f"{value:.4g}" for value in (values[[0, -1]] if np.ptp(values) > 1e-5 else values[:1]))
+    return Finding(
+        CHECK,
+        "severe" if ends.mean() > settings.mostly_at_end else "warning",
+        f"{ends.mean():.1%} of {log.names[column]} equal {places} {log.units[column]}: the signal is clipped",
+        Rows.of(ends, settings.examples),
+        "widen the range of the sensor, or leave these rows out",
+    )
+
+
+def _quantised(log: Log, column: int, settings: AuditSettings) -> list[Finding]:
+    values = log.observation[:, column]
+    step, spread = _resolution(values), float(values.std())
+    if not spread > 0.0 or step <= settings.quantum_note * spread:
+        return []
+    severity = "warning" if step > settings.quantum_warning * spread else "note"
+    return [
+        Finding(
+            CHECK,
+            severity,
+            f"{log.names[column]} has a resolution of {step:.3g} {log.units[column]}, {step / spread:.0%} of its "
+            "standard deviation",
+            None,
+            "log it with more digits or a finer sensor; until then, its noise limits what can be found",
+        )
+    ]
+
+
+def _resolution(values: np.ndarray) -> float:
+    """Smallest step between readings, if they are multiples of it; 0 for a column without steps."""
+    spread = float(np.std(values))
+    if not spread > 0.0:
+        return 0.0
+    levels = np.unique(np.round(values / (1e-5 * spread)))
+    if len(levels) < 3 or len(levels) > 0.5 * len(values):
+        return 0.0
+    steps = np.diff(levels)
+    step = float(np.quantile(steps[steps > 2.0], 0.02)) if (steps > 2.0).any() else 0.0
+    multiples = steps[steps > 2.0] / max(step, 1e-12)
+    regular = np.abs(multiples - np.round(multiples)) < 0.1
+    return 1e-5 * spread * step if step and regular.mean() > 0.9 else 0.0
+
+
+def _frozen(log: Log, ends: np.ndarray, settings: AuditSettings) -> list[Finding]:
+    """Stretches of equal readings while the other column of the pair, or the other columns, move."""
+    found = []
+    partner = {pair.position: pair.velocity for pair in log.pairs}
+    partner |= {velocity: position for position, velocity in partner.items()}
+    for column in range(len(log.names)):
+        values = log.observation[:, column]
+        still = (values[1:] == values[:-1]) & (log.run[1:] == log.run[:-1]) & ~ends[1:, column]
+        frozen = np.zeros(len(log), bool)
+        for start, stop in _stretches(still, settings.frozen_rows):
+            part = slice(start, stop + 1)
+            frozen[part] = _others_move(log, column, partner.get(column), part, settings)
+        if frozen.any():
+            severe = frozen.mean() > settings.frozen_severe
+            found.append(
+                Finding(
+                    CHECK,
+                    "severe" if severe else "warning",
+                    f"{log.names[column]} is frozen while the robot moves",
+                    Rows.of(frozen, settings.examples),
+                    "repair the sensor, or leave these rows out",
+                )
+            )
+    return found
+
+
+def _stretches(mask: np.ndarray, shortest: int) -> list[tuple[int, int]]:
+    """First and last-plus-one index of each stretch of True of at least some length."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= shortest]
+
+
+def _others_move(log: Log, column: int, partner: int | None, part: slice, settings: AuditSettings) -> bool:
+    if partner is None:
+        others = np.delete(log.observation, column, axis=1)
+        spread = others.std(0)
+        moved = others[part].std(0) > settings.moving * spread
+        return bool(moved[spread > 0.0].mean() > 0.5) if (spread > 0.0).any() else False
+    step, spread = _resolution(log.observation[:, column]), log.observation[:, column].std()
+    values = log.observation[part, partner]
+    if any(pair.position == column for pair in log.pairs):  # the velocity tells how far the joint moves
+        distance = np.ptp(np.cumsum(values)) * log.dt
+        return bool(distance > max(3.0 * step, 0.5 * settings.moving * spread))
+    slopes = (values[_SLOPE_ROWS:] - values[:-_SLOPE_ROWS]) / (_SLOPE_ROWS * log.dt)
+    return bool(np.std(slopes) > max(2.0 * step, settings.moving * spread))
+
+
+def _sensor_ranges(log: Log, settings: AuditSettings) -> list[Finding]:
+    if log.clipped.mean() <= settings.at_end:
+        return []
+    return [
+        Finding(
+            CHECK,
+            "warning" if log.clipped.mean() > 0.9 else "note",
+            f"{log.clipped.mean():.0%} of the rows hold a value at the end of the simulator's own sensor range; "
+            "they are left out of fits",
+            Rows.of(log.clipped, settings.examples),
+            "record slower motion, if the remaining rows are too few",
+        )
+    ]
