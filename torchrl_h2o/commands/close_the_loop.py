@@ -21,6 +21,7 @@ from torchrl.envs import TransformedEnv
 
 from torchrl_h2o.commands.guess import GUESS, guess_columns
 from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
@@ -136,7 +137,8 @@ def expanded(argument: str) -> list[str]:
 def run() -> None:
     """Entry point of the console command ``close-the-loop``."""
     if GUESS in sys.argv[1:]:
-        guess_columns(sys.argv[1:])
+        with one_line_errors():
+            guess_columns(sys.argv[1:])
         return
     sys.argv[1:] = [full for argument in sys.argv[1:] for full in expanded(argument)]
     main()
