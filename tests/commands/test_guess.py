@@ -84,6 +84,14 @@ def test_wrong_arguments_are_named(folder, arguments, message):
     assert not list(folder.glob("*.yaml"))
 
 
+def test_an_error_is_one_line(folder, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["close-the-loop", "--guess", "data=none.csv"])
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit):
+        run()
+    assert capsys.readouterr().err == "DataError: none.csv: there is no such file; check the path\n"
+
+
 def test_a_log_without_names_takes_the_model_s_order(folder):
     rows = np.stack([T, np.sin(T), np.cos(T), np.cos(T), -np.sin(T), T], 1)
     np.savetxt("log.txt", rows)
