@@ -86,7 +86,7 @@ def main(cfg: DictConfig) -> None:
         simulation,
         recording.transitions,
         chosen_entries(cfg, simulation),
-        source=recording.source,
+        source="; ".join([recording.source, *(estimate.words() for estimate in recording.estimated)]),
         held_out=recording.reported_on,
         seed=cfg.seed,
         audit=audited(cfg, recording, simulation),

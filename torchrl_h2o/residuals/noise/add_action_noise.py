@@ -30,6 +30,8 @@ def add_action_noise(
         The explanation with an :class:`~torchrl_h2o.effects.ActionNoise`, whose standard deviation is negative where
         the simulator has too much noise; unchanged if the difference is negligible or not significant.
     """
+    if not simulation.model.nu:
+        return explanation  # a free motion
     own = [effect for effect in simulation.effects if isinstance(effect, ActionNoise) and effect.actuators is None]
     own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
     noise = estimate_noise(simulation.with_effects(*explanation.effects), measured, settings)
