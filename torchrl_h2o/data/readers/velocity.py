@@ -15,7 +15,7 @@ import numpy as np
 
 _HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 12, 15, 18, 22, 27, 33, 40, 50, 60, 75, 90)  # rows; odd windows of 7 to 181
 _DIFFERENCES = (3, 4, 5, 6)  # orders of the differences that show noise
-_CERTAIN = 0.1  # share of the noise's own square by which a difference counts as motion
+_CERTAIN = 4.0  # standard deviations of the mean square of noise beyond which a difference counts as motion
 _SHORTEST_RUN = 2 * _HALF_WIDTHS[0] + 2
 
 
@@ -125,7 +125,9 @@ def _error(parts: Sequence[np.ndarray], width: int, noise: float, dt: float) -> 
         fifth = np.pad(_kernels(other, 5)[1], width - other)
         squares = np.concatenate([np.correlate(part, fifth - cubic, "valid") ** 2 for part in _long(parts, width)])
         own = noise**2 * float((fifth - cubic) @ (fifth - cubic))
-        if (more := float(squares.mean()) - own) > certain * own:
+        # neighbouring windows overlap, so the mean has as many independent terms as there are windows side by side
+        chance = math.sqrt(2.0 * (2 * other + 1) / len(squares))
+        if (more := float(squares.mean()) - own) > certain * chance * own:
             cut = max(cut, more)
     return math.sqrt(noise**2 * float(cubic @ cubic) + cut) / dt
 
