@@ -30,7 +30,7 @@ class Case:
         seed: random seed of the recording.
         transitions: number of recorded transitions.
         episode: steps until a reset.
-        held_out: fraction of the data excluded from fits.
+        held_out: fraction of the data on which errors are reported, or the indices of these logs.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Case:
     seed: int = 0
     transitions: int = TRANSITIONS
     episode: int = 500
-    held_out: float = 0.3
+    held_out: float | tuple[int, ...] = 0.25
 
     def simulation(self) -> Simulation:
         """Build the imperfect simulator."""
