@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.report.contents import (
     FoundEffect,
     IndistinguishableGroup,
     Interval,
+    OtherExplanation,
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
@@ -81,6 +82,10 @@ def compose_report(
         trace=judgement.trace,
         verdict=judgement.verdict,
         failures=judgement.failures,
+        others=tuple(
+            OtherExplanation(rival.fit.effects, error, where, tuple(map(words, rival.fit.effects)))
+            for rival, error, where in judgement.others
+        ),
     )
 
 

@@ -166,6 +166,12 @@ class TraceSettings:
     """Number of alternatives tried in an effect's place because their promise was highest."""
     rival_min_sketch: float = 0.5
     """Share of an effect's gain that an alternative must reach in its sketch to be fitted."""
+    rival_set_size: int = 3
+    """Largest number of effects in another set that may explain the data as well."""
+    rival_sets: int = 8
+    """Number of such sets of each size that get a quick fit."""
+    rival_finalists: int = 3
+    """Number of such sets of each size that are fitted on all windows of the search."""
     same_loss: float = 1e-6
     """Loss difference between alternatives, as a share of the effect's gain, that counts as rounding."""
     alike_loss: float = 0.1

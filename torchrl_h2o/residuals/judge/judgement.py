@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
 from torchrl_h2o.residuals.judge.run_errors import run_errors
-from torchrl_h2o.residuals.judge.separation import separated_by
+from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
@@ -27,6 +27,7 @@ from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.rival_sets import RivalSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,7 @@ class Judgement:
         runs: error of each run.
         verdict: what these figures say.
         failures: attempts that failed with an error, and why.
+        others: error and separating data of each other set of effects that explains the data as well.
     """
 
     measured: Measured
@@ -75,6 +77,7 @@ class Judgement:
     runs: tuple[RunError, ...]
     verdict: Verdict
     failures: tuple[str, ...] = ()
+    others: tuple[tuple[RivalSet, float, str], ...] = ()
 
 
 def judge(
@@ -115,6 +118,7 @@ def judge(
         runs=run_errors(simulation, mended, measured, settings=settings.judge),
         verdict=reach_verdict(simulation, mended, measured, effects, error, two_sample, settings),
         failures=(*explanation.failures, *failures),
+        others=_others(simulation, mended, measured, explanation, settings),
     )
 
 
@@ -169,6 +173,18 @@ def _alternatives(
         simulation, measured, alike, _without_noise(before), _without_noise(after), settings=settings.judge
     )
     return Alternatives(alike, tuple(errors), where)
+
+
+def _others(
+    simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
+) -> tuple[tuple[RivalSet, float, str], ...]:
+    """Error of each other set of effects, and the data that would distinguish it from the effects found."""
+    others = []
+    for rival in explanation.trace.others:
+        other = simulation.with_effects(*rival.fit.effects)
+        where = difference_between((mended, other), measured, settings=settings.judge)
+        others.append((rival, overall_error(other, measured), where))
+    return tuple(others)
 
 
 def _two_sample(

@@ -38,10 +38,23 @@ def separated_by(
         A clause with the dimension in which the predictions differ most, the difference per step, and the states or
         actions at which they differ.
     """
+    simulations = [simulation.with_effects(*before, effect, *after) for effect in effects]
+    return difference_between(simulations, measured, settings=settings)
+
+
+def difference_between(
+    simulations: Sequence[Simulation], measured: Measured, *, settings: JudgeSettings = DEFAULTS.judge
+) -> str:
+    """Describes which data would distinguish the first of some simulations from the others, as :func:`separated_by`.
+
+    Args:
+        simulations: simulators with alternative effects.
+        measured: the data.
+        settings: thresholds of the description.
+    """
     rows = measured.windows(1)
-    of_first, *of_others = (
-        residuals(simulation.with_effects(*before, effect, *after), measured, rows)[:, 0] for effect in effects
-    )
+    of_first, *of_others = (residuals(each, measured, rows)[:, 0] for each in simulations)
+    simulation = simulations[0]
     spread = measured.observation.std(0) + 1e-12
     difference = np.nan_to_num(np.max([np.abs(of_first - other) for other in of_others], axis=0) / spread)
     size = difference.max(1)

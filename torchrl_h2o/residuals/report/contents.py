@@ -121,6 +121,27 @@ class IndistinguishableGroup:
 
 
 @dataclass(frozen=True)
+class OtherExplanation:
+    """Another set of effects that explains the data as well as the effects found.
+
+    Args:
+        effects: the effects, fitted together.
+        error: held-out error with them, in the summary's unit.
+        separated_by: description of the data that would tell it from the effects found.
+        words: description of each effect with units; by default those of the effects.
+    """
+
+    effects: tuple[Effect, ...]
+    error: float
+    separated_by: str
+    words: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        if not self.words:
+            object.__setattr__(self, "words", tuple(map(effect_words, self.effects)))
+
+
+@dataclass(frozen=True)
 class DimensionError:
     """Held-out one-step error of one dimension.
 
@@ -268,6 +289,7 @@ class ReportContents:
         found: effects that the simulator lacks, in the order in which they were put in.
         rejected: effects that were fitted and not put in.
         indistinguishable: effects that these data cannot tell apart.
+        others: other sets of effects that explain the data as well, the most usual ones first.
         two_sample: AUC of a classifier of measured against simulated transitions.
         unexplained_intervals: intervals that were excluded as disturbed.
         stop_test: description of the test by which the search stopped.
@@ -293,6 +315,7 @@ class ReportContents:
     found: tuple[FoundEffect, ...] = ()
     rejected: tuple[RejectedEffect, ...] = ()
     indistinguishable: tuple[IndistinguishableGroup, ...] = ()
+    others: tuple[OtherExplanation, ...] = ()
     two_sample: TwoSample = TwoSample()
     unexplained_intervals: tuple[Interval, ...] = ()
     stop_test: str = ""

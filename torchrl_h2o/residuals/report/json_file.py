@@ -22,6 +22,7 @@ from torchrl_h2o.residuals.report.contents import (
     HorizonError,
     IndistinguishableGroup,
     Interval,
+    OtherExplanation,
     RejectedEffect,
     ReportContents,
     TwoSample,
@@ -95,6 +96,15 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             ],
             "error": None if report.error is None else dataclasses.asdict(report.error),
             "verdict": None if report.verdict is None else dataclasses.asdict(report.verdict),
+            "others": [
+                {
+                    "effects": [effect_to_dict(effect) for effect in other.effects],
+                    "words": other.words,
+                    "error": other.error,
+                    "separated_by": other.separated_by,
+                }
+                for other in report.others
+            ],
             "failures": report.failures,
             "audit": None if report.audit is None else report.audit.to_dict(),
             "unfinished": report.unfinished,
@@ -128,6 +138,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "indistinguishable": tuple(_group(entry) for entry in entries["indistinguishable"]),
         "error": None if entries["error"] is None else _error(entries["error"]),
         "verdict": None if entries.get("verdict") is None else _verdict(entries["verdict"]),
+        "others": tuple(_other(entry) for entry in entries.get("others", ())),
         "failures": tuple(entries.get("failures", ())),
         "audit": None if entries.get("audit") is None else Audit.from_dict(entries["audit"]),
         "unfinished": entries.get("unfinished"),
@@ -247,6 +258,11 @@ def _error(entry: Mapping[str, Any]) -> ErrorSummary:
     per_dimension = tuple(_read(DimensionError, dimension) for dimension in entry["per_dimension"])
     headline = None if entry.get("headline") is None else _read(HeadlineError, entry["headline"])
     return _read(ErrorSummary, entry, per_dimension=per_dimension, horizons=horizons, headline=headline)
+
+
+def _other(entry: Mapping[str, Any]) -> OtherExplanation:
+    effects = tuple(map(effect_from_dict, entry["effects"]))
+    return _read(OtherExplanation, entry, effects=effects, words=tuple(entry["words"]))
 
 
 def _verdict(entry: Mapping[str, Any]) -> Verdict:

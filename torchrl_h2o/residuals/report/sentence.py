@@ -36,7 +36,7 @@ def _verdict_words(report: ReportContents) -> str:
         )
         return f"Unfinished, when {report.unfinished}: {so_far}."
     error = _error_words(report.error) if report.error else ""
-    words = _listed(_found_words(report)) if report.found else ""
+    words = _listed(_found_words(report)) + _others_words(report) if report.found else ""
     kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
     if kind == NOT_EXPLAINED:
         attempt = words and f"the best attempt, {words}, is not recommended"
@@ -62,6 +62,15 @@ def _found_words(report: ReportContents) -> list[str]:
     """Each effect found, with the alternatives that the data cannot rule out."""
     others = {effect_name(group.effects[0]): group.words[1:] for group in report.indistinguishable}
     return [_one_of(found, others.get(found.name, ())) for found in report.found]
+
+
+def _others_words(report: ReportContents) -> str:
+    """Other sets of effects that these data cannot rule out; empty if there are none."""
+    if not report.others:
+        return ""
+    more = len(report.others) - 1
+    further = f", or one of {more} other set{'s' * (more > 1)} of effects" if more else ""
+    return f", or instead {_listed(report.others[0].words)}{further} (these data cannot tell them apart)"
 
 
 def _one_of(found: FoundEffect, others: Sequence[str]) -> str:

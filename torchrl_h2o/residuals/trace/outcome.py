@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.trace.fit import Fit
+
+if TYPE_CHECKING:
+    from torchrl_h2o.residuals.trace.rival_sets import RivalSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +46,7 @@ class Trace:
         attempts: other entries that were fitted, in ascending order of their loss.
         groups: for each effect found, alternatives with an equivalent loss, in ascending order of their loss.
         exact: True if the remaining residual is within the rounding of single-precision data.
+        others: other sets of effects with an equivalent loss, the most usual ones first.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -49,3 +54,4 @@ class Trace:
     attempts: tuple[Attempt, ...]
     groups: tuple[tuple[Attempt, ...], ...]
     exact: bool
+    others: tuple[RivalSet, ...] = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from tqdm import tqdm
@@ -17,6 +18,7 @@ from torchrl_h2o.residuals.trace.grow import grow
 from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.per_joint import divide_by_element
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.rival_sets import with_most_usual_set
 from torchrl_h2o.residuals.trace.simplify import simplify
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -59,7 +61,8 @@ def trace_effects(
         # a further round helps only where a simpler effect has replaced one with many parameters
         if state.exact or state.entries == grown.entries:
             break
-    return _outcome(_fitted_to_all(divide_by_element(state)))
+    state, others = with_most_usual_set(divide_by_element(state))
+    return replace(_outcome(_fitted_to_all(state)), others=others)
 
 
 def _fitted_to_all(state: SearchState) -> SearchState:

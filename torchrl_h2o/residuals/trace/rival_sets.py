@@ -1,0 +1,106 @@
+"""Finds other sets of up to three effects that explain the data as well, and prefers the most usual of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.effects.catalogue.plausibility import surprise
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.problem import losses
+from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible, promising_sets, screen
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+@dataclass(frozen=True, eq=False)
+class RivalSet:
+    """A set of effects that explains the data as well as the one found.
+
+    Args:
+        entries: entries of the catalogue.
+        fit: their joint fit.
+        loss: mean loss on the windows by which effects are chosen.
+    """
+
+    entries: tuple[CatalogueEntry, ...]
+    fit: Fit
+    loss: float
+
+    @property
+    def surprise(self) -> int:
+        """How unusual its effects are, see :func:`~torchrl_h2o.effects.catalogue.plausibility.surprise`."""
+        return sum(map(surprise, self.fit.effects))
+
+
+def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet, ...]]:
+    """Replaces the effects found by a more usual set that explains the data as well, and lists the other sets.
+
+    A log in which the torque follows the motion cannot tell a weak motor from friction and rotor inertia. A search that
+    adds one effect at a time finds the set with the fewest parameters first, which need not be the right one.
+
+    Args:
+        state: effects found.
+
+    Returns:
+        The state with the most usual set, unchanged if that is the one found, and the other sets, in ascending order of
+        their surprise and loss.
+    """
+    if state.exact or not state.entries:
+        return state, ()
+    sets = rival_sets(state)
+    own_loss = float(state.selection_losses(state.fit.effects).mean())
+    own = RivalSet(state.entries, state.fit, own_loss)
+    best = min((own, *sets), key=lambda one: one.surprise)  # the first of equals, so the own set is kept
+    others = tuple(sorted((one for one in (own, *sets) if one is not best), key=lambda one: (one.surprise, one.loss)))
+    if best is own:
+        return state, others
+    groups = ((),) * len(best.entries)
+    return replace(state, groups=groups).with_found(best.entries, best.fit), others
+
+
+def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:
+    """Sets of one to three effects whose loss is not significantly higher than that of the effects found."""
+    rules = state.settings.trace
+    state = state.rescaled(state.posed_at(()))
+    with_it, without = (state.selection_losses(effects) for effects in (state.fit.effects, ()))
+    explained = float(without.mean() - with_it.mean())
+    if explained <= 0.0:
+        return ()
+    found = []
+    for entries, sketch in _sketched_sets(state):
+        fitted = state.refitted(entries, sketch.effects)
+        after = state.selection_losses(fitted.effects)
+        close = (after.mean() - with_it.mean()) / explained < rules.alike_loss
+        if close and state.p_value(after, with_it) > state.settings.significance.level:
+            found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
+    return tuple(found)
+
+
+def _sketched_sets(state: SearchState) -> list[tuple[list[CatalogueEntry], Fit]]:
+    """The most promising sets of each size with a quick fit, those that reach a share of the gain."""
+    rules, screened = state.settings.trace, state.windows.screened
+    leads = screen(state.problem, (), state.catalogue, screened)
+    among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
+    few_with_it, few_without = (losses(state.problem.residual(e, screened)).mean() for e in (state.fit.effects, ()))
+    needed = rules.rival_min_sketch * (few_without - few_with_it)
+    chosen = []
+    for size in range(1, rules.rival_set_size + 1):
+        if len(among) < size:
+            break
+        sketches = []
+        for leads_of_set in promising_sets(state.problem, (), among, size, screened, rules.rival_sets):
+            entries = [lead.entry for lead in leads_of_set]
+            if _is_new(state, leads_of_set) and is_possible(state.problem, [lead.effect for lead in leads_of_set]):
+                free = [free_parameters(entry) for entry in entries]
+                sketch = state.sketched([lead.effect for lead in leads_of_set], free, rules.sketch_evaluations)
+                if few_without - sketch.loss >= needed:
+                    sketches.append((entries, sketch))
+        chosen += sorted(sketches, key=lambda one: one[1].loss)[: rules.rival_finalists]
+    return chosen
+
+
+def _is_new(state: SearchState, leads: Sequence[Lead]) -> bool:
+    """Whether a set contains other effects than the one found, and not merely more of them."""
+    own, names = {entry.name for entry in state.entries}, {lead.entry.name for lead in leads}
+    return not names >= own
