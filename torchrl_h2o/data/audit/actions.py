@@ -114,7 +114,9 @@ def _against_accelerations(response: Response, settings: AuditSettings) -> list[
     elif gained and lag != 0:
         if best in (0, len(lags) - 1):
             return [_out_of_step(lag)]
-        found += _late(response, lag, settings)
+        few = response.for_hypotheses()
+        lag = min((lag, lag - 1, lag + 1), key=few.misfit_at_lag)  # windows blur the lag by a row
+        found += _late(response, lag, settings) if lag else []
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)

@@ -57,7 +57,8 @@ def check_kinematics(
                 found.append(_unrelated(log, index, derivatives, exchanged, settings))
             continue
         if not time_is_wrong and not _explained(derivative, step, settings):
-            found += _factor(log, derivative, settings)
+            wrong = _factor(log, derivative, settings)
+            found += wrong and (_swapped(log, pair, settings) or wrong)
         found += filtered
         found += _bias(log, derivative, step, settings)
     return [*found, *_noisy(log, noise, settings)]
@@ -113,12 +114,9 @@ def _unrelated(
     """The cause of a velocity that is not the derivative of its position."""
     derivative = derivatives[index]
     pair = derivative.pair
-    remedy = "correct the order of the columns"
-    factor, _, correlation = related(log, *steps_of(log, pair.velocity, pair.position), settings)
-    low, high = settings.scale_severe
-    if correlation > 0.9 and low <= factor <= high:
-        words = f"{pair.name} and {pair.velocity_name} are exchanged: the second is the integral of the first"
-        return Finding(CHECK, "severe", words, None, remedy)
+    remedy, (low, high) = "correct the order of the columns", settings.scale_severe
+    if swapped := _swapped(log, pair, settings):
+        return swapped[0]
     for other in derivatives:
         velocity = other.pair.velocity
         if other is derivative:
@@ -138,6 +136,16 @@ def _unrelated(
         None,
         "check what these columns hold; if a sensor is broken, leave it out",
     )
+
+
+def _swapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
+    """Whether the column of the position holds the derivative of that of the velocity."""
+    factor, _, correlation = related(log, *steps_of(log, pair.velocity, pair.position), settings)
+    low, high = settings.scale_severe
+    if correlation <= 0.9 or not low <= factor <= high:
+        return []
+    words = f"{pair.name} and {pair.velocity_name} are exchanged: the second is the integral of the first"
+    return [Finding(CHECK, "severe", words, None, "correct the order of the columns")]
 
 
 def _lag(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
@@ -183,7 +191,9 @@ def _wrapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
 
 def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding]:
     found = []
-    for column, name in enumerate(log.names):
+    # for other columns there is no estimate that fast motion does not enter
+    for column in sorted({column for pair in log.pairs for column in (pair.position, pair.velocity)}):
+        name = log.names[column]
         spread = float(log.observation[:, column].std())
         if not np.isfinite(noise[column]) or noise[column] <= settings.noise_warning * spread:
             continue

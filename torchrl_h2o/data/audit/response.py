@@ -76,7 +76,7 @@ class Response:
     def for_hypotheses(self) -> Response:
         """As many of the windows as a hypothesis may simulate."""
         most = self.settings.hypothesis_steps // (self.simulation.frame_skip * self.horizon)
-        return self.thinned(int(np.clip(most, 40, self.settings.hypothesis_windows)))
+        return self.thinned(int(np.clip(most, 30, self.settings.hypothesis_windows)))
 
     @property
     def before(self) -> np.ndarray:
@@ -205,6 +205,11 @@ class Response:
         known = (first == inside) & (self.log.run[inside] == self.log.run[self.starts])
         known &= self.log.run[inside + self.horizon - 1] == self.log.run[self.starts]
         return (sums[inside + self.horizon] - sums[inside]) / self.horizon, known
+
+    def misfit_at_lag(self, lag: int) -> float:
+        """:meth:`misfit` if actions act some rows later than their rows say."""
+        rows = np.clip(self.rows - lag, 0, len(self.log) - 1)
+        return self.misfit(actions=lambda _: self.limited[rows])
 
     def misfit(
         self,

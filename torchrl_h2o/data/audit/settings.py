@@ -111,7 +111,7 @@ class AuditSettings:
     """Largest number of physics steps of one pass over the windows."""
     min_windows: int = 60
     """Windows below which the model is not consulted."""
-    longest_window: float = 0.1
+    longest_window: float = 0.06
     """Longest window, in s."""
     signal_to_noise: float = 4.0
     """Change of the velocities within a window, in standard deviations of their noise, that windows are chosen for."""
