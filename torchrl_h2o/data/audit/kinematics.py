@@ -82,9 +82,7 @@ def _explained(derivative: Derivative, step: Response | None, settings: AuditSet
 
 def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
     pair, factor = derivative.pair, derivative.factor
-    speed = log.observation[:, pair.velocity]
-    coarse = np.corrcoef(speed[:-1], speed[1:])[0, 1] < settings.fine
-    low, high = settings.scale_severe if coarse else settings.scale_warning
+    low, high = settings.scale_severe if _coarse(log, pair, settings) else settings.scale_warning
     if low <= factor <= high:
         return []
     size = abs(factor)
@@ -136,6 +134,12 @@ def _unrelated(
         None,
         "check what these columns hold; if a sensor is broken, leave it out",
     )
+
+
+def _coarse(log: Log, pair: Pair, settings: AuditSettings) -> bool:
+    """Whether the rows are too far apart for small errors of scale and noise to show."""
+    speed = log.observation[:, pair.velocity]
+    return bool(np.corrcoef(speed[:-1], speed[1:])[0, 1] < settings.fine)
 
 
 def _swapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
@@ -192,10 +196,11 @@ def _wrapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
 def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding]:
     found = []
     # for other columns there is no estimate that fast motion does not enter
-    for column in sorted({column for pair in log.pairs for column in (pair.position, pair.velocity)}):
+    for pair, column in [(p, column) for p in log.pairs for column in (p.position, p.velocity)]:
         name = log.names[column]
         spread = float(log.observation[:, column].std())
-        if not np.isfinite(noise[column]) or noise[column] <= settings.noise_warning * spread:
+        limit = spread * settings.noise_warning * (2.0 if _moves(log, pair) and _coarse(log, pair, settings) else 1.0)
+        if not np.isfinite(noise[column]) or noise[column] <= limit:
             continue
         found.append(
             Finding(
