@@ -104,7 +104,7 @@ class Response:
         if self.noise is None:
             return False
         share = np.sqrt(2.0) * self.noise[self.moving] / self.scale
-        return bool(np.median(share) > self.settings.misfit)
+        return bool(np.median(share) > self.settings.drowned)
 
     @cached_property
     def limited(self) -> np.ndarray:

@@ -117,6 +117,8 @@ class AuditSettings:
     """Longest window, in s."""
     signal_to_noise: float = 4.0
     """Change of the velocities within a window, in standard deviations of their noise, that windows are chosen for."""
+    drowned: float = 0.6
+    """Noise of a change, in usual changes of the velocities, above which a bad fit is no evidence against the data."""
     settling_steps: int = 12
     """Control steps from which unobserved coordinates are simulated."""
     nudge: float = 0.02
