@@ -105,7 +105,7 @@ def _against_accelerations(response: Response, settings: AuditSettings) -> list[
     best = int(np.argmax(explained))
     found, lag = [], int(lags[best])
     if explained[best] < settings.unrelated:
-        return [_foreign_actions(explained[best], claimed)]
+        return [] if response.drowned else [_foreign_actions(explained[best], claimed)]
     gained = (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]])
     sharp = 0 if gained else lag_of_events(response, settings)
     if sharp >= settings.clear_lag and explained[sharp - lags[0]] > settings.unrelated:
@@ -113,8 +113,10 @@ def _against_accelerations(response: Response, settings: AuditSettings) -> list[
         found += _late(response, sharp, settings)
     elif gained and lag != 0:
         if best in (0, len(lags) - 1):
-            return [_out_of_step(lag)]
-        found += _late(response, lag, settings)
+            return [] if response.drowned else [_out_of_step(lag)]
+        few = response.for_hypotheses()
+        lag = min((lag, lag - 1, lag + 1), key=few.misfit_at_lag)  # windows blur the lag by a row
+        found += _late(response, lag, settings) if lag else []
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)

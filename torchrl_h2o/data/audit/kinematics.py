@@ -57,7 +57,8 @@ def check_kinematics(
                 found.append(_unrelated(log, index, derivatives, exchanged, settings))
             continue
         if not time_is_wrong and not _explained(derivative, step, settings):
-            found += _factor(log, derivative, settings)
+            wrong = _factor(log, derivative, settings)
+            found += wrong and (_swapped(log, pair, settings) or wrong)
         found += filtered
         found += _bias(log, derivative, step, settings)
     return [*found, *_noisy(log, noise, settings)]
@@ -81,9 +82,7 @@ def _explained(derivative: Derivative, step: Response | None, settings: AuditSet
 
 def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
     pair, factor = derivative.pair, derivative.factor
-    speed = log.observation[:, pair.velocity]
-    coarse = np.corrcoef(speed[:-1], speed[1:])[0, 1] < settings.fine
-    low, high = settings.scale_severe if coarse else settings.scale_warning
+    low, high = settings.scale_severe if _coarse(log, pair, settings) else settings.scale_warning
     if low <= factor <= high:
         return []
     size = abs(factor)
@@ -113,12 +112,9 @@ def _unrelated(
     """The cause of a velocity that is not the derivative of its position."""
     derivative = derivatives[index]
     pair = derivative.pair
-    remedy = "correct the order of the columns"
-    factor, _, correlation = related(log, *steps_of(log, pair.velocity, pair.position), settings)
-    low, high = settings.scale_severe
-    if correlation > 0.9 and low <= factor <= high:
-        words = f"{pair.name} and {pair.velocity_name} are exchanged: the second is the integral of the first"
-        return Finding(CHECK, "severe", words, None, remedy)
+    remedy, (low, high) = "correct the order of the columns", settings.scale_severe
+    if swapped := _swapped(log, pair, settings):
+        return swapped[0]
     for other in derivatives:
         velocity = other.pair.velocity
         if other is derivative:
@@ -138,6 +134,22 @@ def _unrelated(
         None,
         "check what these columns hold; if a sensor is broken, leave it out",
     )
+
+
+def _coarse(log: Log, pair: Pair, settings: AuditSettings) -> bool:
+    """Whether the rows are too far apart for small errors of scale and noise to show."""
+    speed = log.observation[:, pair.velocity]
+    return bool(np.corrcoef(speed[:-1], speed[1:])[0, 1] < settings.fine)
+
+
+def _swapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
+    """Whether the column of the position holds the derivative of that of the velocity."""
+    factor, _, correlation = related(log, *steps_of(log, pair.velocity, pair.position), settings)
+    low, high = settings.scale_severe
+    if correlation <= 0.9 or not low <= factor <= high:
+        return []
+    words = f"{pair.name} and {pair.velocity_name} are exchanged: the second is the integral of the first"
+    return [Finding(CHECK, "severe", words, None, "correct the order of the columns")]
 
 
 def _lag(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
@@ -183,9 +195,12 @@ def _wrapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
 
 def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding]:
     found = []
-    for column, name in enumerate(log.names):
+    # for other columns there is no estimate that fast motion does not enter
+    for pair, column in [(p, column) for p in log.pairs for column in (p.position, p.velocity)]:
+        name = log.names[column]
         spread = float(log.observation[:, column].std())
-        if not np.isfinite(noise[column]) or noise[column] <= settings.noise_warning * spread:
+        limit = spread * settings.noise_warning * (2.0 if _moves(log, pair) and _coarse(log, pair, settings) else 1.0)
+        if not np.isfinite(noise[column]) or noise[column] <= limit:
             continue
         found.append(
             Finding(

@@ -121,6 +121,8 @@ def _zeros(response: Response, settings: AuditSettings) -> list[Finding]:
 
 def check_belonging(response: Response, settings: AuditSettings) -> list[Finding]:
     """Whether the simulator explains next to nothing, even with other gains, friction and constant forces."""
+    if response.drowned:
+        return []
     gains = response.by_action * response.limited[response.rows].mean(1)[:, None]
     responses = np.concatenate([gains, friction_responses(response), response.by_zero], -1)
     found = robust_fit(response.target, responses, response.scale, settings.robust)

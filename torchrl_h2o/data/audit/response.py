@@ -25,6 +25,7 @@ class Response:
         states: start states, (W, nq + nv).
         actions: executed actions of all rows, (T, nu).
         moving: columns of the observed velocities, (m,).
+        noise: standard deviation of the noise of each observation, (n,); None if it is not known.
     """
 
     log: Log
@@ -35,6 +36,7 @@ class Response:
     states: np.ndarray
     actions: np.ndarray
     moving: np.ndarray
+    noise: np.ndarray | None = None
 
     @classmethod
     def of(
@@ -53,7 +55,9 @@ class Response:
             return None
         horizon = 1 if noise is None else _horizon(log, moving, noise, settings)
         margin = settings.settling_steps if simulation.state_map.hidden else 0
-        most = min(settings.windows, settings.physics_steps // (simulation.frame_skip * horizon))
+        length = simulation.frame_skip * horizon
+        fewest = settings.min_windows if length <= settings.longest_steps else 0
+        most = min(settings.windows, max(fewest, settings.physics_steps // length))
         starts = log.starts(horizon, most, margin)
         if len(starts) < settings.min_windows:
             return None
@@ -61,7 +65,7 @@ class Response:
         actions = np.concatenate([simulation.executed(log.action[run]) for run in log.runs])
         states = simulation.state_map.states(true)
         chosen = _settled(log, simulation, states, actions, starts, margin)
-        return cls(log, simulation, settings, horizon, starts, chosen, actions, moving)
+        return cls(log, simulation, settings, horizon, starts, chosen, actions, moving, noise)
 
     @property
     def rows(self) -> np.ndarray:
@@ -76,7 +80,7 @@ class Response:
     def for_hypotheses(self) -> Response:
         """As many of the windows as a hypothesis may simulate."""
         most = self.settings.hypothesis_steps // (self.simulation.frame_skip * self.horizon)
-        return self.thinned(int(np.clip(most, 40, self.settings.hypothesis_windows)))
+        return self.thinned(int(np.clip(most, 30, self.settings.hypothesis_windows)))
 
     @property
     def before(self) -> np.ndarray:
@@ -94,6 +98,14 @@ class Response:
         usual = np.median(np.abs(self.change), axis=0)
         return np.where(usual > 0.0, usual, np.maximum(np.abs(self.change).mean(0), 1e-12))
 
+    @property
+    def drowned(self) -> bool:
+        """Whether noise alone would leave most velocities unexplained."""
+        if self.noise is None:
+            return False
+        share = np.sqrt(2.0) * self.noise[self.moving] / self.scale
+        return bool(np.median(share) > self.settings.drowned)
+
     @cached_property
     def limited(self) -> np.ndarray:
         """Executed actions within the actuators' range, (T, nu)."""
@@ -103,11 +115,12 @@ class Response:
     def anchor(self) -> np.ndarray:
         """Actions of the windows about which the simulation is linearised, (W, H, nu).
 
-        They are the logged ones, or zero if the simulator is far nearer to the log without actions.
+        They are the logged ones, or zero if these do not bring the simulator nearer to the log: the error of the
+        linearisation about wrong actions would follow them.
         """
         logged = self.limited[self.rows]
         without = self.misfit(actions=np.zeros_like)
-        return logged if without > self.settings.better * self.misfit() else np.zeros_like(logged)
+        return logged if without > self.misfit() else np.zeros_like(logged)
 
     @cached_property
     def _range(self) -> tuple[np.ndarray, np.ndarray]:
@@ -205,6 +218,11 @@ class Response:
         known = (first == inside) & (self.log.run[inside] == self.log.run[self.starts])
         known &= self.log.run[inside + self.horizon - 1] == self.log.run[self.starts]
         return (sums[inside + self.horizon] - sums[inside]) / self.horizon, known
+
+    def misfit_at_lag(self, lag: int) -> float:
+        """:meth:`misfit` if actions act some rows later than their rows say."""
+        rows = np.clip(self.rows - lag, 0, len(self.log) - 1)
+        return self.misfit(actions=lambda _: self.limited[rows])
 
     def misfit(
         self,

@@ -105,16 +105,20 @@ class AuditSettings:
     """Windows that are simulated."""
     hypothesis_windows: int = 200
     """Windows on which a hypothesis such as exchanged joints is simulated."""
-    hypothesis_steps: int = 2_000
+    hypothesis_steps: int = 1_000
     """Largest number of physics steps of one hypothesis."""
-    physics_steps: int = 6_000
+    physics_steps: int = 3_000
     """Largest number of physics steps of one pass over the windows."""
+    longest_steps: int = 200
+    """Physics steps of a window up to which ``min_windows`` are simulated in any case."""
     min_windows: int = 60
     """Windows below which the model is not consulted."""
     longest_window: float = 0.1
     """Longest window, in s."""
     signal_to_noise: float = 4.0
     """Change of the velocities within a window, in standard deviations of their noise, that windows are chosen for."""
+    drowned: float = 0.6
+    """Noise of a change, in usual changes of the velocities, above which a bad fit is no evidence against the data."""
     settling_steps: int = 12
     """Control steps from which unobserved coordinates are simulated."""
     nudge: float = 0.02
