@@ -83,7 +83,9 @@ def recorded(real: Simulation, transitions: int = 1500, noise: float = 0.0, seed
     action = np.zeros((transitions, motors))
     for t in range(1, transitions):
         action[t] = 0.9 * action[t - 1] + 0.4 * rng.standard_normal(motors)
-    action = np.clip(0.8 * action, *real.model.actuator_ctrlrange.T)
+    low, high = real.model.actuator_ctrlrange.T
+    bounds = (low, high) if (high > low).all() else (-1.0, 1.0)
+    action = np.clip(0.8 * action, *bounds)
     executed = real.executed(action, np.random.default_rng([seed, 1]))
     reached = real.rollout(np.zeros((1, states)), executed[None])[0]
     observed = np.vstack([np.zeros(states), reached])

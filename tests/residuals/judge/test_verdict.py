@@ -3,7 +3,7 @@
 import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.effects import Gravity, JointDamping, JointFrictionLoss
+from torchrl_h2o.effects import ActionNoise, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals.judge.held_out_error import error_summary
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
@@ -73,3 +73,9 @@ def test_a_value_beyond_belief_is_not_recommended():
 def test_an_unknown_kind_is_refused():
     with pytest.raises(ValueError, match="choose nothing missing"):
         Verdict("fine")
+
+
+def test_action_noise_that_was_found_is_not_missing():
+    noise = ActionNoise(0.2)
+    explained = verdict((noise,), (noise,), noise=0.003)
+    assert explained.kind == EXPLAINED

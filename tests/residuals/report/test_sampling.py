@@ -117,5 +117,8 @@ def test_every_draw_of_a_search_explains_the_data():
     assert len({tuple(type(effect) for effect in draw) for draw in draws}) > 1
     data = Measured.from_ted(measured, simulation)
     for draw in draws:
-        missed = residuals(simulation.with_effects(*draw), data, data.judged())
-        assert np.sqrt((missed**2).mean()) < 1e-4 * np.sqrt((residuals(simulation, data, data.judged()) ** 2).mean())
+        missed = residuals(simulation.with_effects(*draw), data, data.reported_on())
+        before = residuals(simulation, data, data.reported_on())
+        assert np.sqrt((missed**2).mean()) < 1e-4 * np.sqrt((before**2).mean())
+            (residuals(simulation, data, data.reported_on()) ** 2).mean()
+        )

@@ -96,7 +96,8 @@ def judge(
     measured = without_intervals(evidence.measured, disturbed)
     mended = simulation.with_effects(*_without_noise(effects))
     error = error_summary(simulation, mended, measured, settings.judge)
-    two_sample = _two_sample(simulation, mended, measured, seed, settings)
+    # random effects are drawn in the two-sample test
+    two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
     return Judgement(
         measured=measured,

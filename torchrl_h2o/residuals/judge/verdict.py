@@ -52,7 +52,8 @@ def reach_verdict(
         settings: thresholds.
     """
     rules = settings.verdict
-    signs = signs_of_something_missing(mended, measured, error, two_sample, settings)
+    with_noise = simulation.with_effects(*effects)
+    signs = signs_of_something_missing(with_noise, measured, error, two_sample, settings)
     if not effects:
         if not signs:
             return Verdict(NOTHING_MISSING)

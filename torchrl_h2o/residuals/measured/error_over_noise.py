@@ -19,7 +19,8 @@ def errors_and_noise(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Absolute errors at the end of windows, and those that a draw of sensor noise causes in the same windows.
 
-    The noise disturbs the state that a window starts from, and the reading at its end.
+    The noise disturbs the state that a window starts from, and the reading at its end. Action noise that the simulator
+    has is drawn too.
 
     Args:
         simulation: the simulator.
@@ -35,9 +36,8 @@ def errors_and_noise(
     states = start_states(simulation, measured, starts)
     noise = sensor_std * rng.standard_normal((2, *measured.observation.shape))
     disturbed = states + noise[0] @ simulation.state_map.restore.T
-    error, with_noise = (
-        residuals(simulation, measured, starts, horizon, states=each)[:, -1] for each in (states, disturbed)
-    )
+    error = residuals(simulation, measured, starts, horizon, states=states)[:, -1]
+    with_noise = residuals(simulation, measured, starts, horizon, states=disturbed, rng=rng)[:, -1]
     by_noise = with_noise - error + noise[1][starts + horizon - 1]
     whole = np.isfinite(error).all(1) & np.isfinite(by_noise).all(1)
     return np.abs(error[whole]), np.abs(by_noise[whole])
