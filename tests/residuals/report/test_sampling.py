@@ -120,5 +120,3 @@ def test_every_draw_of_a_search_explains_the_data():
         missed = residuals(simulation.with_effects(*draw), data, data.reported_on())
         before = residuals(simulation, data, data.reported_on())
         assert np.sqrt((missed**2).mean()) < 1e-4 * np.sqrt((before**2).mean())
-            (residuals(simulation, data, data.reported_on()) ** 2).mean()
-        )
