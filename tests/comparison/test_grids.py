@@ -1,6 +1,7 @@
 """The paper's grids: their runs, and that no result is lost when a grid is killed or a run fails."""
 
 import csv
+import shlex
 import signal
 import subprocess
 from collections import Counter
@@ -16,7 +17,16 @@ from torchrl.checkpoint import CheckpointRotation
 from tests.small_runs import ROBOT, ROOT, SMALL, trained
 from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
 from torchrl_h2o.comparison.launching import GridLauncher
-from torchrl_h2o.comparison.results_file import CURVE, IDENTITY, RESULT, adopt_runs, append_rows, identity, read_rows
+from torchrl_h2o.comparison.results_file import (
+    CURVE,
+    IDENTITY,
+    RESULT,
+    adopt_runs,
+    append_rows,
+    identity,
+    read_rows,
+    repeating_command,
+)
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
@@ -334,3 +344,19 @@ def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(comman
     assert "these runs failed:\n  method=h2o_plus" in done.stdout
     assert "ValueError: ratio_estimator=guess: choose paper" in done.stdout
     assert done.stdout.count("run folder:") == 3  # IQL once, H2O+ twice, because it is tried again once
+
+
+@pytest.mark.parametrize(
+    ("override", "shown"),
+    [
+        ("data=/home/me/logs/a.txt", "data=logs/a.txt"),
+        ("data=[/home/me/logs/a.txt,/home/me/logs/b.txt]", "data=[logs/a.txt,logs/b.txt]"),
+        ("gap_fix='/home/me/outputs/report.json'", "gap_fix='outputs/report.json'"),
+        ("data=halfcheetah/medium-v0", "data=halfcheetah/medium-v0"),
+    ],
+)
+def test_results_name_no_folder_of_the_machine(compose, override, shown):
+    cfg, _ = compose("method=iql", config="train")
+    cfg.overrides = ["method=iql", override]
+    assert shlex.split(repeating_command(cfg))[-1] == shown
+    assert "/home" not in identity(cfg)["others"]

@@ -7,6 +7,7 @@ evaluation, for learning curves.
 import csv
 import fcntl
 import json
+import re
 import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -44,9 +45,9 @@ RESULT = (
     "versions",
     "command",
 )
-#: overrides not listed in the column ``others``: they have columns of their own, or affect results by rounding only
 #: columns of the results for quantities that the task observes, and their names in summary.json
 OBSERVED = {"mean_v": ("v", "mean"), "max_abs_x": ("x", "max_abs")}
+#: overrides not listed in the column ``others``: they have columns of their own, or affect results by rounding only
 TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
 #: overrides of paper.py that choose runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "sizes", "log", "seeds", "retries"}
@@ -71,7 +72,7 @@ def identity(cfg: DictConfig) -> dict[str, str]:
         "backbone": cfg.backbone if h2o_plus else "",
         "mixing": str(float(cfg.mixing)) if h2o_plus else "",
         "ratio": str(bool(cfg.ratio)) if h2o_plus else "",
-        "others": " ".join(sorted(o for o in cfg.overrides or () if key_of(o) not in TOLD | GRID)),
+        "others": " ".join(sorted(_portable(o) for o in cfg.overrides or () if key_of(o) not in TOLD | GRID)),
     }
 
 
@@ -81,9 +82,14 @@ def key_of(override: str) -> str:
 
 
 def repeating_command(cfg: DictConfig) -> str:
-    """Return the command that repeats a run, without the options for results and folders."""
-    chosen = [o for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
+    """Return the command that repeats a run, without the options for results and folders; paths are shortened."""
+    chosen = [_portable(o) for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
     return shlex.join(["python", "recipes/train.py", *chosen])
+
+
+def _portable(override: str) -> str:
+    """Return an override with the last two parts of each absolute path, because a folder exists on one machine only."""
+    return re.sub(r"(?<=[=\[,'\"])/[^,\]'\"]*", lambda path: _short(path[0]), override)
 
 
 def _strength(cfg: DictConfig) -> float:

@@ -337,7 +337,7 @@ class VerdictSettings:
     far_negligible: float = 0.01
     """Median error far ahead, in spreads, that is negligible without sensor noise."""
     small_rest: float = 0.1
-    """Share of the error ahead below which what remains is not worth a word."""
+    """Share of the error ahead below which the remaining error is not reported as a missing effect."""
     level: float = 0.01
     """Significance level of the decrease of the error on the report's data."""
     auc_near_one: float = 0.95

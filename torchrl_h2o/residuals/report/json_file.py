@@ -282,7 +282,7 @@ def _window(entry: Mapping[str, Any]) -> ShownWindow:
 
 
 def _mended_to_json(mended: MendedModel) -> dict[str, Any]:
-    """The name of the file, and what is not in it, with how to add it."""
+    """The entries of mended.xml: its name, and each effect that it does not contain, with the reason."""
     return {
         "file": mended.file,
         "failure": mended.failure,

@@ -39,7 +39,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class MendedModel:
-    """The file with the effects, and what is not in it.
+    """The MJCF file with the effects of a report, and the effects that it does not contain.
 
     Args:
         file: name of the file in the report's folder; None if it could not be written.
