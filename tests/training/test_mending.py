@@ -1,6 +1,7 @@
 """The option ``mend``: the run's own data, one search for the same data, and simulators with what was found."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -14,7 +15,14 @@ from tests.small_runs import ROBOT, ROOT, SMALL, run
 from torchrl_h2o.effects import ActionDelay, Gravity
 from torchrl_h2o.envs import mujoco_model
 from torchrl_h2o.residuals import Report
-from torchrl_h2o.residuals.report.contents import DataSummary, ErrorSummary, FoundEffect, IndistinguishableGroup
+from torchrl_h2o.residuals.report.contents import (
+    NOT_EXPLAINED,
+    DataSummary,
+    ErrorSummary,
+    FoundEffect,
+    IndistinguishableGroup,
+    Verdict,
+)
 from torchrl_h2o.training import cached_search
 from torchrl_h2o.training.cached_search import BLOCK, MOST_ROWS, digest, searched_rows
 from torchrl_h2o.training.environments import simulator_maker, task_of
@@ -99,6 +107,36 @@ def test_the_same_data_are_searched_once(pendulum):
     assert second["effects"] == [{"effect": "Gravity", "scale": 0.5}]
     assert (folder.parent / "second" / "mended" / "report.html").exists()
     assert find_missing_effects(cfg, task, real[:49], new_folder(folder, "other")) is None
+
+
+def doubted(*effects):
+    """A report that advises against its effects."""
+    return replace(found(*effects), verdict=Verdict(NOT_EXPLAINED, ("they do not lower the error",), recommended=False))
+
+
+def test_effects_that_the_report_does_not_recommend_are_left_out(pendulum, capsys):
+    cfg, task, real, folder = pendulum
+    doubted(Gravity(0.5)).save(folder / "mended")
+    assert find_missing_effects(cfg, task, real, folder) is None
+    written = capsys.readouterr().out
+    assert "is not recommended" in written
+    assert written.endswith("The run trains in the unchanged simulator.\n")
+
+
+@pytest.mark.parametrize(
+    ("report", "said"),
+    [
+        (doubted(Gravity(0.5)), "does not recommend its effects for training: they do not lower the error"),
+        (replace(found(Gravity(0.5)), unfinished="action noise was looked for"), "the search was not finished"),
+        (found(Gravity(0.5)), ""),
+    ],
+)
+def test_a_report_that_advises_against_its_effects_is_named(compose, tmp_path, capsys, report, said):
+    cfg, _ = compose(f"gap_fix={report.save(tmp_path)}", config="h2o_plus")
+    check_mending(cfg)
+    written = capsys.readouterr().out
+    assert said in written
+    assert bool(written) == bool(said)
 
 
 def test_data_simulator_and_settings_tell_searches_apart(pendulum, monkeypatch):

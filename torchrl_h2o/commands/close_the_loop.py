@@ -93,7 +93,7 @@ def main(cfg: DictConfig) -> None:
         known=() if cfg.start_from is None else Report.load(cfg.start_from).effects,
         so_far=lambda unfinished: write_json(unfinished, directory),
     )
-    if report.found and (report.verdict is None or report.verdict.recommended):
+    if report.recommended:
         report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
     report.save(directory)
     print_report(report, directory)
@@ -145,7 +145,7 @@ def print_report(report: Report, directory: Path) -> None:
     if mended is not None and mended.left_out:
         where = f"not in {mended.file}" if mended.file else f"no {FILE} ({mended.failure})"
         print(f"           {where}: {'; '.join(left.words for left in mended.left_out)}")
-    if report.found and (report.verdict is None or report.verdict.recommended):
+    if report.recommended:
         print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")
 
 

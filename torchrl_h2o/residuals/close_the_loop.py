@@ -82,25 +82,25 @@ def close_the_loop(
     simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
     measured = read_measured(data, simulation, source, held_out, settings)
     if (reason := why_no_conclusion(simulation, measured)) is not None:
-        return replace(inconclusive_report(simulation, measured, reason), audit=audit)
+        return inconclusive_report(simulation, measured, reason, audit)
     entries = simulation.catalogue() if catalogue is None else catalogue
     with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
-        evidence = gather_evidence(simulation, measured, settings)
+        evidence = gather_evidence(simulation, measured, settings, audit=audit)
         explanation = explain(
             evidence,
             entries,
             rng=np.random.default_rng(seed),
             progress=bar,
             known=known,
-            so_far=lambda found, stage: so_far(replace(unfinished_report(evidence, found, stage), audit=audit)),
+            so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
             settings=settings,
         )
         computing = "the errors before and after were computed"
-        so_far(replace(unfinished_report(evidence, explanation, computing), audit=audit))
+        so_far(unfinished_report(evidence, explanation, computing))
         bar.set_description("reporting")
         judgement = judge(evidence, explanation, seed=seed, settings=settings)
         wall_s = time.perf_counter() - start
-        return replace(compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings), audit=audit)
+        return compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings)
 
 
 def read_measured(

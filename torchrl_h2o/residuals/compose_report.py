@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation
@@ -80,6 +81,7 @@ def compose_report(
         windows=judgement.windows,
         runs=judgement.runs,
         trace=judgement.trace,
+        audit=evidence.audit,
         verdict=judgement.verdict,
         failures=judgement.failures,
         others=tuple(
@@ -89,9 +91,9 @@ def compose_report(
     )
 
 
-def inconclusive_report(simulation: Simulation, measured: Measured, reason: str) -> Report:
+def inconclusive_report(simulation: Simulation, measured: Measured, reason: str, audit: Audit | None = None) -> Report:
     """The report if the data or the simulator allow no conclusion."""
-    return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason)
+    return Report(simulator=simulation.name, data=_data_summary(measured), conclusion=reason, audit=audit)
 
 
 def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) -> Report:
@@ -113,6 +115,7 @@ def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) 
         ),
         failures=explanation.failures,
         unfinished=stage,
+        audit=evidence.audit,
     )
 
 

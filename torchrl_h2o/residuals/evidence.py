@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_intervals, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -22,12 +23,14 @@ class Evidence:
         measured: all transitions.
         undisturbed: the transitions without suspected disturbances, for fits.
         suspected: intervals that may have been disturbed from outside.
+        audit: findings of the audit of the data; None if it was not audited.
     """
 
     simulation: Simulation
     measured: Measured
     undisturbed: Measured
     suspected: tuple[OutsideInterval, ...]
+    audit: Audit | None = None
 
 
 def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
@@ -43,13 +46,16 @@ def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
     )
 
 
-def gather_evidence(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> Evidence:
+def gather_evidence(
+    simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS, *, audit: Audit | None = None
+) -> Evidence:
     """Excludes the intervals that may have been disturbed from outside.
 
     Args:
         simulation: the simulator.
         measured: the data.
         settings: thresholds of a disturbance.
+        audit: findings of the audit of the data, for the report.
     """
     suspected = outside_intervals(simulation, measured, settings=settings.outside)
-    return Evidence(simulation, measured, without_intervals(measured, suspected), tuple(suspected))
+    return Evidence(simulation, measured, without_intervals(measured, suspected), tuple(suspected), audit)

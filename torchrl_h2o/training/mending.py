@@ -24,9 +24,12 @@ POSTERIOR_WORLDS = 10  # smallest number of worlds with mend=posterior; each of 
 
 
 def check_mending(cfg: DictConfig) -> None:
-    """Checks the option ``mend``, and raises ``num_worlds`` in place to the number that ``mend=posterior`` needs.
+    """Checks the options ``mend`` and ``gap_fix``, and sets ``num_worlds`` to the number that ``mend=posterior`` needs.
+
+    Writes a message if the report of ``gap_fix`` does not recommend its effects.
 
     Raises:
+        torchrl_h2o.data.DataError: if the report of ``gap_fix`` cannot be read.
         ValueError: for an unknown value, together with ``gap_fix``, or for ``mend=posterior`` with a task that is not
             batched or steps per epoch that its worlds cannot share equally.
     """
@@ -34,6 +37,8 @@ def check_mending(cfg: DictConfig) -> None:
     if mend not in (None, False, True, POSTERIOR):
         raise ValueError(f"mend={mend}: choose null, true or {POSTERIOR}")
     if not mend:
+        if cfg.get("gap_fix") is not None and (against := Report.load(cfg.gap_fix).why_not_recommended()):
+            tqdm.write(f"gap_fix={cfg.gap_fix}: this report does not recommend its effects for training: {against}")
         return
     if cfg.get("gap_fix") is not None:
         raise ValueError(
@@ -61,7 +66,7 @@ def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, dire
     """Closes the loop between the real data and the simulator if ``mend`` is set, and writes ``mended/report.json``.
 
     A run that is resumed reads the report in its folder. A search that fails does not end the run: the report then
-    contains the reason and no effects.
+    contains the reason and no effects. Effects that the report does not recommend are not used.
 
     Args:
         cfg: the run's configuration.
@@ -76,9 +81,9 @@ def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, dire
     if not cfg.get("mend") or cfg.get("mended") is not None:
         return cfg.get("mended")
     report = report_of_run(directory) or _search(task, real, cfg.data, directory / FOLDER)
-    unchanged = "" if report.found else " The run trains in the unchanged simulator."
+    unchanged = "" if report.recommended else " The run trains in the unchanged simulator."
     tqdm.write(f"mend={str(cfg.mend).lower()}: {report.sentence()}{unchanged}")
-    if not report.found:
+    if not report.recommended:
         return None
     draws = _draws(report, task, cfg.num_worlds, cfg.seed) if cfg.mend == POSTERIOR else None
     return {"effects": _entries(report.effects), "worlds": draws and [_entries(effects) for effects in draws]}
@@ -126,7 +131,7 @@ def summary_of_mending(directory: Path) -> dict[str, Any]:
     error = entries["error"] and {key: entries["error"][key] for key in ("metric", "unit", "before", "after", "floor")}
     effects = [{key: effect[key] for key in ("name", "words", "parameters")} for effect in entries["effects"]]
     kept = {key: entries[key] for key in ("sentence", "conclusion", "two_sample", "data", "wall_s")}
-    return {"mended": {**kept, "effects": effects, "error": error}}
+    return {"mended": {**kept, "recommended": report.recommended, "effects": effects, "error": error}}
 
 
 def lines_of_mending(directories: Sequence[Path]) -> list[str]:

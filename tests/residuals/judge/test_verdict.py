@@ -3,7 +3,7 @@
 import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.effects import ActionNoise, Gravity, JointDamping, JointFrictionLoss
+from torchrl_h2o.effects import ActionNoise, Gravity, JointDamping, JointFrictionLoss, ObservationDelay
 from torchrl_h2o.residuals.judge.held_out_error import error_summary
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
@@ -67,7 +67,15 @@ def test_an_effect_that_does_not_lower_the_error_is_not_recommended():
 
 
 def test_a_value_beyond_belief_is_not_recommended():
-    assert not verdict((Gravity(0.02),), (Gravity(0.02),), noise=0.0).recommended
+    unbelievable = verdict((Gravity(0.02),), (Gravity(0.02),), noise=0.0)
+    assert not unbelievable.recommended
+    assert "implausibly far" in unbelievable.reasons[0]
+
+
+@pytest.mark.parametrize(("delay", "named"), [(1.0, True), (0.9995, True), (0.9, False), (0.02, False)])
+def test_a_value_at_a_bound_is_named(delay, named):
+    reasons = verdict((), (ObservationDelay(delay),), rows=600).reasons
+    assert any("at the end of what was allowed" in reason for reason in reasons) == named
 
 
 def test_an_unknown_kind_is_refused():

@@ -23,7 +23,7 @@ from torchrl_h2o.residuals.report.contents import (
     Verdict,
 )
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
@@ -133,9 +133,7 @@ def reasons_against(
     halved = head is not None and head.after < rules.much_lower * head.before
     if auc is not None and auc > rules.auc_near_one and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")
-    reasons += [
-        f"{effect_words(effect)} is at the end of what was allowed" for effect in effects if _extreme(effect, rules)
-    ]
+    reasons += [f"{effect_words(effect)} is {why}" for effect in effects if (why := _why_implausible(effect, rules))]
     return tuple(reasons)
 
 
@@ -157,18 +155,20 @@ def _lowers_the_error(
     return False
 
 
-def _extreme(effect: Effect, rules) -> bool:
-    """Whether a parameter is at a bound, or a property of the model differs by an implausible factor."""
+def _why_implausible(effect: Effect, rules: VerdictSettings) -> str:
+    """Why a value is implausible: a factor far from one, or a fit that ended at a bound; empty if it is plausible."""
     for parameter in effect.parameters.values():
-        low, high = parameter.bounds
-        width = 1e-3 * (high - low) if np.isfinite(high - low) else 0.0
-        scale = parameter.neutral == 1.0 and parameter.value > 0.0
-        if scale and not 1.0 / rules.extreme_factor < parameter.value < rules.extreme_factor:
-            return True
-        inner = parameter.value - low > width and high - parameter.value > width
-        if not scale and not inner and parameter.value != parameter.neutral:
-            return low != parameter.neutral or high - parameter.value <= width
-    return False
+        if parameter.neutral == 1.0:  # a factor on a property of the model
+            if not 1.0 / rules.extreme_factor < parameter.value < rules.extreme_factor:
+                return "implausibly far from the model's value"
+        elif any(_reached(bound, parameter.value, parameter.neutral) for bound in parameter.bounds):
+            return "at the end of what was allowed"
+    return ""
+
+
+def _reached(bound: float, value: float, neutral: float) -> bool:
+    """Whether a fitted value lies at a bound; a bound at the neutral value means that there is no effect."""
+    return bool(np.isfinite(bound) and bound != neutral and abs(value - bound) <= 1e-3 * abs(bound - neutral))
 
 
 def where_most(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> str:

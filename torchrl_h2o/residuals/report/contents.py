@@ -341,3 +341,16 @@ class ReportContents:
     def effects(self) -> tuple[Effect, ...]:
         """The effects that mend the simulator, at their fitted values, in order."""
         return tuple(found.effect for found in self.found)
+
+    @property
+    def recommended(self) -> bool:
+        """Whether there are effects, and the report recommends to put them into a simulator for training."""
+        return bool(self.found) and self.unfinished is None and (self.verdict is None or self.verdict.recommended)
+
+    def why_not_recommended(self) -> str:
+        """The reasons against putting the effects into a simulator, as one clause; empty if there are none."""
+        if not self.found or self.recommended:
+            return ""
+        if self.unfinished is not None:
+            return f"the search was not finished: it ended while {self.unfinished}"
+        return "; ".join(self.verdict.reasons) if self.verdict is not None else ""
