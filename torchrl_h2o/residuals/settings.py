@@ -150,6 +150,10 @@ class TraceSettings:
     """Control steps, over all windows, in a fit during the search."""
     min_fitted: int = 120
     """Smallest number of windows in a fit during the search."""
+    noise_free_loss: float = 0.5
+    """Share of the loss to which a quick fit without sensor noise must lower it; else the sensors have noise."""
+    noise_free_fits: int = 4
+    """Largest number of such fits, each with residuals scaled anew, that may leave only rounding."""
     leads_combined: int = 60
     """Number of most promising leads from which sets are formed."""
     set_sizes: tuple[tuple[int, int], ...] = ((1, 12), (2, 4), (3, 4))
@@ -164,6 +168,8 @@ class TraceSettings:
     """Number of alternatives tried in an effect's place because their promise was closest to its own."""
     top_rivals: int = 6
     """Number of alternatives tried in an effect's place because their promise was highest."""
+    rival_min_first: float = 0.25
+    """Share of an effect's gain that an alternative must reach in ``sketch_evaluations``; else it is given up."""
     rival_min_sketch: float = 0.5
     """Share of an effect's gain that an alternative must reach in its sketch to be fitted."""
     rival_set_size: int = 3

@@ -99,3 +99,13 @@ class ActionBacklash(ActionEffect):
             return np.where(entry_mask(action, self.actuators), last, action)
 
         return pushed
+
+    def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
+        # each step clips the previous result to [low, high], and clips of 1, 2, 4, ... steps are again clips
+        low, high = actions - 0.5 * self.width, actions + 0.5 * self.width
+        steps = 1
+        while steps < len(actions):
+            later = low[steps:], high[steps:]
+            low[steps:], high[steps:] = np.clip(low[:-steps], *later), np.clip(high[:-steps], *later)
+            steps *= 2
+        return np.where(entry_mask(actions, self.actuators), np.clip(0.0, low, high), actions)

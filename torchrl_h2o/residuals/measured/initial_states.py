@@ -61,6 +61,12 @@ def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
         >>> estimate_states(simulation, Measured.from_ted(data, simulation)).shape
         (300, 8)
     """
+    if noise is None:
+        return measured.remembered("states", simulation, lambda: _estimated_states(simulation, measured, None))
+    return _estimated_states(simulation, measured, noise)
+
+
+def _estimated_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None) -> np.ndarray:
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
     return linearised.states_at(_filter(linearised, noise, measured.settings).mean, simulation.state_map)

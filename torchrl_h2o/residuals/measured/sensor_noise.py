@@ -19,8 +19,16 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
     """Standard deviation of each sensor's noise, (n), in its unit; None if all of them are negligible."""
-    std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
+    std = sensor_std(simulation, measured)
     return std if (std > measured.settings.noiseless * measured.observation.std(0)).any() else None
+
+
+def sensor_std(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """Standard deviation of each sensor's noise, (n), in its unit, estimated from the first rows of the data."""
+    first = slice(0, measured.settings.noise_rows)
+    return measured.remembered(
+        "noise of the sensors", simulation, lambda: noise_levels(simulation, measured.part(first)).sensor
+    )
 
 
 def stand_in(

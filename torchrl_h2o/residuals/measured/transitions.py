@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -16,7 +17,10 @@ from torchrl_h2o.data.readers.ted import require_ted
 from torchrl_h2o.residuals.settings import DEFAULTS, MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+Result = TypeVar("Result")
+
 HELD_OUT = 0.25  # share of the transitions on which errors are reported
+REMEMBERED = 16  # results that are kept with the data
 
 
 class Split(IntEnum):
@@ -57,6 +61,7 @@ class Measured:
     left_out: dict[str, int]
     source: str
     settings: MeasuredSettings = DEFAULTS.measured
+    _results: OrderedDict[tuple[str, Simulation], Any] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @classmethod
     def from_ted(
@@ -165,6 +170,22 @@ class Measured:
         left_out = dict(self.left_out)
         left_out[reason] = left_out.get(reason, 0) + int((rows & self.usable).sum())
         return replace(self, usable=self.usable & ~rows, left_out=left_out)
+
+    def remembered(self, what: str, simulation: Simulation, compute: Callable[[], Result]) -> Result:
+        """The result of a computation on these data with a simulation, which is kept for later calls.
+
+        Args:
+            what: name of the computation.
+            simulation: the simulation.
+            compute: computes the result. Nobody may change the result afterwards.
+        """
+        key = (what, simulation)
+        if key not in self._results:
+            self._results[key] = compute()
+        self._results.move_to_end(key)
+        while len(self._results) > REMEMBERED:
+            self._results.popitem(last=False)
+        return self._results[key]
 
     def why_no_conclusion(self) -> str | None:
         """Reason why these data allow no conclusion about a simulator; None if a conclusion is possible."""

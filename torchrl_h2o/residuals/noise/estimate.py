@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.initial_states import noise_levels
-from torchrl_h2o.residuals.measured.sensor_noise import stand_in
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_std, stand_in
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.noise.scatter import Scatter
 from torchrl_h2o.residuals.noise.variances import fitted_variances, log_likelihood
@@ -57,17 +56,17 @@ def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSet
     fitted = Scatter.of(simulation, measured, measured.fitted(), settings=rules)
     judged = Scatter.of(simulation, measured, measured.selected_on(), fitted.scale, settings=rules)
     # noise with opposite signs in successive residuals is attributed to the sensors, even if action noise could fit it
-    sensor_std = noise_levels(simulation, measured.part(slice(0, measured.settings.noise_rows))).sensor
-    estimate, left_out = fitted_variances(fitted, sensor_std, rules)
-    silent, _ = fitted_variances(fitted.without_action(), sensor_std, rules)
+    by_sensors = sensor_std(simulation, measured)
+    estimate, left_out = fitted_variances(fitted, by_sensors, rules)
+    silent, _ = fitted_variances(fitted.without_action(), by_sensors, rules)
     std = float(np.sqrt(estimate[0]))
     half_width = float(1.96 * np.sqrt(rules.blocks - 1) * np.std(np.sqrt(left_out)))
     if not _plausible(simulation, measured, std, half_width, rules):
         return NoiseEstimate(std, half_width, 1.0)
-    sensors_alone = stand_in(simulation, measured, sensor_std, np.random.default_rng(0))
+    sensors_alone = stand_in(simulation, measured, by_sensors, np.random.default_rng(0))
     scatter_alone = Scatter.of(simulation, sensors_alone, measured.fitted(), settings=rules)
-    by_sensors, _ = fitted_variances(scatter_alone, sensor_std, rules)
-    if std < rules.beyond_sensors * np.sqrt(by_sensors[0]):
+    alone, _ = fitted_variances(scatter_alone, by_sensors, rules)
+    if std < rules.beyond_sensors * np.sqrt(alone[0]):
         return NoiseEstimate(std, half_width, 1.0)
     gain = log_likelihood(estimate, judged, rules) - log_likelihood(silent, judged.without_action(), rules)
     return NoiseEstimate(std, half_width, p_value(gain, settings.significance))

@@ -31,6 +31,8 @@ from torchrl_h2o.residuals.simulation.state_map import StateMap
 class Simulation:
     """A simulator with its control step, its observation and its effects.
 
+    Two simulations are equal if they have the same source and equal effects.
+
     Args:
         spec: returns the model's specification, parsed anew at each call.
         frame_skip: physics steps per control step.
@@ -98,6 +100,16 @@ class Simulation:
         state_map = source.state_map
         hidden = hidden_coordinates(state_map, simulation.model.nu, simulation.rollout, simulation.settings)
         return replace(simulation, state_map=replace(state_map, hidden=hidden))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Simulation) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        return hash(self._identity)
+
+    @property
+    def _identity(self) -> tuple:
+        return type(self), self.spec, self.frame_skip, id(self.state_map), self.effects
 
     @cached_property
     def pipeline(self) -> Pipeline:

@@ -58,18 +58,23 @@ def _rivals(state: SearchState, index: int) -> list[Lead]:
 
 
 def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
-    """Rivals that reach a minimum share of the effect's gain in a quick fit of all parameters, with this fit."""
+    """Rivals that reach a minimum share of the effect's gain in a quick fit of all parameters, with this fit.
+
+    A rival that is far from this share after the first evaluations is given up.
+    """
     rules, effects, screened = state.settings.trace, state.fit.effects, state.windows.screened
     kept = [effect for i, effect in enumerate(effects) if i != index]
     few_with_it, few_without = (losses(state.problem.residual(e, screened)).mean() for e in (effects, kept))
-    near = []
+    gain, near = few_without - few_with_it, []
     for lead in _rivals(state, index):
         instead = [*kept[:index], lead.effect, *kept[index:]]
         if not is_possible(state.problem, instead):
             continue
         free = [free_parameters(entry) for entry in _entries_with(state, index, lead)]
-        sketch = state.sketched(instead, free, rules.rival_evaluations)
-        if few_without - sketch.loss >= rules.rival_min_sketch * (few_without - few_with_it):
+        sketch = state.sketched(instead, free, rules.sketch_evaluations)
+        if few_without - sketch.loss >= rules.rival_min_first * gain:
+            sketch = state.sketched(sketch.effects, free, rules.rival_evaluations)
+        if few_without - sketch.loss >= rules.rival_min_sketch * gain:
             near.append((lead, sketch))
     return near
 

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from torchrl_h2o.residuals.trace.add import best_addition
 from torchrl_h2o.residuals.trace.eliminate import eliminate
+from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.screening import Lead, screen
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -60,4 +61,4 @@ def _rescale(state: SearchState) -> SearchState:
         kept = eliminate(refitted)
         posed = kept.posed_at(kept.fit.effects)
         rescaled = kept.rescaled(posed)
-    return replace(rescaled, exact=posed.within_rounding)
+    return without_noise(replace(rescaled, exact=posed.within_rounding))

@@ -62,11 +62,14 @@ class Problem:
             simulation: the simulator.
             measured: the data.
             horizon: control steps per window.
-            sensor_std: (n), standard deviation of the readings' noise; estimated from the data by default.
+            sensor_std: (n), standard deviation of the readings' noise; estimated from the data by default, zeros for
+                sensors without noise.
             settings: bounds and rounding of the residuals.
         """
         if sensor_std is None:
             sensor_std = sensor_noise(simulation, measured)
+        elif not sensor_std.any():
+            sensor_std = None
         fitted = measured.fitted(horizon)
         states = start_states(simulation, measured, np.concatenate([fitted, measured.selected_on(horizon)]))
         one = np.ones((1, 1, measured.observation.shape[1]))

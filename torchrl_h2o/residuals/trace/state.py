@@ -132,6 +132,8 @@ class SearchState:
 
     def posed_at(self, effects: Sequence[Effect]) -> Problem:
         """The problem of the simulation with effects put in: start states and scales of the residuals anew."""
+        if not effects:
+            return self.first
         base = self.problem
         mended = base.simulation.with_effects(*effects)
         return Problem.pose(mended, base.measured, base.horizon, settings=base.settings)

@@ -1,0 +1,54 @@
+"""Tests whether what looks like sensor noise is an error of the effects found so far."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.screening import free_parameters
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+def without_noise(state: SearchState) -> SearchState:
+    """Fits the effects found as if the sensors had no noise, and keeps that fit if only rounding remains.
+
+    A wrong gain or bias of a sensor enters successive residuals with opposite signs, as noise does. Start states that
+    are filtered for such noise hide a part of the error, and the fitted gain is then too close to 1.
+
+    Args:
+        state: effects found, with residuals scaled by their present size.
+
+    Returns:
+        The state with the exact fit; unchanged if the sensors have noise or an effect is missing.
+    """
+    if state.exact or not state.entries or state.problem.sensor_std is None:
+        return state
+    rules = state.settings.trace
+    silent = state.rescaled(_silent(state, state.fit))
+    free = [free_parameters(entry) for entry in state.entries]
+    fitted = silent.sketched(state.fit.effects, free, rules.sketch_evaluations)
+    if fitted.loss > rules.noise_free_loss * _loss(silent, state.fit):
+        return state
+    for _ in range(rules.noise_free_fits):
+        silent = silent.with_found(state.entries, silent.refitted(state.entries, fitted.effects))
+        fitted, problem = silent.fit, _silent(state, silent.fit)
+        silent = silent.rescaled(problem)
+        if problem.within_rounding:
+            return replace(silent, exact=True)
+    return state
+
+
+def _silent(state: SearchState, fitted: Fit) -> Problem:
+    """The problem with fitted effects put in, and without sensor noise."""
+    base = state.problem
+    no_noise = np.zeros(base.measured.observation.shape[1])
+    mended = base.simulation.with_effects(*fitted.effects)
+    return Problem.pose(mended, base.measured, base.horizon, sensor_std=no_noise, settings=base.settings)
+
+
+def _loss(state: SearchState, fitted: Fit) -> float:
+    """Loss of a fit on the screened windows."""
+    return float(losses(state.problem.residual(fitted.effects, state.windows.screened)).mean())
