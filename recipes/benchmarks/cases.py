@@ -68,15 +68,17 @@ class Family:
         size: number of cases.
         asked: number of cases that should pass.
         what: pass criterion, in words.
+        stream: number of its random stream, different for each family that draws at random.
     """
 
     draw: Callable[[int, np.random.Generator], Case]
     size: int
     asked: int
     what: str
+    stream: int = 0
 
 
 def draw_case(families: Mapping[str, Family], family: str, number: int, seed: int) -> Case:
     """Draw a case by family and number; the result depends only on these and the seed."""
-    stream = np.random.SeedSequence((seed, sorted(families).index(family), number))
+    stream = np.random.SeedSequence((seed, families[family].stream, number))
     return families[family].draw(number, np.random.default_rng(stream))

@@ -5,7 +5,9 @@ import math
 
 import numpy as np
 from cases import Case, Family
+from pendulum import CONTROL_STEP, PendulumEnv
 from scoring import (
+    depends_on_time,
     is_exact_set,
     is_marked_undeclared,
     is_reported_as_group,
@@ -14,9 +16,9 @@ from scoring import (
     says_nothing_is_missing,
 )
 from systems import SYSTEMS
-from undeclared_effects import CubicWind, LateForce, MovingSpring, PlaceFriction, TorqueRipple
+from undeclared_effects import CubicWind, DriftingTorque, LateForce, MovingSpring, PlaceFriction, TorqueRipple
 
-from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry, Effect
+from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry, Effect, JointDamping
 from torchrl_h2o.residuals import Measured, Report, Simulation, residuals
 
 SENSOR_NOISE = 0.01
@@ -29,6 +31,8 @@ LOOKED_AT = 500  # transitions used to measure an effect's size
 TRIES = 200
 EXPLAINABLE = 0.95  # of the error above the floor, of declared effects
 EXPLAINABLE_UNDECLARED = 0.8
+DAMPING_RATIO = (0.007, 0.015)  # of slow viscous friction: about 1 % of critical
+DRIFT = (0.05, 0.15)  # N·m, torque that a drifting motor reaches at the end of the data
 
 
 def visibility(effect: Effect, simulation: Simulation, measured: Measured) -> float:
@@ -197,7 +201,42 @@ def decoy(number: int, rng: np.random.Generator) -> Case:
     )
 
 
-SEVERAL = Family(several, 20, 17, "the exact set or its group, 95 % of the explainable error gone")
-UNDECLARED_FORCE = Family(undeclared, 10, 9, "marked undeclared, 80 % of the residual gone")
-NOTHING = Family(nothing, 20, 19, "'nothing missing'")
-DECOY = Family(decoy, 4, 4, "reported as a group")
+def slow(number: int, rng: np.random.Generator) -> Case:
+    """An effect that noisy sensors hide for many steps: weak viscous friction, or a motor whose torque drifts."""
+    viscous = number % 2 == 0
+    if viscous:
+        damping = float(rng.uniform(*DAMPING_RATIO)) * PendulumEnv.critical_damping()
+        effect: Effect = JointDamping(damping, joints="pivot")
+    else:
+        torque = float(rng.choice([-1, 1]) * rng.uniform(*DRIFT))
+        effect = DriftingTorque(torque, "pivot", duration=Case.transitions * CONTROL_STEP)
+    return Case(
+        name=f"pendulum {type(effect).__name__}",
+        system="swinging pendulum",
+        judge=judge_viscous if viscous else judge_drift,
+        truth=(effect,),
+        in_reality=(effect,),
+        noise=SENSOR_NOISE,
+        seed=int(rng.integers(2**31)),
+        episode=10**6,
+    )
+
+
+def judge_viscous(report: Report, case: Case) -> dict:
+    """Passed if exactly the viscous friction, or a group with it, is found."""
+    simulation = case.simulation()
+    error = parameter_error(report, case.truth, simulation)
+    return {"ok": is_exact_set(report, case.truth, simulation), "parameter_error": error}
+
+
+def judge_drift(report: Report, case: Case) -> dict:
+    """Passed if the only effect found is a torque that depends on time."""
+    found = report.effects
+    return {"ok": len(found) == 1 and depends_on_time(found[0])}
+
+
+SEVERAL = Family(several, 20, 17, "the exact set or its group, 95 % of the explainable error gone", stream=4)
+UNDECLARED_FORCE = Family(undeclared, 10, 9, "marked undeclared, 80 % of the residual gone", stream=5)
+NOTHING = Family(nothing, 20, 20, "'nothing missing'", stream=1)
+DECOY = Family(decoy, 4, 4, "reported as a group", stream=0)
+SLOW = Family(slow, 10, 8, "viscous friction or a torque that depends on time", stream=6)

@@ -5,7 +5,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from cases import Family
-from drawn_cases import DECOY, NOTHING, SEVERAL, UNDECLARED_FORCE
+from drawn_cases import DECOY, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
 from log_cases import log_families
 from paper_cases import PAPER, PAPER_WITH_NOISE
 
@@ -17,6 +17,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "undeclared": UNDECLARED_FORCE,
         "nothing": NOTHING,
         "decoy": DECOY,
+        "slow": SLOW,
     }
 )
 

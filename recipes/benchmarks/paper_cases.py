@@ -75,7 +75,11 @@ def judge_named(report: Report, case: Case) -> dict:
     }
 
 
-PAPER = Family(paper_case, len(GAPS), 16, "named first, parameter within 2 %, error down by 99 %")
+PAPER = Family(paper_case, len(GAPS), 16, "named first, parameter within 2 %, error down by 99 %", stream=2)
 PAPER_WITH_NOISE = Family(
-    lambda number, rng: paper_case(number, rng, SENSOR_NOISE), len(GAPS), 15, "named first under 1 % of sensor noise"
+    lambda number, rng: paper_case(number, rng, SENSOR_NOISE),
+    len(GAPS),
+    15,
+    "named first under 1 % of sensor noise",
+    stream=3,
 )

@@ -1,8 +1,10 @@
 """A pendulum as a Gymnasium task, the smallest system of the benchmark."""
 
+import math
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
@@ -31,6 +33,14 @@ class PendulumEnv(MujocoEnv):
     def reset_model(self) -> np.ndarray:
         self.set_state(self.np_random.uniform(-np.pi, np.pi, 1), self.np_random.uniform(-1.0, 1.0, 1))
         return self._get_obs()
+
+    @classmethod
+    def critical_damping(cls) -> float:
+        """Viscous friction, in N·m·s/rad, at which small swings just do not overshoot: twice the root of m g l · m l²."""
+        model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
+        mass, length = float(model.body("arm").mass[0]), -float(model.body("arm").ipos[2])
+        weight = -float(model.opt.gravity[2]) * mass
+        return 2.0 * math.sqrt(weight * length * mass * length**2)
 
     def _get_obs(self) -> np.ndarray:
         return np.concatenate([self.data.qpos, self.data.qvel])

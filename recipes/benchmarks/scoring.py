@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from torchrl_h2o.effects import Effect, selection
+from torchrl_h2o.effects import Effect, ResidualForce, selection
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import NOTHING_MISSING
 
@@ -87,6 +87,12 @@ def reduction(report: Report, floor: float = 0.0) -> float:
 def is_marked_undeclared(report: Report) -> bool:
     """Whether the report contains an effect outside the catalogue."""
     return any(not found.declared for found in report.found)
+
+
+def depends_on_time(effect: Effect) -> bool:
+    """Whether an effect is a force with a term in time."""
+    terms = effect.parsed if isinstance(effect, ResidualForce) else ()
+    return any(factor.coordinate == "t" for term in terms for factor in term.factors)
 
 
 def says_nothing_is_missing(report: Report) -> bool:

@@ -155,6 +155,11 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
             lambda episode: GymWrapper(TimeLimit(PendulumEnv(), episode)),
             lambda: Excitation(torch.tensor([3.0]), brake=torch.tensor([[0.0, 0.2]])),
         ),
+        # swings of less than a turn, as a laboratory rig makes
+        "swinging pendulum": System(
+            lambda episode: GymWrapper(TimeLimit(PendulumEnv(), episode)),
+            lambda: Excitation(torch.tensor([3.0]), strongest=0.15, brake=torch.tensor([[0.0, 0.05]])),
+        ),
         "wheel_legged": System(
             lambda episode: WheelLeggedEnv(max_episode_steps=episode), lambda: noisy_balance_controller()
         ),

@@ -89,6 +89,17 @@ class LateForce(_TorqueOnJoint):
 
 
 @dataclass(frozen=True)
+class DriftingTorque(_TorqueOnJoint):
+    """Torque that grows with time, such as a motor's offset while it warms up; ``torque`` is its value at the end."""
+
+    wording: ClassVar[str] = "drift to {torque} in {duration}, on {joint}"
+    duration: float = parameter(unit="s", bounds=(0.1, 10000.0), neutral=1.0)
+
+    def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
+        return self.torque * time / self.duration
+
+
+@dataclass(frozen=True)
 class PlaceFriction(_TorqueOnJoint):
     """Dry friction that depends on the angle, such as a bent axle: largest at one angle, zero at the opposite."""
 

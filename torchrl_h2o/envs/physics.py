@@ -13,6 +13,8 @@ from torchrl_h2o.effects.effect import BatchedForce
 
 FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
+_ALONE = Rollout(nthread=0)
+_FEW = 128  # physics steps of one rollout below which threads cost more time than they save
 _CTRL_AND_FORCE = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
 
@@ -45,6 +47,8 @@ def roll_out(
     Returns:
         The states after each control step, (B, H, size).
     """
+    if len(states) * (1 if forces else actions.shape[1] * physics_steps) <= _FEW:
+        pool, data = _ALONE, data[:1]
     if not forces:
         control, spec = actions, _CTRL
         if applied is not None:

@@ -116,8 +116,9 @@ class HorizonSettings:
     """Largest number of windows by which a length is judged."""
     min_fitted: int = 20
     """Smallest number of windows for fits that a length must leave."""
-    min_selected: int = 8
-    """Smallest number of windows for the selection of effects that a length must leave."""
+    min_selected: int = 16
+    """Smallest number of windows for the selection of effects that a length must leave. With fewer windows, no gain is
+    significant after the level is divided by the number of effects tried."""
     stands_out: float = 10.0
     """Median error over the median error that sensor noise alone causes, beyond which no longer windows are tried."""
     least_ratio: float = 1.5

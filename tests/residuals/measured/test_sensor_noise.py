@@ -8,7 +8,7 @@ import pytest
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals import Split, residuals
-from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, sensor_std, stand_in
 
 SIMULATION = pendulum()
 
@@ -44,3 +44,11 @@ def test_a_stand_in_is_read_by_noisy_sensors_and_leaves_the_data_as_they_are():
         np.testing.assert_allclose((getattr(data, name) - getattr(measured, name)).std(0), std, rtol=0.1)
         np.testing.assert_array_equal(getattr(measured, name), getattr(kept, name))
     np.testing.assert_array_equal(data.action, measured.action)
+
+
+def test_estimated_columns_are_at_least_as_noisy_as_is_known():
+    """Successive residuals do not show errors that are alike in successive rows, as those of a smoother."""
+    measured = recorded(SIMULATION, 600, noise=0.001)
+    found = sensor_std(SIMULATION, measured)
+    known = np.array([0.0, 10.0 * found[1]])
+    assert sensor_std(SIMULATION, replace(measured, estimated_std=known)) == pytest.approx([found[0], known[1]])

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect
+from torchrl_h2o.effects.force.kinematics import com_jacobians
 from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Names
 
@@ -66,6 +67,9 @@ class LinearDrag(ForceEffect):
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
         return _drag(model, self.bodies, lambda speed: self.coefficient)
 
+    def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
+        return _batched_drag(model, self.bodies, lambda speed: self.coefficient)
+
 
 @dataclass(frozen=True)
 class QuadraticDrag(ForceEffect):
@@ -90,8 +94,11 @@ class QuadraticDrag(ForceEffect):
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
         return _drag(model, self.bodies, lambda speed: self.coefficient * speed)
 
+    def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
+        return _batched_drag(model, self.bodies, lambda speed: self.coefficient * speed)
 
-def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[np.floating], float | np.floating]) -> Force:
+
+def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[Any], Any]) -> Force:
     """Returns the drag on bodies for a resistance in N·s/m that depends on the speed in m/s."""
     bodies = selection.body_ids(model, names)
     jacobian = np.zeros((3, model.nv))
@@ -103,5 +110,18 @@ def _drag(model: mujoco.MjModel, names: Names, resistance: Callable[[np.floating
             velocity = jacobian @ data.qvel
             force -= resistance(np.linalg.norm(velocity)) * jacobian.T @ velocity
         return force
+
+    return drag
+
+
+def _batched_drag(model: mujoco.MjModel, names: Names, resistance: Callable[[Any], Any]) -> BatchedForce:
+    """Returns the drag of :func:`_drag` as a function of many states."""
+    jacobians_at = com_jacobians(model, selection.body_ids(model, names))
+
+    def drag(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
+        jacobians = jacobians_at(qpos)
+        velocities = (jacobians @ qvel[:, None, :, None])[..., 0]
+        resisting = resistance(np.linalg.norm(velocities, axis=-1, keepdims=True)) * velocities
+        return -(resisting[..., None, :] @ jacobians).sum(1)[:, 0]
 
     return drag

@@ -10,6 +10,7 @@ from scipy.stats import mannwhitneyu
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
+from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -140,14 +141,19 @@ def reasons_against(
 def _lowers_the_error(
     simulation: Simulation, mended: Simulation, measured: Measured, error: ErrorSummary, settings: LoopSettings
 ) -> bool:
-    """Whether the error on the report's data falls significantly, one step ahead or as far as the sentence says."""
+    """Whether the error on the report's data falls significantly, one step ahead or as far as the sentence says.
+
+    With noisy sensors, windows start from states that are filtered with the past rows.
+    """
+    noisy = sensor_noise(mended, measured) is not None
     ahead = {1} if error.headline is None else {1, max(1, round(error.headline.seconds / simulation.control_step))}
     spread = np.maximum(measured.observation.std(0), 1e-12)
     for steps in ahead:
         starts = measured.reported_on(steps)
         sizes = []
         for which in (simulation, mended):
-            missed = residuals(which, measured, starts, steps)[:, -1] / spread
+            states = estimate_states(which, measured) if noisy else None
+            missed = residuals(which, measured, starts, steps, states=states)[:, -1] / spread
             sizes.append(np.nan_to_num(np.abs(missed), nan=settings.residual.worst).mean(1))
         level = settings.verdict.level / len(ahead)
         if len(starts) >= 2 and p_value_of_losses(sizes[0], sizes[1], settings.significance) < level:

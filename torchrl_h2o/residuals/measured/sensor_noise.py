@@ -24,11 +24,16 @@ def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | Non
 
 
 def sensor_std(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """Standard deviation of each sensor's noise, (n), in its unit, estimated from the first rows of the data."""
+    """Standard deviation of each sensor's noise, (n), in its unit, estimated from the first rows of the data.
+
+    It is not less than the known error of columns that were estimated from others. Such errors are alike in successive
+    rows, so the residuals alone would show too little of them.
+    """
     first = slice(0, measured.settings.noise_rows)
-    return measured.remembered(
+    std = measured.remembered(
         "noise of the sensors", simulation, lambda: noise_levels(simulation, measured.part(first)).sensor
     )
+    return std if measured.estimated_std is None else np.maximum(std, measured.estimated_std)
 
 
 def stand_in(

@@ -49,6 +49,8 @@ class Measured:
         left_out: number of excluded rows by reason.
         source: name of the data in reports and errors.
         settings: sampling of windows, noise estimation and state estimation.
+        estimated_std: (n), standard deviation of the errors of columns that were estimated from others, such as
+            velocities from positions, and 0 for measured ones; None if all were measured.
     """
 
     observation: np.ndarray
@@ -61,6 +63,7 @@ class Measured:
     left_out: dict[str, int]
     source: str
     settings: MeasuredSettings = DEFAULTS.measured
+    estimated_std: np.ndarray | None = None
     _results: OrderedDict[tuple[str, Simulation], Any] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @classmethod
@@ -80,7 +83,8 @@ class Measured:
 
         Args:
             data: batch size (T,), as the readers of :mod:`torchrl_h2o.data` return it; with the entry ``"log"`` if the
-                data are several logs: the index of each transition's log.
+                data are several logs: the index of each transition's log; and with ``"observation_std"`` (T, n) if
+                columns were estimated from others: the standard deviation of their errors, 0 for measured ones.
             simulation: simulator that the data will be compared with.
             source: name of the data in reports and errors.
             held_out: share of the transitions, taken from the end, on which errors are reported; or the indices of
@@ -112,6 +116,7 @@ class Measured:
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
             settings,
+            _rms(_float64(data["observation_std"])) if "observation_std" in data.keys() else None,
         )
 
     def __len__(self) -> int:
@@ -265,6 +270,10 @@ def thinned(starts: np.ndarray, most: int) -> np.ndarray:
 
 def _float64(tensor) -> np.ndarray:
     return tensor.detach().cpu().double().numpy()
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt((values**2).mean(0))
 
 
 def _require_width(values: np.ndarray, names: Sequence[str], what: str, source: str) -> None:
