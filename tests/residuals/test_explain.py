@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
 from torchrl_h2o.residuals import Evidence, explain
+from torchrl_h2o.residuals.progress import LoopBar
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -17,7 +17,7 @@ RIPPLE = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
 
 def explained(*truth, simulation=SIMULATION, catalogue=(GRAVITY, FRICTION), rows=2000, noise=0.0):
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
-    with tqdm(disable=True) as progress:
+    with LoopBar(disable=True) as progress:
         evidence = Evidence(simulation, measured, undisturbed=measured, suspected=())
         return explain(evidence, catalogue, rng=np.random.default_rng(0), progress=progress)
 

@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import CatalogueEntry, Effect
@@ -23,6 +22,7 @@ from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
+from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -84,7 +84,7 @@ def close_the_loop(
     if (reason := why_no_conclusion(simulation, measured)) is not None:
         return inconclusive_report(simulation, measured, reason, audit)
     entries = simulation.catalogue() if catalogue is None else catalogue
-    with tqdm(desc="closing the loop", unit=" effects", disable=not progress) as bar:
+    with LoopBar(disable=not progress) as bar:
         evidence = gather_evidence(simulation, measured, settings, audit=audit)
         explanation = explain(
             evidence,
@@ -97,8 +97,9 @@ def close_the_loop(
         )
         computing = "the errors before and after were computed"
         so_far(unfinished_report(evidence, explanation, computing))
-        bar.set_description("reporting")
+        bar.stage(REPORT)
         judgement = judge(evidence, explanation, seed=seed, settings=settings)
+        bar.finish()
         wall_s = time.perf_counter() - start
         return compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings)
 
@@ -121,7 +122,7 @@ def explain(
     catalogue: Sequence[CatalogueEntry],
     *,
     rng: np.random.Generator,
-    progress: tqdm,
+    progress: LoopBar,
     known: Sequence[Effect] = (),
     so_far: Callable[[Explanation, str], object] = lambda explanation, stage: None,
     settings: LoopSettings = DEFAULTS,
@@ -132,7 +133,7 @@ def explain(
         evidence: the simulator and the data.
         catalogue: effects that the simulator may lack.
         rng: generator for screened windows and synthetic noise.
-        progress: bar that counts screened entries and names the stage.
+        progress: bar that shows how far the search is, and its stage.
         known: effects from which the search begins.
         so_far: called with a preliminary explanation, and what was going on, as it grows.
         settings: thresholds and budgets.
@@ -153,11 +154,11 @@ def explain(
     )
     declared = Explanation.of(trace)
     so_far(declared, "undeclared forces were looked for")
-    progress.set_description("looking for undeclared forces")
+    progress.stage(FORCES)
     add_force = partial(add_undeclared_force, rng=rng, settings=settings)
     with_force = _tried("an undeclared force", declared, lambda: add_force(simulation, measured, declared))
     so_far(with_force, "action noise was looked for")
-    progress.set_description("looking for action noise")
+    progress.stage(NOISE)
     return _tried("action noise", with_force, lambda: add_action_noise(simulation, measured, with_force, settings))
 
 

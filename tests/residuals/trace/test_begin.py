@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals.progress import LoopBar
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -17,7 +17,7 @@ TRUTH = (Gravity(1.3), JointFrictionLoss(0.05))
 def traced(known):
     seen = []
     measured = recorded(SIMULATION.with_effects(*TRUTH), 1000)
-    with tqdm(disable=True) as progress:
+    with LoopBar(disable=True) as progress:
         trace = trace_effects(
             SIMULATION,
             measured,

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, JointFrictionLoss
 from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.per_joint import entries_of_elements
 
 SIMULATION = double_pendulum()
@@ -18,7 +18,7 @@ CATALOGUE = (SHOULDER, ELBOW, ALL)
 def friction(shoulder, elbow, noise):
     truth = (JointFrictionLoss(shoulder, "shoulder"), JointFrictionLoss(elbow, "elbow"))
     measured = recorded(SIMULATION.with_effects(*truth), 3000, noise=noise)
-    with tqdm(disable=True) as progress:
+    with LoopBar(disable=True) as progress:
         trace = trace_effects(SIMULATION, measured, CATALOGUE, rng=np.random.default_rng(0), progress=progress)
     return trace.fit.effects
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tqdm import tqdm
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry, Gravity, JointDamping
 from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals.progress import LoopBar
 
 SIMULATION = pendulum()  # damping 0.1 N·m·s/rad
 FACTORS = ({"scale": 0.5}, {"scale": 0.8}, {"scale": 1.25}, {"scale": 2.0})
@@ -17,7 +17,7 @@ GRAVITY = CatalogueEntry(Gravity(), FACTORS)
 
 def traced(*truth, catalogue, noise=0.002):
     measured = recorded(SIMULATION.with_effects(*truth), 2000, noise=noise)
-    with tqdm(disable=True) as progress:
+    with LoopBar(disable=True) as progress:
         return trace_effects(SIMULATION, measured, catalogue, rng=np.random.default_rng(0), progress=progress)
 
 

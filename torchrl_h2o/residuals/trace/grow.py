@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from tqdm import tqdm
 
+from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import best_addition
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.noise_free import without_noise
@@ -15,11 +16,13 @@ from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.screening import Lead, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
+SCREENING, ADDITION = 0.2, 0.3  # shares by which a screening and an addition bring the bar closer to the stage's end
+
 
 def grow(
     state: SearchState,
     rng: np.random.Generator,
-    progress: tqdm,
+    progress: LoopBar,
     found: Callable[[SearchState], object] = lambda state: None,
 ) -> SearchState:
     """Adds effects until no addition passes the tests, the limit is reached, or the residual is within rounding.
@@ -27,18 +30,20 @@ def grow(
     Args:
         state: effects found so far.
         rng: generator of synthetic noise.
-        progress: bar that counts screened entries and names the effects found.
+        progress: bar that moves with every screened entry and names the effects found.
         found: called after each addition.
     """
     state = _rescale(state)
     while not state.exact and len(state.entries) < state.settings.trace.max_effects:
         screened = state.windows.screened
-        leads = screen(state.problem, state.fit.effects, state.others, screened, progress.update)
+        one_more = partial(progress.closer, SCREENING / max(1, len(state.others)))
+        leads = screen(state.problem, state.fit.effects, state.others, screened, one_more)
         grown = best_addition(state, leads, rng)
         if len(grown.entries) == len(state.entries):
             return grown
         grown = _remember_leads(grown, leads, grown.entries[len(state.entries) :])
         state = _rescale(reorder(eliminate(grown)))
+        progress.closer(ADDITION)
         progress.set_postfix_str(", ".join(entry.name for entry in state.entries))
         found(state)
     return state

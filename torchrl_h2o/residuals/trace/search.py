@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from tqdm import tqdm
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.begin import begin_with
@@ -22,6 +22,8 @@ from torchrl_h2o.residuals.trace.rival_sets import with_most_usual_set
 from torchrl_h2o.residuals.trace.simplify import simplify
 from torchrl_h2o.residuals.trace.state import SearchState
 
+EFFECT_SIMPLIFIED = 0.25  # share by which one effect brings the bar closer to the end of its stage
+
 
 def trace_effects(
     simulation: Simulation,
@@ -29,7 +31,7 @@ def trace_effects(
     catalogue: Sequence[CatalogueEntry],
     *,
     rng: np.random.Generator,
-    progress: tqdm,
+    progress: LoopBar,
     known: Sequence[Effect] = (),
     found: Callable[[Trace], object] = lambda trace: None,
     settings: LoopSettings = DEFAULTS,
@@ -41,7 +43,7 @@ def trace_effects(
         measured: the data.
         catalogue: effects that the simulator may lack.
         rng: generator for screened windows and synthetic noise.
-        progress: bar that counts screened entries.
+        progress: bar that shows how far the search is.
         known: effects from which the search begins, such as those of an unfinished run; those that are not in the
             catalogue are left out.
         found: called with the preliminary result whenever an effect has been found.
@@ -50,6 +52,7 @@ def trace_effects(
     Returns:
         The effects found, the other effects tried, and equivalent alternatives.
     """
+    progress.stage(EFFECTS)
     horizon = choose_horizon(simulation, measured, rng, settings)
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
@@ -57,7 +60,8 @@ def trace_effects(
         before, state = state, grow(state, rng, progress, lambda grown: found(_outcome(grown)))
         if state.entries == before.entries:
             break
-        grown, state = state, simplify(state)
+        progress.stage(OTHERS)
+        grown, state = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
         # a further round helps only where a simpler effect has replaced one with many parameters
         if state.exact or state.entries == grown.entries:
             break

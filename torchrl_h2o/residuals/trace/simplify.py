@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
@@ -11,12 +12,18 @@ from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
-def simplify(state: SearchState) -> SearchState:
-    """Simplifies the effects found one by one; the state's groups then hold the alternatives of each."""
+def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -> SearchState:
+    """Simplifies the effects found one by one; the state's groups then hold the alternatives of each.
+
+    Args:
+        state: effects found.
+        advance: called after each effect.
+    """
     state = replace(state, groups=())
     for index in range(len(state.entries)):
         state, group = simplify_one(state, index)
         state = replace(state, groups=(*state.groups, group))
+        advance()
     return state
 
 

@@ -1,0 +1,42 @@
+"""The bar of closing the loop: it only moves forwards, and ends at 100 %."""
+
+import io
+
+import pytest
+
+from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, REPORT, STAGES, LoopBar
+
+
+@pytest.fixture
+def bar():
+    with LoopBar(file=io.StringIO()) as bar:
+        yield bar
+
+
+def test_a_stage_begins_where_the_earlier_ones_end(bar):
+    bar.stage(FORCES)
+    assert bar.n == STAGES[EFFECTS] + STAGES[OTHERS]
+    assert bar.desc.startswith(FORCES)
+
+
+def test_the_bar_comes_closer_to_the_end_of_its_stage_and_never_moves_back(bar):
+    bar.stage(OTHERS)
+    bar.closer(0.5)
+    halfway = STAGES[EFFECTS] + 0.5 * STAGES[OTHERS]
+    assert bar.n == halfway
+    bar.stage(EFFECTS)  # another round of the search
+    assert bar.n == halfway
+    for _ in range(100):
+        bar.closer(0.5)
+    assert bar.n == pytest.approx(STAGES[EFFECTS] + STAGES[OTHERS])
+
+
+def test_the_last_stage_ends_at_100_per_cent(bar):
+    bar.stage(REPORT)
+    bar.finish()
+    assert bar.n == bar.total == 100.0
+
+
+def test_a_stage_that_does_not_exist_is_refused(bar):
+    with pytest.raises(KeyError):
+        bar.stage("waiting")

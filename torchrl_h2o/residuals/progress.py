@@ -1,0 +1,53 @@
+"""The progress bar of closing the loop: the stage, and an estimate of the time that is left."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tqdm import tqdm
+
+# Stages in their order, with their usual shares of the time in per cent: medians of runs on HalfCheetah, on a robot and
+# on a double pendulum. A run in which nothing is missing, or in which the effects explain the data exactly, is shorter.
+EFFECTS, OTHERS = "looking for effects", "looking for other explanations"
+FORCES, NOISE, REPORT = "looking for undeclared forces", "looking for action noise", "reporting"
+STAGES = {EFFECTS: 35.0, OTHERS: 30.0, FORCES: 20.0, NOISE: 5.0, REPORT: 10.0}
+
+
+class LoopBar(tqdm):
+    """Shows how much of the expected time has passed, in per cent, and what is being done.
+
+    How many effects a search will find is not known before, so the bar moves by shares of what is left of a stage.
+
+    Args:
+        **options: options of ``tqdm``, such as ``disable=True`` or ``file``.
+
+    Examples:
+        >>> with LoopBar(disable=True) as bar:
+        ...     bar.stage("looking for effects")
+        ...     bar.closer(0.5)
+    """
+
+    def __init__(self, **options: Any) -> None:
+        form = "{desc}: {percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
+        super().__init__(total=sum(STAGES.values()), bar_format=form, **options)
+        self._end = 0.0
+
+    def stage(self, name: str) -> None:
+        """Begins a stage; the bar never moves back.
+
+        Raises:
+            KeyError: for a name that is not in :data:`STAGES`.
+        """
+        share = STAGES[name]
+        start = sum(list(STAGES.values())[: list(STAGES).index(name)])
+        self._end = max(self._end, start + share)
+        self.set_description(name, refresh=False)
+        self.update(max(0.0, start - self.n))
+
+    def closer(self, share: float) -> None:
+        """Moves the bar by a share of what is left of the stage."""
+        self.update(share * max(0.0, self._end - self.n))
+
+    def finish(self) -> None:
+        """Moves the bar to the end."""
+        self.update(max(0.0, self.total - self.n))
