@@ -36,7 +36,7 @@ class PendulumEnv(MujocoEnv):
 
     @classmethod
     def critical_damping(cls) -> float:
-        """Viscous friction at which small swings just do not overshoot, in N·m·s/rad: twice the root of m g l · m l²."""
+        """Viscous friction at which small swings just do not overshoot, in N·m·s/rad: 2 √(m g l · m l²)."""
         model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
         mass, length = float(model.body("arm").mass[0]), -float(model.body("arm").ipos[2])
         weight = -float(model.opt.gravity[2]) * mass

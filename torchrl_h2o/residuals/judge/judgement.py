@@ -179,7 +179,13 @@ def _alternatives(
 def _others(
     simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
 ) -> tuple[tuple[RivalSet, float, str], ...]:
-    """Error of each other set of effects, and the data that would distinguish it from the effects found."""
+    """Error of each other set of effects, and the data that would distinguish it from the effects found.
+
+    There are none beside an undeclared force: these sets explain as much as the catalogue's effects alone, and the
+    force explains more.
+    """
+    if not all(part.declared for part in explanation.parts):
+        return ()
     others = []
     for rival in explanation.trace.others:
         other = simulation.with_effects(*rival.fit.effects)

@@ -47,6 +47,7 @@ class Trace:
         groups: for each effect found, alternatives with an equivalent loss, in ascending order of their loss.
         exact: True if the remaining residual is within the rounding of single-precision data.
         others: other sets of effects with an equivalent loss, the most usual ones first.
+        horizon: control steps per window of the search.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -55,3 +56,4 @@ class Trace:
     groups: tuple[tuple[Attempt, ...], ...]
     exact: bool
     others: tuple[RivalSet, ...] = ()
+    horizon: int = 1

@@ -80,4 +80,4 @@ def _outcome(state: SearchState) -> Trace:
     tried = sorted(state.attempts.values(), key=lambda attempt: attempt.loss)
     attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
     groups = state.groups or ((),) * len(state.entries)  # alternatives are looked for after the effects
-    return Trace(state.entries, state.fit, attempts, groups, state.exact)
+    return Trace(state.entries, state.fit, attempts, groups, state.exact, horizon=state.problem.horizon)

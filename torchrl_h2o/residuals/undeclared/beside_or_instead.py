@@ -14,7 +14,6 @@ from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 from torchrl_h2o.residuals.undeclared.find_force import Undeclared, find_undeclared
@@ -68,52 +67,63 @@ def add_undeclared_force(
     if not candidates:
         return explanation
     compared = [parts, *(candidate.parts for candidate in candidates)]
-    problem = _with_least_noise(simulation, measured, compared, settings)
-    first = Problem.pose(simulation, measured, settings=settings.residual)
+    horizon = _horizon(explanation, settings)
+    problem = _with_least_noise(simulation, measured, compared, horizon, settings)
+    first = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     before = _selection_losses(problem, parts)
     paying = []
     for candidate in candidates:
         after = _selection_losses(problem, candidate.parts)
         pays = _pays(first, before, after, parts, candidate.parts, settings)
-        if pays and _beyond_noise(candidate, measured, rng, settings):
+        if pays and _beyond_noise(candidate, measured, horizon, rng, settings):
             paying.append((candidate.parts, after.mean()))
     return explanation.with_parts(_shortest(paying, settings) if paying else parts)
+
+
+def _horizon(explanation: Explanation, settings: LoopSettings) -> int:
+    """Control steps per window on which a force is fitted and judged: one, or those of the search if it needs many.
+
+    Where the search needs long windows, the noise of the sensors hides a force one step ahead.
+    """
+    horizon = explanation.trace.horizon
+    return horizon if horizon > settings.undeclared.further_steps else 1
 
 
 def _candidates(
     simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
 ) -> list[_Candidate]:
     """A force beside the effects found, and a force instead of them; only those that were found."""
-    parts, candidates = explanation.parts, []
+    parts, candidates, horizon = explanation.parts, [], _horizon(explanation, settings)
     mended = simulation.with_effects(*explanation.effects)
-    if (beside := find_undeclared(mended, measured, settings=settings)) is not None:
-        together = _beside(simulation, measured, explanation.trace, parts, beside, settings)
+    if (beside := find_undeclared(mended, measured, horizon, settings=settings)) is not None:
+        together = _beside(simulation, measured, explanation, beside, settings)
         candidates.append(_Candidate(together, beside, mended))
     # tried even if there is no force beside, because effects that imitate a force may leave a residual like noise
-    if parts and (alone := find_undeclared(simulation, measured, settings=settings)) is not None:
+    if parts and (alone := find_undeclared(simulation, measured, horizon, settings=settings)) is not None:
         candidates.append(_Candidate((Part(alone.effect, False, alone.ci95),), alone, simulation))
     return candidates
 
 
 def _beside(
-    simulation: Simulation, measured: Measured, trace: Trace, parts: Parts, force: Undeclared, settings: LoopSettings
+    simulation: Simulation, measured: Measured, explanation: Explanation, force: Undeclared, settings: LoopSettings
 ) -> Parts:
     """The effects that are needed beside a force, and the force from a new search beside these effects."""
+    parts, horizon = explanation.parts, _horizon(explanation, settings)
     candidate = (*parts, Part(force.effect, False, force.ci95))
     if not parts:
         return candidate
     mended = simulation.with_effects(*(part.effect for part in parts))
-    posed = Problem.pose(mended, measured, settings=settings.residual)
-    needed = needed_parts(replace(posed, simulation=simulation), trace, candidate, settings)
+    posed = Problem.pose(mended, measured, horizon, settings=settings.residual)
+    needed = needed_parts(replace(posed, simulation=simulation), explanation.trace, candidate, settings)
     known = needed[:-1]
     again = find_undeclared(
-        simulation.with_effects(*(part.effect for part in known)), measured, settings=settings
+        simulation.with_effects(*(part.effect for part in known)), measured, horizon, settings=settings
     )  # the new search omits terms that have become redundant
     return needed if again is None else (*known, Part(again.effect, False, again.ci95))
 
 
 def _with_least_noise(
-    simulation: Simulation, measured: Measured, explanations: Sequence[Parts], settings: LoopSettings
+    simulation: Simulation, measured: Measured, explanations: Sequence[Parts], horizon: int, settings: LoopSettings
 ) -> Problem:
     """The problem in which explanations are compared, posed with the explanation that leaves the least sensor noise.
 
@@ -127,12 +137,13 @@ def _with_least_noise(
         std = sensor_noise(candidate, measured)
         return 0.0 if std is None else float(((std / spread) ** 2).mean())
 
-    posed = Problem.pose(min(mended, key=noise), measured, settings=settings.residual)
+    posed = Problem.pose(min(mended, key=noise), measured, horizon, settings=settings.residual)
     return replace(posed, simulation=simulation)
 
 
 def _selection_losses(problem: Problem, parts: Parts) -> np.ndarray:
-    return losses(problem.residual([part.effect for part in parts], problem.measured.selected_on()))
+    judged = problem.measured.selected_on(problem.horizon)
+    return losses(problem.residual([part.effect for part in parts], judged))
 
 
 def _pays(
@@ -147,13 +158,15 @@ def _pays(
     return matters(none, present, proposed, rules.min_share)
 
 
-def _beyond_noise(candidate: _Candidate, measured: Measured, rng: np.random.Generator, settings: LoopSettings) -> bool:
+def _beyond_noise(
+    candidate: _Candidate, measured: Measured, horizon: int, rng: np.random.Generator, settings: LoopSettings
+) -> bool:
     """Whether the force explains more than one found in data with sensor noise as the only difference."""
     sensor_std = sensor_noise(candidate.base, measured)
     if sensor_std is None:
         return True
-    data = stand_in(candidate.base, measured, sensor_std, rng)
-    by_chance = find_undeclared(candidate.base, data, settings=settings)
+    data = stand_in(candidate.base, measured, sensor_std, rng, horizon)
+    by_chance = find_undeclared(candidate.base, data, horizon, settings=settings)
     if by_chance is None:
         return True
     return _explained(candidate.force) > settings.undeclared.beyond_noise * _explained(by_chance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -28,7 +29,7 @@ class Undeclared:
     Args:
         effect: the force.
         ci95: 95 % interval (low, high) of each fitted parameter, in its unit.
-        error_before: (n), held-out one-step RMSE of each dimension without the force, in the dimension's unit.
+        error_before: (n), held-out RMSE of each dimension at the end of a window without the force, in its unit.
         error_after: (n), the same with the force.
         p_value: p-value of the decrease of the held-out loss.
     """
@@ -43,6 +44,7 @@ class Undeclared:
 def find_undeclared(
     simulation: Simulation,
     measured: Measured,
+    horizon: int = 1,
     *,
     progress: Callable[[str], object] | None = None,
     settings: LoopSettings = DEFAULTS,
@@ -57,6 +59,8 @@ def find_undeclared(
     Args:
         simulation: the simulator with all effects found so far.
         measured: the data.
+        horizon: control steps per window on which the force is fitted and judged. With noisy sensors, a weak force
+            shows only in long windows.
         progress: called after each round with a description of the force found so far.
         settings: thresholds and budgets.
 
@@ -66,19 +70,19 @@ def find_undeclared(
     problem = Problem.pose(simulation, measured, settings=settings.residual)
     if _nothing_to_explain(problem, measured.fitted(), settings):
         return None
-    regression = _Regression.of(problem, settings)
+    regression = _Regression.of(problem, horizon, settings)
     found = _grown(regression, progress or (lambda words: None))
     if found is None:
         return None
-    judged = measured.selected_on()
-    before, after = problem.residual((), judged), problem.residual(found.effects, judged)
+    objective, judged = regression.objective, measured.selected_on(horizon)
+    before, after = objective.residual((), judged), objective.residual(found.effects, judged)
     gain = losses(before) - losses(after)
-    p_one_step = p_value_of_losses(losses(before), losses(after), settings.significance)
-    p = max(p_one_step, _p_value_further(regression, (), found.effects, held_out=True))
+    p_of_windows = p_value_of_losses(losses(before), losses(after), settings.significance)
+    p = max(p_of_windows, _p_value_further(regression, (), found.effects, held_out=True))
     if p > settings.significance.level or gain.mean() < settings.undeclared.min_gain * losses(before).mean():
         return None
-    size = problem.scale_of(judged)
-    error_before, error_after = (np.sqrt(((size * residual)[:, 0] ** 2).mean(0)) for residual in (before, after))
+    size = objective.scale_of(judged)
+    error_before, error_after = (np.sqrt(((size * residual)[:, -1] ** 2).mean(0)) for residual in (before, after))
     return Undeclared(_force_of(found), found.ci95(0), error_before, error_after, p)
 
 
@@ -87,7 +91,8 @@ class _Regression:
     """The data of the regression, on the transitions that may be fitted.
 
     Args:
-        problem: one-step residuals of the simulation.
+        problem: one-step residuals of the simulation, for the regression.
+        objective: residuals for the fits and the judgement: one step, or long windows.
         further: residuals several steps ahead.
         starts: (W), the transitions.
         path: states and controls within each transition.
@@ -97,6 +102,7 @@ class _Regression:
     """
 
     problem: Problem
+    objective: Problem
     further: Problem
     starts: np.ndarray
     path: StepPath
@@ -105,16 +111,19 @@ class _Regression:
     settings: LoopSettings
 
     @classmethod
-    def of(cls, problem: Problem, settings: LoopSettings) -> _Regression:
+    def of(cls, problem: Problem, horizon: int, settings: LoopSettings) -> _Regression:
         simulation, measured, states = problem.simulation, problem.measured, problem.states
-        starts, steps = measured.fitted(), settings.undeclared.further_steps
+        starts, std = measured.fitted(), problem.sensor_std
+        pose = partial(Problem.pose, simulation, measured, sensor_std=std, settings=settings.residual)
+        objective = problem if horizon == 1 else pose(horizon)
         return cls(
             problem,
-            Problem.pose(simulation, measured, steps, sensor_std=problem.sensor_std, settings=settings.residual),
+            objective,
+            pose(settings.undeclared.further_steps),
             starts,
             step_path(simulation, measured, starts, states=states),
             force_response(simulation, measured, starts, states=states, settings=settings.regression),
-            losses(problem.residual((), starts)).mean(),
+            losses(objective.residual((), measured.fitted(horizon))).mean(),
             settings,
         )
 
@@ -185,12 +194,15 @@ def _force_of(fitted: Fit) -> ResidualForce:
 def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
     """The force fitted in the simulation; start times of steps are not fitted."""
     free = tuple(name for name in effect.parameters if not name.startswith("start"))
-    return fit(regression.problem, (effect,), (free,), regression.starts, settings=regression.settings.fit)
+    objective = regression.objective
+    starts = objective.measured.fitted(objective.horizon)
+    return fit(objective, (effect,), (free,), starts, settings=regression.settings.fit)
 
 
 def _pruned(regression: _Regression, best: Fit) -> Fit:
     """Removes the term that explains least, as long as the loss hardly increases."""
-    problem, starts = regression.problem, regression.starts
+    problem = regression.objective
+    starts = problem.measured.fitted(problem.horizon)
     while len(terms := _force_of(best).terms) > 1:
         rest = [ResidualForce(terms[:i] + terms[i + 1 :]) for i in range(len(terms))]
         alone = [losses(problem.residual((effect,), starts)).mean() for effect in rest]

@@ -47,9 +47,11 @@ def _refitted(
     """Some of the parts, fitted together, and their held-out losses, (W)."""
     free = [free_parameters(trace.entries[i]) if parts[i].declared else tuple(parts[i].ci95) for i in range(len(parts))]
     effects = [parts[i].effect for i in chosen]
-    result = fit(problem, effects, [free[i] for i in chosen], problem.measured.fitted(), settings=settings.fit)
+    result = fit(
+        problem, effects, [free[i] for i in chosen], problem.measured.fitted(problem.horizon), settings=settings.fit
+    )
     refitted = tuple(
         Part(effect, parts[i].declared, result.ci95(position), parts[i].alike)
         for position, (i, effect) in enumerate(zip(chosen, result.effects, strict=True))
     )
-    return refitted, losses(problem.residual(result.effects, problem.measured.selected_on()))
+    return refitted, losses(problem.residual(result.effects, problem.measured.selected_on(problem.horizon)))
