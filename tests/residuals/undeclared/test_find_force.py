@@ -57,3 +57,14 @@ def test_force_that_ceases_before_the_selection_data_is_not_kept():
     simulation = pendulum()
     burst = UnknownForce(0.2, lambda q, v, t: (t < 15.0) * np.sin(5.0 * q))
     assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None
+
+
+def test_a_weak_drift_shows_only_in_long_windows():
+    """One step ahead, the sensors' noise hides it."""
+    drift = UnknownForce(0.03, lambda q, v, t: t / 40.0 + 0.0 * q)
+    simulation = pendulum()
+    measured = recorded(simulation.with_effects(drift), 2000, noise=0.02)
+    assert find_undeclared(simulation, measured) is None
+    found = find_undeclared(simulation, measured, 25)
+    assert found is not None
+    assert [term.split(": ")[1].split(" · ")[1] for term in found.effect.terms] == ["t"]
