@@ -17,9 +17,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_h2o.comparison.results_file import IDENTITY, identity
-from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
-from torchrl_h2o.training.environments import as_observed, make_reality, preprocessing_of, sim_capacity_of, task_of
+from torchrl_h2o.training.environments import make_reality, make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import SEED
 from torchrl_h2o.training.run_folder import checkpoint_folder, load_config
@@ -79,14 +78,7 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     """Read pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
-    real = as_observed(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds")))
-    replay = HybridReplayBuffer(
-        real,
-        sim_capacity=sim_capacity_of(cfg, len(real)),
-        batch_size=cfg.batch_size,
-        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
-        gamma=cfg.gamma,
-    )
+    replay = make_replay(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds")))
     title = METHODS[cfg.method].title
     latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
     Checkpoint(replay=replay).load(cast(Path, latest))  # a run with a summary has one

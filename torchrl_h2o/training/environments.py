@@ -1,4 +1,4 @@
-"""Environments and preprocessing of a run, built from its complete configuration."""
+"""Environments, preprocessing and replay buffer of a run, built from its complete configuration."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.task import Task
 
@@ -69,3 +70,19 @@ def sim_capacity_of(cfg: DictConfig, num_real: int) -> int:
 def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
     """Applies the run's preprocessing to the real transitions."""
     return preprocessing_of(cfg).apply(real)
+
+
+def make_replay(cfg: DictConfig, real: TensorDictBase) -> HybridReplayBuffer:
+    """Builds the replay buffer of a run.
+
+    Args:
+        cfg: the run's configuration.
+        real: the measured transitions, ``[T]``, in physical units; the buffer holds them with the run's preprocessing.
+    """
+    return HybridReplayBuffer(
+        as_observed(cfg, real),
+        sim_capacity=sim_capacity_of(cfg, len(real)),
+        batch_size=cfg.batch_size,
+        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
+        gamma=cfg.gamma,
+    )

@@ -20,7 +20,7 @@ from torchrl.data import TensorSpec
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
-from torchrl_h2o.training.environments import preprocessing_of, sim_capacity_of, task_of
+from torchrl_h2o.training.environments import make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
@@ -148,14 +148,7 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     Returns:
         The policy selected by ``keep``, and the training with its metrics.
     """
-    shown = preprocessing_of(cfg).apply(real)
-    replay = HybridReplayBuffer(
-        shown,
-        sim_capacity=sim_capacity_of(cfg, len(real)),
-        batch_size=cfg.batch_size,
-        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
-        gamma=cfg.gamma,
-    )
+    replay = make_replay(cfg, real)
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
     if learner.trains_discriminators:
