@@ -28,7 +28,7 @@ class LoopBar(tqdm):
     """
 
     def __init__(self, **options: Any) -> None:
-        form = "{desc}: {percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
+        form = "{desc}{percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
         super().__init__(total=sum(STAGES.values()), bar_format=form, **options)
         self._end = 0.0
 
