@@ -69,7 +69,8 @@ def _others_words(report: ReportContents) -> str:
     if not report.others:
         return ""
     more = len(report.others) - 1
-    further = f", or one of {more} other set{'s' * (more > 1)} of effects" if more else ""
+    sets = "one other set" if more == 1 else f"one of {more} other sets"
+    further = f", or {sets} of effects" if more else ""
     return f", or instead {_listed(report.others[0].words)}{further} (these data cannot tell them apart)"
 
 
