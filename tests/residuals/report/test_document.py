@@ -30,6 +30,7 @@ from torchrl_h2o.residuals.report.contents import (
     ErrorSummary,
     FoundEffect,
     IndistinguishableGroup,
+    OtherExplanation,
     RejectedEffect,
     TwoSample,
 )
@@ -80,6 +81,19 @@ def test_the_sentence_counts_what_else_it_could_be_where_naming_all_would_bury_i
     more = dataclasses.replace(group, words=(*group.words, "gravity × 1.1"))
     sentence = dataclasses.replace(report, indistinguishable=(more,)).sentence()
     assert "mass of bodies pole × 1.2 or one of 2 others (these data cannot tell them apart)" in sentence
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [
+        (1, ", or instead gravity × 0.5 (these data"),
+        (2, ", or instead gravity × 0.5, or one other set of effects (these data"),
+        (3, ", or instead gravity × 0.5, or one of 2 other sets of effects (these data"),
+    ],
+)
+def test_the_sentence_names_one_other_set_and_counts_the_rest(count, words):
+    other = OtherExplanation((Gravity(0.5),), 0.1, "motion")
+    assert words in dataclasses.replace(full_report(), others=(other,) * count).sentence()
 
 
 def test_a_report_without_effects_says_whether_nothing_is_missing_or_nothing_can_be_said():
