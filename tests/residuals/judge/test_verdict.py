@@ -3,7 +3,15 @@
 import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.effects import ActionNoise, Gravity, JointDamping, JointFrictionLoss, ObservationDelay
+from torchrl_h2o.effects import (
+    ActionGain,
+    ActionNoise,
+    ActionSaturation,
+    Gravity,
+    JointDamping,
+    JointFrictionLoss,
+    ObservationDelay,
+)
 from torchrl_h2o.residuals.judge.held_out_error import error_summary
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
@@ -76,6 +84,12 @@ def test_a_value_beyond_belief_is_not_recommended():
 def test_a_value_at_a_bound_is_named(delay, named):
     reasons = verdict((), (ObservationDelay(delay),), rows=600).reasons
     assert any("at the end of what was allowed" in reason for reason in reasons) == named
+
+
+@pytest.mark.parametrize("effect", [ActionSaturation(0.6), ActionGain(-1.0), ActionGain(0.1), JointFrictionLoss(0.1)])
+def test_a_value_that_a_real_machine_may_have_is_not_called_implausible(effect):
+    """A saturation has no finite neutral value; a motor that is connected the wrong way round has a gain of -1."""
+    assert verdict((effect,), (effect,), rows=600).reasons == ()
 
 
 def test_an_unknown_kind_is_refused():

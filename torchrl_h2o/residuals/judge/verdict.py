@@ -164,8 +164,8 @@ def _lowers_the_error(
 def _why_implausible(effect: Effect, rules: VerdictSettings) -> str:
     """Why a value is implausible: a factor far from one, or a fit that ended at a bound; empty if it is plausible."""
     for parameter in effect.parameters.values():
-        if parameter.neutral == 1.0:  # a factor on a property of the model
-            if not 1.0 / rules.extreme_factor < parameter.value < rules.extreme_factor:
+        if parameter.neutral == 1.0:  # a factor; a reversed sensor or motor has -1
+            if not 1.0 / rules.extreme_factor < abs(parameter.value) < rules.extreme_factor:
                 return "implausibly far from the model's value"
         elif any(_reached(bound, parameter.value, parameter.neutral) for bound in parameter.bounds):
             return "at the end of what was allowed"
@@ -174,7 +174,8 @@ def _why_implausible(effect: Effect, rules: VerdictSettings) -> str:
 
 def _reached(bound: float, value: float, neutral: float) -> bool:
     """Whether a fitted value lies at a bound; a bound at the neutral value means that there is no effect."""
-    return bool(np.isfinite(bound) and bound != neutral and abs(value - bound) <= 1e-3 * abs(bound - neutral))
+    tolerance = 1e-3 * abs(bound - neutral) if np.isfinite(neutral) else 0.0
+    return bool(np.isfinite(bound) and bound != neutral and abs(value - bound) <= tolerance)
 
 
 def where_most(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> str:
