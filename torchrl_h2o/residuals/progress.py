@@ -6,8 +6,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-# Stages in their order, with their usual shares of the time in per cent: medians of runs on HalfCheetah, on a robot and
-# on a double pendulum. A run in which nothing is missing, or in which the effects explain the data exactly, is shorter.
+# Stages in their order, with their usual shares of the time in per cent, rounded from four runs on HalfCheetah and on a
+# double pendulum. A run in which nothing is missing, or in which the effects explain the data exactly, is shorter.
 EFFECTS, OTHERS = "looking for effects", "looking for other explanations"
 FORCES, NOISE, REPORT = "looking for undeclared forces", "looking for action noise", "reporting"
 STAGES = {EFFECTS: 35.0, OTHERS: 30.0, FORCES: 20.0, NOISE: 5.0, REPORT: 10.0}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.residuals.trace.fit import Fit
-from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -27,26 +27,19 @@ def without_noise(state: SearchState) -> SearchState:
     if state.exact or not state.entries or state.problem.sensor_std is None:
         return state
     rules = state.settings.trace
-    silent = state.rescaled(_silent(state, state.fit))
+    no_noise = np.zeros(state.problem.measured.observation.shape[1])
+    silent = state.rescaled(state.posed_at(state.fit.effects, sensor_std=no_noise))
     free = [free_parameters(entry) for entry in state.entries]
     fitted = silent.sketched(state.fit.effects, free, rules.sketch_evaluations)
     if fitted.loss > rules.noise_free_loss * _loss(silent, state.fit):
         return state
     for _ in range(rules.noise_free_fits):
         silent = silent.with_found(state.entries, silent.refitted(state.entries, fitted.effects))
-        fitted, problem = silent.fit, _silent(state, silent.fit)
-        silent = silent.rescaled(problem)
-        if problem.within_rounding:
+        fitted, posed = silent.fit, state.posed_at(silent.fit.effects, sensor_std=no_noise)
+        silent = silent.rescaled(posed)
+        if posed.within_rounding:
             return replace(silent, exact=True)
     return state
-
-
-def _silent(state: SearchState, fitted: Fit) -> Problem:
-    """The problem with fitted effects put in, and without sensor noise."""
-    base = state.problem
-    no_noise = np.zeros(base.measured.observation.shape[1])
-    mended = base.simulation.with_effects(*fitted.effects)
-    return Problem.pose(mended, base.measured, base.horizon, sensor_std=no_noise, settings=base.settings)
 
 
 def _loss(state: SearchState, fitted: Fit) -> float:

@@ -130,13 +130,18 @@ class SearchState:
         """p-value of a decrease of losses on the selection windows, (W) each."""
         return p_value_of_losses(before, after, self.settings.significance)
 
-    def posed_at(self, effects: Sequence[Effect]) -> Problem:
-        """The problem of the simulation with effects put in: start states and scales of the residuals anew."""
-        if not effects:
+    def posed_at(self, effects: Sequence[Effect], *, sensor_std: np.ndarray | None = None) -> Problem:
+        """The problem of the simulation with effects put in: start states and scales of the residuals anew.
+
+        Args:
+            effects: the effects to put in.
+            sensor_std: (n), standard deviation of the readings' noise; estimated from the data by default.
+        """
+        if not effects and sensor_std is None:
             return self.first
         base = self.problem
         mended = base.simulation.with_effects(*effects)
-        return Problem.pose(mended, base.measured, base.horizon, settings=base.settings)
+        return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std, settings=base.settings)
 
     def rescaled(self, posed: Problem) -> SearchState:
         """The state with the start states and scales of a problem posed with effects put in."""
