@@ -19,7 +19,7 @@ from torchrl_h2o.effects import (
     ObservationDelay,
     ObservationGain,
 )
-from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.envs import DynamicsGap, physics
 from torchrl_h2o.residuals import Simulation
 from torchrl_h2o.residuals.simulation.settings import SimulationSettings
 
@@ -57,6 +57,27 @@ def test_a_rollout_in_chunks_is_the_rollout_at_once(effects):
     at_once = simulation.rollout(states, actions, time=time, applied=applied)
     in_chunks = replace(simulation, settings=SimulationSettings(rollout_numbers=100))
     np.testing.assert_array_equal(in_chunks.rollout(states, actions, time=time, applied=applied), at_once)
+
+
+@pytest.mark.parametrize("effects", [(), (PULL,)], ids=["free", "forced"])
+def test_a_small_rollout_uses_no_threads_and_gives_the_same_states(effects, monkeypatch):
+    simulation = pendulum().with_effects(*effects)
+    states, actions, time = drawn()
+    alone = simulation.rollout(states, actions, time=time)
+    monkeypatch.setattr(physics, "_ALONE", None)
+    with pytest.raises(AttributeError):
+        simulation.rollout(states, actions, time=time)
+    monkeypatch.setattr(physics, "_FEW", 0)
+    np.testing.assert_array_equal(simulation.rollout(states, actions, time=time), alone)
+
+
+def test_simulations_are_equal_if_source_and_effects_are():
+    simulation = pendulum()
+    assert simulation.with_effects(Gravity(2.0)) == simulation.with_effects(Gravity(2.0))
+    assert hash(simulation.with_effects(Gravity(2.0))) == hash(simulation.with_effects(Gravity(2.0)))
+    assert simulation.with_effects(Gravity(2.0)) != simulation.with_effects(Gravity(2.1))
+    assert simulation != pendulum()
+    assert simulation != replace(simulation, frame_skip=2 * simulation.frame_skip)
 
 
 def test_a_rollout_of_no_states_is_empty():

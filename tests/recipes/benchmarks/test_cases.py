@@ -34,6 +34,7 @@ from torchrl_h2o.effects import (
     Gravity,
     JointSpring,
     ObservationNoise,
+    ResidualForce,
 )
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
 from torchrl_h2o.residuals import Measured, Simulation, residuals
@@ -291,6 +292,24 @@ def test_a_case_that_fails_is_a_row_and_the_others_go_on(tmp_path):
     printed = table(choose_families(["decoy"]), rows)
     assert "1 of 2" in printed
     assert "4 of 4" in printed
+
+
+def test_slow_effects_pass_by_their_friction_or_by_a_torque_in_time():
+    viscous, drift = (draw_case(FAMILIES, "slow", number, SEED) for number in (0, 1))
+    assert viscous.judge(report(*viscous.truth), viscous)["ok"]
+    assert not viscous.judge(report(JointSpring(0.1, joints="pivot")), viscous)["ok"]
+    grows = ResidualForce(("torque on pivot: 0.01 · t",))
+    pulls = ResidualForce(("torque on pivot: 0.01 · sin(7 q)",))
+    assert drift.judge(report(grows), drift)["ok"]
+    assert not drift.judge(report(pulls), drift)["ok"]
+    assert not drift.judge(report(grows, *viscous.truth), drift)["ok"]
+
+
+def test_a_family_draws_the_same_cases_beside_others():
+    alone = draw_case(choose_families(["slow"]), "slow", 2, SEED)
+    assert draw_case(choose_families(["nothing", "slow"]), "slow", 2, SEED).truth == alone.truth
+    streams = [family.stream for family in FAMILIES.values()]
+    assert len(set(streams)) == len(streams)
 
 
 @pytest.mark.usefixtures("short")

@@ -11,7 +11,9 @@ from tensordict import TensorDict
 
 from tests.residuals.pendulum import pendulum
 from torchrl_h2o.data import DataError
+from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals import Measured, Split
+from torchrl_h2o.residuals.measured.transitions import REMEMBERED
 
 SIMULATION = pendulum()
 
@@ -152,3 +154,28 @@ def test_a_width_that_the_simulator_does_not_have_is_refused(width, actions, col
         DataError, match=rf"{column}.*the data have {max(width, actions) if column == 'action' else width}"
     ):
         of(ted(width=width, actions=actions), source="swing.csv")
+
+
+def test_a_result_is_computed_once_for_equal_simulations_and_anew_for_others():
+    measured, calls = of(ted()), []
+
+    def count():
+        calls.append(1)
+        return len(calls)
+
+    heavy = SIMULATION.with_effects(Gravity(2.0))
+    assert measured.remembered("mass", heavy, count) == 1
+    assert measured.remembered("mass", SIMULATION.with_effects(Gravity(2.0)), count) == 1
+    assert measured.remembered("mass", SIMULATION, count) == 2
+    assert measured.remembered("noise", heavy, count) == 3
+    assert measured.part(slice(0, 100)).remembered("mass", heavy, count) == 4
+
+
+def test_only_the_latest_results_are_kept():
+    measured, calls = of(ted()), []
+    for number in range(REMEMBERED + 1):
+        measured.remembered(str(number), SIMULATION, lambda: calls.append(1))
+    measured.remembered(str(REMEMBERED), SIMULATION, lambda: calls.append(1))
+    assert len(calls) == REMEMBERED + 1
+    measured.remembered("0", SIMULATION, lambda: calls.append(1))
+    assert len(calls) == REMEMBERED + 2
