@@ -31,9 +31,9 @@ def test_both_rates_of_the_logs_fit_the_timestep():
     assert Simulation.from_mjcf(PENDULUM, COLUMNS, 0.0033338).frame_skip == 2
 
 
-def test_columns_keep_their_own_names_and_get_the_coordinates_units():
+def test_a_mapped_column_has_the_names_of_coordinate_and_column_and_its_unit():
     simulation = Simulation.from_mjcf(PENDULUM, {"velocity": "hinge_velocity", "position": "hinge"}, 0.005)
-    assert simulation.state_map.names == ("velocity", "position")
+    assert simulation.state_map.names == ("hinge_velocity (velocity)", "hinge (position)")
     assert simulation.state_map.units == ("rad/s", "rad")
     np.testing.assert_array_equal(simulation.state_map.states(np.array([3.0, 0.5])), [0.5, 3.0])
 

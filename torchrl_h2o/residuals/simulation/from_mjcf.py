@@ -62,7 +62,10 @@ def _compiled(path: Path, spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
 
 
 def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjModel, path: Path) -> StateMap:
-    """Builds the map of the observed coordinates; unobserved ones keep the value of the model's initial pose."""
+    """Builds the map of the observed coordinates; unobserved ones keep the value of the model's initial pose.
+
+    A column with a name of its own is called by both names, such as ``elbow (pos_meas2)``, in reports and findings.
+    """
     columns = list(coordinates)
     chosen = [coordinates[column] for column in columns] if isinstance(coordinates, Mapping) else columns
     names, units = coordinate_names(model)
@@ -77,7 +80,8 @@ def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjMode
     if twice:
         raise ValueError(f"{', '.join(sorted(twice))} is named twice; name each coordinate once")
     indices = [names.index(coordinate) for coordinate in chosen]
-    found = StateMap.of_coordinates(columns, [units[i] for i in indices], indices, len(names))
+    both = [name if name == column else f"{name} ({column})" for name, column in zip(chosen, columns, strict=True)]
+    found = StateMap.of_coordinates(both, [units[i] for i in indices], indices, len(names))
     found.offset[: model.nq] = model.qpos0
     found.offset[indices] = 0.0
     return found
