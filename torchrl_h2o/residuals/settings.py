@@ -343,7 +343,7 @@ class VerdictSettings:
     """Median error far ahead, in multiples of the median error by sensor noise, above which something is missing."""
     far_negligible: float = 0.01
     """Median error far ahead, in spreads, that is negligible without sensor noise."""
-    small_rest: float = 0.1
+    small_rest: float = 0.02
     """Share of the error ahead below which the remaining error is not reported as a missing effect."""
     level: float = 0.01
     """Significance level of the decrease of the error on the report's data."""

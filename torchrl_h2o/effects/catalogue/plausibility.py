@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 
+import mujoco
+
 from torchrl_h2o.effects.action.signal import ActionBias
 from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.effect import Effect
+from torchrl_h2o.effects.model.body import BodyCentreOfMass, Payload
 from torchrl_h2o.effects.model.contact import RollingResistance
 from torchrl_h2o.effects.model.gravity import Gravity
 from torchrl_h2o.effects.model.joint import Armature, JointDamping, JointFrictionLoss
@@ -54,3 +57,23 @@ def surprise(effect: Effect, settings: EffectSettings = EFFECT_SETTINGS) -> int:
             far = isinstance(effect, USUAL[:4]) and parameter.value < 0.0
         rank += far
     return rank
+
+
+def is_outside(effect: Effect, model: mujoco.MjModel) -> bool:
+    """Whether an effect places a mass further away than the model is large, as a fit of an inertia may do.
+
+    Args:
+        effect: the effect at its fitted value.
+        model: the model, for its size.
+
+    Examples:
+        >>> import mujoco
+        >>> from torchrl_h2o.effects import Payload
+        >>> ball = "<mujoco><worldbody><body><freejoint/><geom size='0.2'/></body></worldbody></mujoco>"
+        >>> model = mujoco.MjModel.from_xml_string(ball)
+        >>> is_outside(Payload(1.0, z=0.1), model), is_outside(Payload(0.001, z=5.0), model)
+        (False, True)
+    """
+    if not isinstance(effect, BodyCentreOfMass | Payload):
+        return False
+    return math.hypot(effect.x, effect.y, effect.z) > model.stat.extent

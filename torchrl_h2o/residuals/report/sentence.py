@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import takewhile
 
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED_IN_PART,
@@ -16,6 +17,7 @@ from torchrl_h2o.residuals.report.contents import (
 )
 from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
 
+MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together
 NOT_IN_CATALOGUE = "Something is missing that this catalogue does not explain"
 
 
@@ -61,7 +63,38 @@ def _joined(*parts: str) -> str:
 def _found_words(report: ReportContents) -> list[str]:
     """Each effect found, with the alternatives that the data cannot rule out."""
     others = {effect_name(group.effects[0]): group.words[1:] for group in report.indistinguishable}
-    return [_one_of(found, others.get(found.name, ())) for found in report.found]
+    alone: dict[type, list[str]] = {}  # effects without alternatives; those of one kind are named together
+    for found in report.found:
+        if not others.get(found.name):
+            alone.setdefault(type(found.effect), []).append(found.words)
+    words = []
+    for found in report.found:
+        if others.get(found.name):
+            words.append(_one_of(found, others[found.name]))
+        elif alike := alone.pop(type(found.effect), None):
+            words += together(alike)
+    return words
+
+
+def together(words: Sequence[str]) -> list[str]:
+    """Effects of one kind in one phrase, if their words begin alike.
+
+    Examples:
+        >>> together(["dry friction of joints hip + 0.27 N·m", "dry friction of joints knee + 0.88 N·m"])
+        ['dry friction of joints hip + 0.27 and knee + 0.88 N·m']
+    """
+    split = [phrase.split() for phrase in words]
+    first = _num_alike(split)
+    last = _num_alike([phrase[:first:-1] for phrase in split])
+    if len(words) < 2 or first < MIN_WORDS_ALIKE:
+        return list(words)
+    middle = [" ".join(phrase[first : len(phrase) - last]) for phrase in split]
+    return [" ".join([*split[0][:first], _listed(middle), *split[0][len(split[0]) - last :]])]
+
+
+def _num_alike(phrases: Sequence[Sequence[str]]) -> int:
+    """Number of words with which all phrases begin."""
+    return len(list(takewhile(lambda column: len(set(column)) == 1, zip(*phrases, strict=False))))
 
 
 def _others_words(report: ReportContents) -> str:

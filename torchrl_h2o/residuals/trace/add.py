@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.residuals.measured.sensor_noise import stand_in
-from torchrl_h2o.residuals.trace.fit import Fit, fit
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.outcome import Attempt
-from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
+from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible, promising_sets
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -65,7 +65,8 @@ def best_addition(state: SearchState, leads: Sequence[Lead], rng: np.random.Gene
     if best is present:
         return state
     explained = 1.0 - best.losses.mean() / before.mean()
-    by_noise = _explained_by_noise(state, best, rng)
+    free = [*(() for _ in effects), *(free_parameters(entry) for entry in best.entries[-best.added :])]
+    by_noise = explained_by_noise(state, (*effects, *best.fit.effects[-best.added :]), free, rng)
     return state.with_found(best.entries, best.fit) if explained > rules.beyond_noise * by_noise else state
 
 
@@ -127,19 +128,3 @@ def _pays(state: SearchState, best: _Candidate, candidate: _Candidate) -> bool:
         and state.p_value(best.losses, candidate.losses) < level
         and matters(state.first_loss, best.first_loss, candidate.first_loss, share)
     )
-
-
-def _explained_by_noise(state: SearchState, best: _Candidate, rng: np.random.Generator) -> float:
-    """Share of the loss that the added entries explain in data with sensor noise as the only difference."""
-    problem = state.problem
-    if problem.sensor_std is None:
-        return 0.0
-    mended = problem.simulation.with_effects(*state.fit.effects)
-    data = stand_in(mended, problem.measured, problem.sensor_std, rng, problem.horizon, problem.states)
-    posed = Problem.pose(mended, data, problem.horizon, sensor_std=problem.sensor_std, settings=problem.settings)
-    # the fit starts from the values found in the data, because noise alone may have a minimum near them
-    free = [free_parameters(entry) for entry in best.entries[-best.added :]]
-    effects = best.fit.effects[-best.added :]
-    refitted = fit(posed, effects, free, state.windows.fitted, settings=state.settings.fit)
-    before = losses(posed.residual((), state.windows.selected_on)).mean()
-    return 1.0 - float(losses(posed.residual(refitted.effects, state.windows.selected_on)).mean() / before)

@@ -6,8 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.per_joint import elements
 from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -52,9 +55,22 @@ def _rivals(state: SearchState, index: int) -> list[Lead]:
     leads = state.rivals[own]
     names = {entry.name for entry in state.entries}
     promise = next(lead.promise for lead in leads if lead.entry.name == own)
-    others = [lead for lead in leads if lead.entry.name not in names]
+    others = [lead for lead in leads if lead.entry.name not in names and not _repeats(state, index, lead.entry)]
     nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[: rules.nearest_rivals]
     return list({lead.entry.name: lead for lead in (*nearest, *others[: rules.top_rivals])}.values())
+
+
+def _repeats(state: SearchState, index: int, entry: CatalogueEntry) -> bool:
+    """Whether an entry says the same as the effects found in other words.
+
+    With friction of the hip and of the knee, friction of both in the place of the knee's is no other explanation.
+    """
+    simulation, own = state.problem.simulation, state.entries[index]
+    others = [other for i, other in enumerate(state.entries) if i != index and type(other.effect) is type(entry.effect)]
+    acted_on, wider = set(elements(own.effect, simulation)), set(elements(entry.effect, simulation))
+    return type(own.effect) is type(entry.effect) and any(
+        wider > acted_on and not wider.isdisjoint(elements(other.effect, simulation)) for other in others
+    )
 
 
 def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
@@ -97,6 +113,8 @@ def _attempt(state: SearchState, index: int, rival: tuple[Lead, Fit], with_it: n
 
 def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explained: float) -> bool:
     """Whether an attempt misses a negligible share of the effect's gain, or a small and insignificant one."""
+    if is_outside(attempt.effect, state.problem.simulation.model):
+        return False
     rules, worse = state.settings.trace, (attempt.loss - with_it) / explained
     significant = attempt.p_value <= state.settings.significance.level
     return bool(worse < rules.same_loss or (worse < rules.alike_loss and not significant))

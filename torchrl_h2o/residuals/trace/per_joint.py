@@ -5,27 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from torchrl_h2o.effects import CatalogueEntry, Effect, selection
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
-def divide_by_element(state: SearchState) -> SearchState:
-    """Replaces each effect on several joints or motors by one effect each, where that lowers the loss significantly.
+def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchState:
+    """Replaces effects on several joints or motors by one effect each, where that lowers the loss significantly.
 
-    One value for all is the simpler explanation and is found first; a hip and a knee may still differ.
+    One value for all is the simpler explanation and is found first; a hip and a knee may still differ. The division
+    that lowers the loss most comes first, because a wrong value of one effect may be made up by another's division.
 
     Args:
         state: effects found.
+        rng: generator of synthetic noise.
 
     Returns:
         The state with the divided effects; unchanged where one value for all explains the data as well.
     """
-    for entry in state.entries:
-        state = _divided(state, entry)
-    return state
+    while True:
+        divisions = [divided for entry in state.entries if (divided := _divided(state, entry)) is not None]
+        divisions.sort(key=lambda divided: float(divided.selection_losses(divided.fit.effects).mean()))
+        state, before = next((divided for divided in divisions if _pays(state, divided, rng)), state), state
+        if state is before:
+            return state
 
 
 def entries_of_elements(
@@ -56,30 +64,33 @@ def elements(effect: Effect, simulation: Simulation) -> tuple[str | int, ...]:
     return ()
 
 
-def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState:
-    rules, present = state.settings.trace, state.fit.effects
-    index = state.entries.index(entry)
+def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:
+    """The state with one effect for each of an entry's elements, fitted; None if that is not possible."""
+    present, index = state.fit.effects, state.entries.index(entry)
     singles = entries_of_elements(entry, state.catalogue, state.problem.simulation)
     if not singles or {single.name for single in singles} & {other.name for other in state.entries}:
-        return state
+        return None
     values = {name: getattr(present[index], name) for name in free_parameters(entry)}
     starts = tuple(single.effect.with_parameters(values) for single in singles)
     effects = (*present[:index], *starts, *present[index + 1 :])
     if not is_possible(state.problem, effects):
-        return state
+        return None
     entries = (*state.entries[:index], *singles, *state.entries[index + 1 :])
-    before = state.selection_losses(present)
-    fitted = state.refitted(entries, effects)
-    after = state.selection_losses(fitted.effects)
-    least = rules.min_gain if state.problem.sensor_std is None else rules.min_gain_under_noise
-    pays = after.mean() < (1.0 - least) * before.mean() and matters(
-        state.first_loss,
-        state.first.selection_loss(present),
-        state.first.selection_loss(fitted.effects),
-        (len(singles) - 1) * rules.min_share,
-    )
-    if not (pays and state.p_value(before, after) < state.settings.significance.level):
-        return state
     rivals = {**state.rivals, **{single.name: state.rivals[entry.name] for single in singles}}
-    groups = (*state.groups[:index], *(() for _ in singles), *state.groups[index + 1 :])
-    return replace(state, entries=entries, fit=fitted, rivals=rivals, groups=groups)
+    return replace(state, entries=entries, fit=state.refitted(entries, effects), rivals=rivals, groups=())
+
+
+def _pays(state: SearchState, divided: SearchState, rng: np.random.Generator) -> bool:
+    """Whether a division lowers the loss significantly, and by more than rounding or noise would make it."""
+    rules, noisy = state.settings.trace, state.problem.sensor_std is not None
+    before, after = (which.selection_losses(which.fit.effects) for which in (state, divided))
+    gain = 1.0 - after.mean() / before.mean()
+    least = rules.min_gain_under_noise if noisy else rules.min_gain
+    if gain <= least or state.p_value(before, after) >= state.settings.significance.level:
+        return False
+    if noisy:  # the whole reduction of the loss also contains that of the noise, so a share of it says little
+        free = [free_parameters(entry) for entry in divided.entries]
+        return gain > rules.beyond_noise * explained_by_noise(state, divided.fit.effects, free, rng)
+    one, each = (state.first.selection_loss(which.fit.effects) for which in (state, divided))
+    added = len(divided.entries) - len(state.entries)
+    return matters(state.first_loss, one, each, added * rules.min_share)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.effects.catalogue.plausibility import surprise
+from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible, promising_sets, screen
@@ -60,7 +60,12 @@ def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet
 
 
 def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:
-    """Sets of one to three effects whose loss is not significantly higher than that of the effects found."""
+    """Sets of one to three effects whose loss is not significantly higher than that of the effects found.
+
+    Residuals are scaled by their size without effects, which favours no set. There, the noise of one quantity may hide
+    a difference in another. A set is therefore also ruled out if it is worse both with residuals scaled by what the
+    effects found leave and with residuals scaled by what the set itself leaves.
+    """
     rules = state.settings.trace
     state = state.rescaled(state.posed_at(()))
     with_it, without = (state.selection_losses(effects) for effects in (state.fit.effects, ()))
@@ -72,9 +77,26 @@ def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:
         fitted = state.refitted(entries, sketch.effects)
         after = state.selection_losses(fitted.effects)
         close = (after.mean() - with_it.mean()) / explained < rules.alike_loss
-        if close and state.p_value(after, with_it) > state.settings.significance.level:
+        alike = close and state.p_value(after, with_it) > state.settings.significance.level
+        if alike and not _is_ruled_out(state, fitted) and not _places_mass_outside(state, fitted):
             found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
     return tuple(found)
+
+
+def _is_ruled_out(state: SearchState, rival: Fit) -> bool:
+    """Whether a set is worse than the effects found where either of them scales the residuals."""
+    return all(_is_worse(state.rescaled(state.posed_at(of.effects)), rival) for of in (state.fit, rival))
+
+
+def _is_worse(state: SearchState, rival: Fit) -> bool:
+    """Whether a set's loss is significantly, and by more than a small share, higher than that of the effects found."""
+    own, other = (state.selection_losses(which.effects) for which in (state.fit, rival))
+    far = other.mean() > (1.0 + state.settings.trace.alike_loss) * own.mean()
+    return bool(far and state.p_value(other, own) < state.settings.significance.level)
+
+
+def _places_mass_outside(state: SearchState, fitted: Fit) -> bool:
+    return any(is_outside(effect, state.problem.simulation.model) for effect in fitted.effects)
 
 
 def _sketched_sets(state: SearchState) -> list[tuple[list[CatalogueEntry], Fit]]:

@@ -58,20 +58,27 @@ def trace_effects(
     state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
     for _ in range(settings.trace.rounds):
         before, state = state, grow(state, rng, progress, lambda grown: found(_outcome(grown)))
-        if state.entries == before.entries:
+        if state.entries == before.entries and len(state.groups) == len(state.entries):
             break
         progress.stage(OTHERS)
         grown, state = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
-        # a further round helps only where a simpler effect has replaced one with many parameters
-        if state.exact or state.entries == grown.entries:
+        if state.exact:
             break
-    state, others = with_most_usual_set(divide_by_element(state))
+        state = divide_by_element(_rescaled(state), rng)
+        # a further round helps only where effects have been replaced, by simpler ones or by one for each joint
+        if state.entries == grown.entries:
+            break
+    state, others = with_most_usual_set(state)
     return replace(_outcome(_fitted_to_all(state)), others=others)
+
+
+def _rescaled(state: SearchState) -> SearchState:
+    return state.rescaled(state.posed_at(state.fit.effects))
 
 
 def _fitted_to_all(state: SearchState) -> SearchState:
     """The effects found, fitted to all windows with residuals scaled by their present size."""
-    rescaled = state.rescaled(state.posed_at(state.fit.effects))
+    rescaled = _rescaled(state)
     return rescaled.with_found(state.entries, rescaled.refitted(state.entries, state.fit.effects, state.windows.all))
 
 
