@@ -263,9 +263,9 @@ class MixedBellmanLoss(HybridLoss):
         if value_network is not None:
             value = self._next_value(value_network, next_states)
             next_value = self.mixing * value + (1 - self.mixing) * next_value
-        reward = self._one_per_row(self._entry(next_states, keys.reward), next_value, keys.reward)
-        terminated = require_boolean(self._entry(next_states, keys.terminated), keys.terminated, type(self).__name__)
-        terminated = self._one_per_row(terminated, next_value, keys.terminated)
+        reward = self._one_per_row(self._entry(next_states, keys.reward), next_value, ("next", keys.reward))
+        terminated, key = self._entry(next_states, keys.terminated), ("next", keys.terminated)
+        terminated = self._one_per_row(require_boolean(terminated, key, type(self).__name__), next_value, key)
         steps, discount = tensordict.get(keys.steps_to_next_obs, None), self.gamma
         if steps is not None:
             discount = self.gamma ** self._one_per_row(steps, next_value, keys.steps_to_next_obs)
