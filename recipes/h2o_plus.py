@@ -148,6 +148,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
             batch = replay.sample(cfg.batch_size)
             pairs = pairs_replay.sample(cfg.discriminator_batch_size)
             losses = loss_fn(batch, pairs)
+            training.check(losses)  # a loss that is not finite ends the run, and the last checkpoint stays
             optimiser.zero_grad()
             total_loss(losses).backward()
             optimiser.step()

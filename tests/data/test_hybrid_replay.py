@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from tests.data.recordings import assert_same, make_recording
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.data.hybrid_replay import TRANSITION_KEYS
+from torchrl_h2o.data.transition_checks import UnstableSimulatorError
 
 
 def stream(steps, offset=0.0, seed=0):
@@ -236,3 +237,50 @@ def test_mapped_real_data_are_not_copied(tmp_path):
     buffer = HybridReplayBuffer(real, 10)
     assert buffer.real[:]["observation"].data_ptr() == real["observation"].data_ptr()
     assert buffer.sample((4, 0))["observation"].shape == (4, 3)
+
+
+NUMBERS = ("observation", "action", ("next", "observation"), ("next", "reward"))
+with_steps = pytest.mark.parametrize("n_steps", [1, 3])
+
+
+def pattern(key):
+    return repr(key).replace("(", r"\(").replace(")", r"\)")
+
+
+@with_steps
+@pytest.mark.parametrize("key", NUMBERS, ids=str)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300])
+def test_simulated_numbers_that_are_not_finite_are_refused_and_no_row_is_kept(key, value, n_steps):
+    torch.manual_seed(0)
+    buffer, untouched = make_buffer(n_steps=n_steps), make_buffer(n_steps=n_steps)
+    rows = stream(12, offset=2000)
+    rows[key] = rows[key].double()
+    rows[key][6:8] = value
+    said = rf"the simulator produced a {pattern(key)} that is NaN or infinite in 2 of 12 rows, and no row was added"
+    with pytest.raises(UnstableSimulatorError, match=said):
+        buffer.extend(rows)
+    for one in (buffer, untouched):
+        one.extend(stream(5, offset=1030))
+    state, expected = buffer.state_dict(), untouched.state_dict()
+    for kept in ("rows", "waiting"):
+        torch.testing.assert_close(state[kept], expected[kept], rtol=0, atol=0)
+
+
+@with_steps
+@pytest.mark.parametrize("key", NUMBERS, ids=str)
+def test_real_numbers_that_are_not_finite_are_refused(key, n_steps):
+    real = stream(20)
+    real[key][4:7] = float("nan")
+    with pytest.raises(ValueError, match=f"{pattern(key)} of the real data is NaN or infinite in"):
+        HybridReplayBuffer(real, 10, n_steps=n_steps)
+
+
+@pytest.mark.parametrize("key", [("next", "terminated"), ("next", "done")], ids=str)
+@pytest.mark.parametrize("value", [0.5, float("nan"), 1.0])
+def test_flags_that_are_not_boolean_are_refused(key, value):
+    buffer, rows = make_buffer(sim=0), stream(12)
+    rows[key] = torch.full((12, 1), value)
+    with pytest.raises(ValueError, match=rf"{pattern(key)} of the simulated data is torch.float32, .*\.bool\(\)"):
+        buffer.extend(rows)
+    with pytest.raises(ValueError, match=rf"{pattern(key)} of the real data is torch.float32, .*\.bool\(\)"):
+        HybridReplayBuffer(rows, 10)

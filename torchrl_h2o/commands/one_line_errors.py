@@ -54,14 +54,15 @@ def asks_for_tracebacks() -> bool:
 def is_expected(error: Exception) -> bool:
     """Whether an error tells the user what to correct, rather than the developer.
 
-    These are Hydra's errors of the configuration, DataError, and ValueError and OSError if a ``raise`` statement of
-    this package or of its recipes raised them. A ValueError that NumPy raises is a bug.
+    These are Hydra's errors of the configuration, DataError, and ValueError, OSError and ArithmeticError (a training
+    that diverges) if a ``raise`` statement of this package or of its recipes raised them. A ValueError that NumPy
+    raises is a bug.
     """
     from torchrl_h2o.data import DataError
 
     if isinstance(error, HydraException | OmegaConfBaseException | DataError):
         return True
-    return isinstance(error, ValueError | OSError) and _is_raised_here(error)
+    return isinstance(error, ValueError | OSError | ArithmeticError) and _is_raised_here(error)
 
 
 def _is_raised_here(error: Exception) -> bool:

@@ -1,11 +1,13 @@
 """Trains one run of a comparison and appends its row to the results file."""
 
+import json
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from torchrl_h2o.comparison.results_file import append_run
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.job import run_job
 from torchrl_h2o.training.methods import method_named
 from torchrl_h2o.training.run_folder import claimed, open_run
@@ -17,8 +19,16 @@ def train_and_record(cfg: DictConfig, directory: Path) -> None:
     Args:
         cfg: the run's configuration; ``results`` is the CSV file, or None to append nothing.
         directory: the run's folder.
+
+    Raises:
+        DivergenceError: if the training diverges, or did so in an earlier attempt.
     """
-    if not (directory / "summary.json").exists():
+    summary = directory / "summary.json"
+    if summary.exists() and (failure := json.loads(summary.read_text()).get("failure")) is not None:
+        # the same settings and seed give the same numbers, so a grid does not train it again
+        message = f"{failure} in an earlier attempt, and the same settings repeat it; remove {directory} to try again"
+        raise DivergenceError(message, failure, 0)
+    if not summary.exists():
         run_job(cfg, directory, [method_named(name) for name in (cfg.method, *(cfg.get("baselines") or ()))])
     if cfg.results is not None:
         append_run(Path(cfg.results), cfg, directory)

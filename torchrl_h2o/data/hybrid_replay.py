@@ -28,6 +28,7 @@ from torchrl.data import (
 from torchrl_h2o.data.multi_step import STEPS, OngoingMultiStep, multi_step_keys, original_key
 from torchrl_h2o.data.readers.memory_map import load_memory_map
 from torchrl_h2o.data.readers.whole_folder import whole_folder
+from torchrl_h2o.data.transition_checks import require_usable_real, require_usable_simulated, select_entries
 
 TRANSITION_KEYS: tuple[NestedKey, ...] = (
     "observation",
@@ -63,7 +64,8 @@ class HybridReplayBuffer:
             ignored.
 
     Raises:
-        ValueError: if the real data lack an entry of ``keys``; the message gives a remedy.
+        ValueError: if the real data lack an entry of ``keys``, have a flag that is not boolean, or numbers that are NaN
+            or infinite; the message gives a remedy.
 
     Attributes:
         stream_keys: the entries that :meth:`extend` reads, ``keys`` as given.
@@ -109,8 +111,11 @@ class HybridReplayBuffer:
         if self._multi_step is not None:
             self.keys = multi_step_keys(self.stream_keys)
             self.next_observation = original_key(self.next_observation)
-            real = real if STEPS in real.keys() else self._multi_step.whole(_select(real, self.stream_keys, "real"))
-        real = _select(real, self.keys, "real").to(self.device)
+            real = (
+                real if STEPS in real.keys() else self._multi_step.whole(select_entries(real, self.stream_keys, "real"))
+            )
+        real = select_entries(real, self.keys, "real").to(self.device)
+        require_usable_real(real, self.keys)
         self.real = ReplayBuffer(storage=TensorStorage(real, device=self.device), writer=ImmutableDatasetWriter())
         if sim_memory is not None:
             storage = TensorStorage(sim_memory, device=self.device)
@@ -142,23 +147,21 @@ class HybridReplayBuffer:
                 ends with ``("next", "done")``. The last n rows of each run then wait for the next call.
 
         Raises:
-            ValueError: if an entry is missing or its shape differs from that of the real data.
+            ValueError: if an entry is missing, its shape differs from that of the real data, or a flag is not boolean.
+            UnstableSimulatorError: a ValueError, if the simulator produced NaN or infinite numbers; no row is added.
         """
-        rows = _select(transitions, self.stream_keys, "simulated")
+        rows = select_entries(transitions, self.stream_keys, "simulated")
+        like = dict(zip(self.keys, self._real_rows, strict=True))
+        # before the sums over n steps, which would spread a NaN and keep it for the next call
+        require_usable_simulated(rows, self.stream_keys, [like[key] for key in self.stream_keys])
         if self._multi_step is not None:
             rows = self._multi_step.transform(rows)
             if rows is None:
                 return
-        rows = _select(rows.reshape(-1), self.keys, "simulated")
-        for key, like in zip(self.keys, self._real_rows, strict=True):
-            value = rows.get(key)
-            if value.shape[1:] != like.shape[1:]:
-                raise ValueError(
-                    f"{key!r} has the shape {list(value.shape[1:])} in the simulated data and "
-                    f"{list(like.shape[1:])} in the real data; simulator and data must be of the same task"
-                )
+        rows = rows.select(*self.keys).reshape(-1)
+        for key, real in like.items():
             # converted to the dtype of the real data, because Gymnasium's observations are float64
-            rows.set(key, value.detach().to(like))
+            rows.set(key, rows.get(key).detach().to(real))
         self.sim.extend(rows)
         self._find_sim_rows()
 
@@ -303,17 +306,6 @@ class HybridReplayBuffer:
                 f"entries {saved['keys']}; this buffer has {own['transitions']} and "
                 f"{own['keys']}, or other values: load the same real data first"
             )
-
-
-def _select(td: TensorDictBase, keys: list[NestedKey], stream: str) -> TensorDictBase:
-    present = set(td.keys(True, True))
-    for key in keys:
-        if key not in present:
-            raise ValueError(
-                f"the {stream} data lack {key!r}, they have {sorted(present, key=str)}; record "
-                "it (for a log, give reward=), or choose other keys="
-            )
-    return td.select(*keys)
 
 
 def _require_sizes(sizes: tuple[int, int]) -> tuple[int, int]:

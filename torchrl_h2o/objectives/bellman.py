@@ -8,15 +8,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 
+from torchrl_h2o.objectives.batch_checks import NetworkInput, network_inputs, require_boolean, separated
 from torchrl_h2o.objectives.exploration import EntropyBonus
-from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows, like_rows
+from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 from torchrl_h2o.objectives.one_step import ValueType, one_step_discount
 
 if TYPE_CHECKING:
@@ -164,6 +166,7 @@ class MixedBellmanLoss(HybridLoss):
             raise ValueError(f"alpha_init must be positive, not {alpha_init}.")
         if value_network is None and mixing:
             raise ValueError(f"mixing={mixing} weighs V(s'), and there is no value network: pass one, or mixing=0.0.")
+        self._network_inputs = _inputs_of(actor_network, qvalue_network, value_network)
         self.convert_to_functional(actor_network, "actor_network")
         self.tensor_keys.action = _action_key(actor_network)
         if isinstance(qvalue_network, Sequence):
@@ -226,6 +229,9 @@ class MixedBellmanLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return ("loss_qvalue",)
 
+    def _network_dtype(self) -> torch.dtype:
+        return self.gamma.dtype
+
     @property
     def alpha(self) -> Tensor:
         """β, the weight of the entropy, as a constant."""
@@ -243,7 +249,8 @@ class MixedBellmanLoss(HybridLoss):
         terms = (td_error**2).sum(0)
         ratio = tensordict.get(self.tensor_keys.dynamics_ratio, None)
         if ratio is not None:
-            terms = torch.where(rows.real, terms, like_rows(ratio.detach(), terms) * terms)
+            ratio = self._one_per_row(ratio.detach(), terms, self.tensor_keys.dynamics_ratio)
+            terms = torch.where(rows.real, terms, ratio * terms)
         return self._expectation(terms, rows)  # Eq. (8)
 
     @torch.no_grad()
@@ -256,10 +263,12 @@ class MixedBellmanLoss(HybridLoss):
         if value_network is not None:
             value = self._next_value(value_network, next_states)
             next_value = self.mixing * value + (1 - self.mixing) * next_value
-        reward = like_rows(self._entry(next_states, keys.reward), next_value)
-        terminated = like_rows(self._entry(next_states, keys.terminated).bool(), next_value)
-        steps = tensordict.get(keys.steps_to_next_obs, None)
-        discount = self.gamma if steps is None else self.gamma ** like_rows(steps, next_value)
+        reward = self._one_per_row(self._entry(next_states, keys.reward), next_value, ("next", keys.reward))
+        terminated, key = self._entry(next_states, keys.terminated), ("next", keys.terminated)
+        terminated = self._one_per_row(require_boolean(terminated, key, type(self).__name__), next_value, key)
+        steps, discount = tensordict.get(keys.steps_to_next_obs, None), self.gamma
+        if steps is not None:
+            discount = self.gamma ** self._one_per_row(steps, next_value, keys.steps_to_next_obs)
         return reward + discount * torch.where(terminated, 0.0, next_value)  # Eq. (7)
 
     def _next_value(self, value_network: TensorDictModule, next_states: TensorDictBase) -> Tensor:
@@ -275,7 +284,7 @@ class MixedBellmanLoss(HybridLoss):
         qvalue = self.qvalues(states, self.target_qvalue_network_params).amin(0)
         states.set(keys.log_prob, log_prob).set(keys.alpha, self.alpha.expand(log_prob.shape))
         bonus = self._entry(self.exploration(states), keys.exploration_bonus)
-        return qvalue + like_rows(bonus, qvalue)
+        return qvalue + self._one_per_row(bonus, qvalue, keys.exploration_bonus)
 
     def sample_action(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Draw a reparameterised a ~ π(.|s), and return it with log π(a|s), ``[*B]``."""
@@ -293,3 +302,28 @@ def _action_key(actor_network: ProbabilisticTensorDictSequential) -> NestedKey:
     """The key under which the actor writes its action."""
     keys = getattr(actor_network, "dist_sample_keys", None)
     return keys[0] if keys else "action"
+
+
+def action_dim_of(actor_network: ProbabilisticTensorDictSequential, action_key: NestedKey) -> int | None:
+    """Size of the action from the actor's spec; None without a spec."""
+    spec = getattr(actor_network, "spec", None)
+    leaf = spec.get(action_key, None) if isinstance(spec, Composite) else spec
+    if leaf is None:
+        return None
+    batch_dims = spec.ndim if isinstance(spec, Composite) else 0
+    return leaf.shape[batch_dims:].numel()
+
+
+def _inputs_of(
+    actor_network: ProbabilisticTensorDictSequential,
+    qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+    value_network: TensorDictModule | None,
+) -> tuple[NetworkInput, ...]:
+    """Sizes of the entries that the loss reads, from its networks and the action's spec."""
+    read_by_q, key = network_inputs(qvalue_network), _action_key(actor_network)
+    states = [*network_inputs(actor_network), *network_inputs(value_network)]
+    following = [*network_inputs(actor_network, "next"), *network_inputs(value_network, "next")]
+    action_dim = action_dim_of(actor_network, key)
+    action = [] if action_dim is None else [NetworkInput((unravel_key(key),), action_dim)]
+    read = {key for one in (*read_by_q, *following) for key in one.keys}
+    return tuple(one for one in separated([*read_by_q, *states, *following, *action]) if read.issuperset(one.keys))

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from torchrl_h2o.objectives.hybrid_loss import Rows, like_rows
+from torchrl_h2o.objectives.hybrid_loss import Rows
 from torchrl_h2o.objectives.loss_wrapper import LossWrapper
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
@@ -196,7 +196,9 @@ class ConservativeLoss(LossWrapper):
         sim = rows.sim
         lowest = torch.finfo(qvalues.dtype).min  # with -inf, a batch without simulated rows would give NaN (-inf + inf)
         divergence = tensordict.get(self.tensor_keys.dynamics_divergence, None)
-        logits = torch.zeros_like(qvalues[0]) if divergence is None else like_rows(divergence.detach(), sim).log()
+        logits = torch.zeros_like(qvalues[0])
+        if divergence is not None:
+            logits = self._one_per_row(divergence.detach(), sim, self.tensor_keys.dynamics_divergence).log()
         if rows.priority is not None:
             logits = logits + rows.priority.log()
         logits = torch.where(sim, logits, lowest).flatten()

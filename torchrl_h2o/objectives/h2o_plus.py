@@ -9,10 +9,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor, nn
-from torchrl.data import Composite
 from torchrl.objectives import LossModule
 
-from torchrl_h2o.objectives.bellman import MixedBellmanLoss
+from torchrl_h2o.objectives.bellman import MixedBellmanLoss, action_dim_of
 from torchrl_h2o.objectives.hybrid_loss import Rows
 from torchrl_h2o.objectives.loss_wrapper import LossWrapper
 from torchrl_h2o.objectives.ratio import DynamicsRatioLoss
@@ -307,12 +306,10 @@ def _are_shared(params: TensorDictBase, others: TensorDictBase) -> bool:
 
 
 def _action_dim(actor_network: ProbabilisticTensorDictSequential, action_key: NestedKey) -> int:
-    spec = getattr(actor_network, "spec", None)
-    leaf = spec.get(action_key, None) if isinstance(spec, Composite) else spec
-    if leaf is None:
+    action_dim = action_dim_of(actor_network, action_key)
+    if action_dim is None:
         raise ValueError(
             "target_entropy='auto' needs the action's spec: give it to the actor "
             "(ProbabilisticActor(..., spec=env.action_spec)), or pass target_entropy=-action_dim."
         )
-    batch_dims = spec.ndim if isinstance(spec, Composite) else 0
-    return leaf.shape[batch_dims:].numel()
+    return action_dim

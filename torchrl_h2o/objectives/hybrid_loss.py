@@ -17,6 +17,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_h2o.objectives.batch_checks import NetworkInput, one_per_row, require_boolean, require_rows
 from torchrl_h2o.objectives.network_calls import NetworkCalls
 
 
@@ -89,6 +90,7 @@ class HybridLoss(LossModule):
     default_keys = _AcceptedKeys
     _in_keys: list[NestedKey] | None
     _out_keys: list[NestedKey] | None
+    _network_inputs: tuple[NetworkInput, ...] = ()  # what the networks read, as far as its size is known
 
     def __init_subclass__(cls, **kwargs) -> None:
         super().__init_subclass__(**kwargs)
@@ -161,17 +163,35 @@ class HybridLoss(LossModule):
             )
         return value
 
+    def _one_per_row(self, value: Tensor, rows: Tensor, key: NestedKey) -> Tensor:
+        """Return an entry with one value per row in the shape of ``rows``, ``[*B]``."""
+        return one_per_row(value, rows.shape, key, type(self).__name__)
+
+    def _network_dtype(self) -> torch.dtype | None:
+        """Dtype of the networks' parameters; None if the loss holds no network itself."""
+        return None
+
+    def _check_network_inputs(self, tensordict: TensorDictBase) -> None:
+        if self._network_inputs:
+            dtype = self._network_dtype()
+            for one in self._network_inputs:
+                one.check([self._entry(tensordict, key) for key in one.keys], type(self).__name__, dtype)
+
     def _rows(self, tensordict: TensorDictBase) -> Rows:
-        """Sort the batch's rows into streams; called once per forward."""
+        """Check the batch and sort its rows into streams; called once per forward."""
+        self._check_network_inputs(tensordict)
         real = tensordict.get(self.tensor_keys.real, None)
         if real is None:
             raise KeyError(
                 f"the batch has no entry {self.tensor_keys.real!r}. Mark its rows with a boolean of the batch's "
                 "shape (True for measured data), or rename the entry with set_keys(real=...)."
             )
-        real = real.bool()
-        if real.ndim > tensordict.ndim:
+        real = require_boolean(real, self.tensor_keys.real, type(self).__name__)
+        if tensordict.ndim:
+            real = one_per_row(real, tensordict.batch_size, self.tensor_keys.real, type(self).__name__)
+        elif real.ndim:  # called with tensors: the shape of the batch is not known
             real = real.squeeze(-1)
+        require_rows(real, type(self).__name__)
         sim, either = ~real, None
         for key in self._loss_mask_keys():
             valid = tensordict.get(key, None)
@@ -180,7 +200,9 @@ class HybridLoss(LossModule):
                 real, sim = real & valid, sim & valid
                 either = real | sim
         priority = self._maybe_get_priority_weight(tensordict)
-        return Rows(real, sim, either, None if priority is None else like_rows(priority, real))
+        if priority is not None:
+            priority = self._one_per_row(priority, real, self.tensor_keys.priority_weight)
+        return Rows(real, sim, either, priority)
 
     def _maybe_get_priority_weight(self, tensordict: TensorDictBase) -> Tensor | None:
         # TorchRL's implementation looks the key up in ``keys()``, which does not contain nested keys.
@@ -236,11 +258,6 @@ class HybridLoss(LossModule):
             held = [module for module in self.modules() if isinstance(module, TensorDictParams)]
             self._clear_weakrefs(tensordict, out, *held)
         return out
-
-
-def like_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """Remove a trailing dimension of size 1 that ``rows`` does not have: ``[*B, 1]`` becomes ``[*B]``."""
-    return tensor.squeeze(-1) if tensor.ndim > rows.ndim else tensor
 
 
 def total_loss(terms: dict[str, Tensor]) -> Tensor:

@@ -10,6 +10,7 @@ from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from torchrl_h2o.objectives.batch_checks import one_per_row, require_boolean, require_rows
 from torchrl_h2o.objectives.loss_wrapper import LossWrapper
 
 
@@ -89,8 +90,8 @@ class ImportanceWeightedLoss(LossWrapper):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        terms = self.loss(tensordict).select(*self._written_keys())
         weights = self._weights(tensordict)
+        terms = self.loss(tensordict).select(*self._written_keys())
         weighted = {key: _scale(value, weights) if key in self.terms else value for key, value in terms.items()}
         return self._output({key: self._reduce_loss(value, tensordict) for key, value in weighted.items()}, tensordict)
 
@@ -101,14 +102,18 @@ class ImportanceWeightedLoss(LossWrapper):
                 f"the batch has no weights at {self.key!r}: call a DynamicsRatioEstimator on it first, or name "
                 "their key."
             )
+        require_rows(weights, type(self).__name__)
+        if tensordict.ndim:
+            weights = one_per_row(weights, tensordict.batch_size, self.key, type(self).__name__)
         real = tensordict.get(self.tensor_keys.real, None)
         if real is not None:
-            weights = torch.where(self._expand_loss_mask(real.bool(), weights), 1.0, weights)
+            real = require_boolean(real, self.tensor_keys.real, type(self).__name__)
+            weights = torch.where(self._expand_loss_mask(real, weights), 1.0, weights)
         return weights.detach()
 
 
 def _scale(terms: Tensor, weights: Tensor) -> Tensor:
-    """Multiply terms by weights, after trailing dimensions of size 1 are removed from or added to the weights."""
-    while weights.ndim > terms.ndim:
+    """Multiply terms by weights, after trailing dimensions of size 1 are added to the weights, or one is removed."""
+    if weights.ndim > terms.ndim:
         weights = weights.squeeze(-1)
     return terms * weights.reshape(weights.shape + (1,) * (terms.ndim - weights.ndim))

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, cast
 
+import torch
 from tensordict import NestedKey
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_h2o.objectives.batch_checks import NetworkInput
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss
 
 
@@ -37,6 +39,13 @@ class LossWrapper(HybridLoss):
     def _inside_if_set(self) -> LossModule | None:
         """The loss inside; None while the base class's constructor runs."""
         return self.__dict__.get("_modules", {}).get(self._inside_name)
+
+    @property
+    def _network_inputs(self) -> tuple[NetworkInput, ...]:
+        return getattr(self._inside, "_network_inputs", ())
+
+    def _network_dtype(self) -> torch.dtype | None:
+        return cast(HybridLoss, self._inside)._network_dtype()
 
     @property
     def _parts(self) -> list[LossModule]:

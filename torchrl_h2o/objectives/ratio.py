@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchrl_h2o.objectives.batch_checks import network_inputs, separated
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 from torchrl_h2o.objectives.network_calls import NetworkCalls
 
@@ -113,6 +114,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
         self.clamp = clamp
         self.observation, self.next_observation = unravel_key(observation), unravel_key(next_observation)
         self.register_buffer("change_scale", change_scale)
+        self.network_inputs = separated([*network_inputs(sa_network), *network_inputs(sas_network)])
         read_by_sa = [] if sa_network is None else sa_network.in_keys
         self.in_keys = list(dict.fromkeys((*read_by_sa, *sas_network.in_keys)))
         self.out_keys = list(out_keys)
@@ -180,6 +182,8 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for one in self.network_inputs:
+            one.check([cast(Tensor, tensordict.get(key)) for key in one.keys], "DynamicsRatioEstimator", None)
         log_ratio, ratio = self.ratio(tensordict)
         log_key, key = self.out_keys
         return tensordict.set(log_key, log_ratio).set(key, ratio)
@@ -288,6 +292,7 @@ class DynamicsRatioLoss(HybridLoss):
         if weight_penalty < 0 or (weight_penalty and reduction != "mean"):
             raise ValueError(f"weight_penalty={weight_penalty} must not be negative, and needs reduction='mean'.")
         noise = _noise_by_entry(input_noise, estimator.in_keys)
+        self._network_inputs = estimator.network_inputs
         # TorchRL accepts any compatible module, although it annotates a TensorDictModule.
         self.convert_to_functional(cast(TensorDictModule, estimator), "estimator", create_target_params=False)
         self.input_noise = input_noise
@@ -302,6 +307,9 @@ class DynamicsRatioLoss(HybridLoss):
             return "loss_ratio_sas", "accuracy"
         return "loss_ratio_sa", "loss_ratio_sas", "accuracy_sa", "accuracy"
 
+    def _network_dtype(self) -> torch.dtype:
+        return cast(Tensor, next(iter(self.estimator_params.values(True, True)))).dtype
+
     def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
         """Compute Eq. (9) with this loss's current parameters, as a constant, ``[*B]``."""
         return self.log_and_clamped_ratio(tensordict)[1]
@@ -312,7 +320,7 @@ class DynamicsRatioLoss(HybridLoss):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        inputs, rows = tensordict.select(*self.estimator.in_keys), self._rows(tensordict)
+        rows, inputs = self._rows(tensordict), tensordict.select(*self.estimator.in_keys)
         if self.training and self._noise:
             inputs = self._noisy(inputs)
         sa, sas = self.estimator.log_odds(inputs, self.estimator_params, self.calls)

@@ -6,7 +6,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 
-from torchrl_h2o.objectives.hybrid_loss import like_rows
+from torchrl_h2o.objectives.batch_checks import one_per_row, require_boolean
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 
@@ -79,14 +79,17 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        name = "DynamicsRewardCorrection"
         estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
         correction = self.scale * estimated.get(self.estimator.out_keys[0])
         steps = tensordict.get(self.steps_to_next_obs, None)
         if steps is not None:
-            steps = like_rows(steps, correction).to(correction.dtype)
+            steps = one_per_row(steps, correction.shape, self.steps_to_next_obs, name).to(correction.dtype)
             correction = correction * (steps if self.gamma == 1 else (1 - self.gamma**steps) / (1 - self.gamma))
         real = tensordict.get(self.real, None)
         if real is not None:
-            correction = torch.where(like_rows(real.bool(), correction), 0.0, correction)
+            real = one_per_row(require_boolean(real, self.real, name), correction.shape, self.real, name)
+            correction = torch.where(real, 0.0, correction)
         reward = tensordict.get(self.reward)
+        one_per_row(reward, correction.shape, self.reward, name)
         return tensordict.set(self.reward, reward + correction.reshape(reward.shape))

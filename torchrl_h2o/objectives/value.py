@@ -14,6 +14,7 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
 
+from torchrl_h2o.objectives.batch_checks import network_inputs, separated
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 
 
@@ -69,6 +70,7 @@ class InSampleValueLoss(HybridLoss):
 
     def __init__(self, value_network: TensorDictModule, *, reduction: str = "mean") -> None:
         super().__init__(reduction=reduction)
+        self._network_inputs = separated(network_inputs(value_network))
         self.convert_to_functional(value_network, "value_network", create_target_params=False)
 
     @abstractmethod
@@ -85,6 +87,9 @@ class InSampleValueLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return ("loss_value",)
 
+    def _network_dtype(self) -> torch.dtype:
+        return next(iter(self.value_network_params.values(True, True))).dtype
+
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self._output({"loss_value": self.value_loss(tensordict, self._rows(tensordict))}, tensordict)
@@ -93,7 +98,8 @@ class InSampleValueLoss(HybridLoss):
         """Compute the reduced loss of Eq. (4)."""
         out = self.calls.outputs(self.value_network, tensordict, self.value_network_params)
         value = self._entry(out, self.tensor_keys.value).squeeze(-1)
-        qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach().reshape(value.shape)
+        qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach()
+        qvalue = self._one_per_row(qvalue, value, self.tensor_keys.state_action_value)
         return self._expectation(self.penalty(qvalue - value), rows, rows.real)  # Eq. (4)
 
 

@@ -9,9 +9,10 @@ from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from torchrl_h2o.training.collection import check_collector
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.environments import measure_observation_norm, preprocessing_of, task_of
 from torchrl_h2o.training.film import try_to_film
-from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.judging import judge, run_settings, table_of_run, write_failure
 from torchrl_h2o.training.loop import Method, train
 from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.real_data import behaviour_of, is_cut
@@ -25,6 +26,9 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
         cfg: the run's configuration.
         directory: the run's folder.
         methods: the main method, then its baselines.
+
+    Raises:
+        DivergenceError: if a loss or a parameter is no longer finite; summary.json then has the reason.
     """
     start = time.perf_counter()
     real = prepare(cfg, directory)
@@ -34,7 +38,11 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
 
     policies, trainings = {}, {}
     for method in methods:
-        policies[method.title], trainings[method.title] = train(method, cfg, real, directory)
+        try:
+            policies[method.title], trainings[method.title] = train(method, cfg, real, directory)
+        except DivergenceError as error:
+            write_failure(directory, error.failure, run_settings(cfg, real))
+            raise
     wall_s += sum(training.progress["seconds"] for training in trainings.values())
 
     task, preprocessing = task_of(cfg), preprocessing_of(cfg)

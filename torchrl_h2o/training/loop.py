@@ -162,6 +162,7 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
             trainee.begin_epoch(epoch)
             for _ in training.epoch_updates():
                 losses = learner.update()
+                training.check(losses)
             schedule.step()
             if evaluating:
                 figures = {name: loss.item() for name, loss in losses.items()}

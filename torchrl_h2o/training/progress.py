@@ -7,17 +7,20 @@ checkpoint therefore draws the same random numbers as an uninterrupted one.
 from __future__ import annotations
 
 import csv
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
+from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
+from torchrl_h2o.training.divergence import DivergenceError, are_finite, not_finite_losses
 from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
 
 
@@ -71,6 +74,8 @@ class Training:
         self.progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
         # "archive", because a damaged ZIP raises an error, while a damaged folder of memory maps is read as zeros.
         self.checkpoint = Checkpoint(format="archive", **components)
+        self._components = components
+        self._update = 0  # of the current epoch
         directory.mkdir(parents=True, exist_ok=True)
         folder = checkpoint_folder(directory, name)
         self.rotation = CheckpointRotation(folder, keep_last=1)
@@ -81,6 +86,7 @@ class Training:
             raise RuntimeError(
                 f"{folder} contains no checkpoint that can be read: remove it to train {name} from the start"
             )
+        self._saved = self.progress["epoch"]  # epochs in the last checkpoint
 
     @property
     def updates(self) -> int:
@@ -105,15 +111,55 @@ class Training:
             if last or (epoch + 1) % self.budget.checkpoint_every == 0:
                 with uninterrupted():
                     self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
+                self._saved = epoch + 1
         self._bar.close()
 
     def epoch_updates(self) -> Iterator[int]:
-        """Yields the number of each update of an epoch, advances the progress bar and measures the time."""
+        """Yields the number of each update of an epoch, advances the progress bar and measures the time.
+
+        Raises:
+            DivergenceError: after the last update, if a parameter is not finite: before the policy is evaluated, and
+                before a checkpoint replaces the last good one.
+        """
         start = time.perf_counter()
         for update in range(self.budget.updates_per_epoch):
+            self._update = update
             yield update
             self._bar.update()
+        self._check_parameters()
         self.progress["update_seconds"] += time.perf_counter() - start
+
+    def check(self, losses: Mapping[str, Tensor]) -> None:
+        """Stops the training at the first update with a loss that is not finite.
+
+        Args:
+            losses: terms of the current update by name, ``[]`` each.
+
+        Raises:
+            DivergenceError: with the loss, the update, the last checkpoint and what to change.
+        """
+        if (why := not_finite_losses(losses)) is not None:
+            raise self._diverged(why)
+
+    def _check_parameters(self) -> None:
+        if not are_finite(part for part in self._components.values() if isinstance(part, nn.Module)):
+            raise self._diverged("a parameter is not finite")
+
+    def _diverged(self, why: str) -> DivergenceError:
+        self._bar.close()
+        size, epoch = self.budget.updates_per_epoch, self.progress["epoch"]
+        before = epoch * size + self._update
+        what = f"{self.name}: {why} at update {before + 1:,} of {self.updates:,} (epoch {epoch + 1})"
+        kept = "There is no checkpoint yet: start"
+        if self._saved:
+            folder = os.path.relpath(self.directory)
+            kept = (
+                f"The checkpoint of update {self._saved * size:,} is kept; resume={folder} would repeat the same "
+                f"numbers, so start"
+            )
+        optimiser = self._components.get("optimiser")
+        lr = "" if optimiser is None else f" (now {optimiser.defaults['lr']:g})"
+        return DivergenceError(f"{what}. {kept} a new run with a smaller lr{lr} or reward_scale.", what, before)
 
     @property
     def updates_per_second(self) -> float:

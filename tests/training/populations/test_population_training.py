@@ -7,6 +7,9 @@ import pytest
 import torch
 
 from tests.small_runs import ROBOT, SMALL, rows, run, trained
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.data.transition_checks import UnstableSimulatorError
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.loop import Trainee, train
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS, make_learner
 from torchrl_h2o.training.populations.job import run_population
@@ -136,6 +139,30 @@ def test_a_member_that_fails_is_reported_and_the_others_go_on_as_if_it_had_not(c
 
 
 @pytest.mark.slow
+def test_a_member_whose_simulator_is_unstable_stops_and_the_others_go_on(compose, tmp_path, monkeypatch):
+    cfg, real = compose("seeds=[0,1]", "updates=20")
+    healthy = train_all(cfg, real, tmp_path / "healthy")
+    extend, calls = HybridReplayBuffer.extend, []
+
+    def unstable(self, transitions):
+        calls.append(self)
+        if len(calls) == unstable_call:
+            transitions["next", "reward"][0, 3] = float("nan")
+        extend(self, transitions)
+
+    monkeypatch.setattr(HybridReplayBuffer, "extend", unstable)
+    unstable_call = 4  # of the second member in the second epoch
+    outcomes = train_all(cfg, real, tmp_path / "unstable")
+    assert outcomes["seed_1"].failure["updates"] == 10
+    assert "reward') that is NaN or infinite in 1 of 20 rows" in outcomes["seed_1"].failure["why"]
+    assert outcomes["seed_0"].rows == healthy["seed_0"].rows
+    calls.clear()
+    unstable_call = 2  # before it has any simulated row
+    with pytest.raises(UnstableSimulatorError, match=r"^seed_1: the simulator produced"):
+        train_all(cfg, real, tmp_path / "at_once")
+
+
+@pytest.mark.slow
 def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(compose, tmp_path, monkeypatch, capsys):
     cfg, _ = compose("seeds=[0,1]", "updates=10")
     update = PopulationLearner.update
@@ -143,14 +170,17 @@ def test_a_member_that_failed_is_neither_evaluated_nor_left_out_of_the_table(com
     def spoiling(self):
         terms = update(self)
         if self.updates == 10:  # its losses are finite up to this update
-            next(self.population.parameters()).data[1] = float("inf")
+            for parameter in self.population.parameters():
+                parameter.data[1] = float("inf")
         return terms
 
     monkeypatch.setattr("torchrl_h2o.training.populations.learner.PopulationLearner.update", spoiling)
-    run_population(cfg, members_of(cfg), tmp_path)
+    with pytest.raises(DivergenceError, match=r"1 of 2 members diverged: seed_1 after 10 updates .*parameters"):
+        run_population(cfg, members_of(cfg), tmp_path)
     failed = json.loads((tmp_path / "seed_1" / "summary.json").read_text())
     assert (failed["failure"], failed["updates"], failed["return_real"]) == ("its parameters not finite", 10, None)
     assert not (tmp_path / "seed_1" / "metrics.csv").exists()
+    assert not list((tmp_path / "seed_1").glob("checkpoints/*/checkpoint*"))  # its policy is not finite
     healthy = json.loads((tmp_path / "seed_0" / "summary.json").read_text())
     assert healthy["return_real"]["episodes"] == 1
     table = {line.split()[0]: line.split()[1] for line in capsys.readouterr().out.splitlines() if "seed_" in line}

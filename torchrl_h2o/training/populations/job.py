@@ -6,6 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 from tqdm import tqdm
 
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.job import prepare
 from torchrl_h2o.training.judging import DATA, judge, run_settings, table_of_population, write_failure
@@ -25,6 +26,7 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
 
     Raises:
         ValueError: for any method except H2O+, or for baselines.
+        DivergenceError: at the end, with the members that diverged.
     """
     if cfg.method != "h2o_plus" or cfg.baselines:
         raise ValueError(
@@ -64,3 +66,12 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
             preprocessing=preprocessing,
         )["H2O+"]
     tqdm.write(table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step))
+    failures = {name: outcome.failure for name, outcome in outcomes.items() if outcome.failure is not None}
+    if failures:
+        which = ", ".join(f"{name} after {one['updates']:,} updates ({one['why']})" for name, one in failures.items())
+        raise DivergenceError(
+            f"{len(failures)} of {len(outcomes)} members diverged: {which}; the others are complete in {directory}; "
+            "train these with a smaller lr or reward_scale.",
+            which,
+            min(one["updates"] for one in failures.values()),
+        )

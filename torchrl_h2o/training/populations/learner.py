@@ -84,7 +84,11 @@ class PopulationLearner:
         for number in (~healthy).nonzero().flatten().tolist():
             bad = [name for name, term in terms.items() if not term[number].isfinite()]
             why = f"{' and '.join(bad) or 'its parameters'} not finite"
-            self.failures.setdefault(number, {"updates": self.updates, "why": why})
+            self.note_failure(number, why)
+
+    def note_failure(self, number: int, why: str) -> None:
+        """Stop a member, if it is not stopped already."""
+        self.failures.setdefault(number, {"updates": self.updates, "why": why})
 
     def sample(self) -> list[TensorDictBase]:
         """Draw the batches of one update of all members, ``[N, B]`` each."""

@@ -2,7 +2,8 @@
 
 Each member has its own simulator, buffer and random stream, and draws from the stream in the order of a single run. On
 a CPU its results therefore equal that run's, up to rounding. A member is stopped when its losses or parameters are no
-longer finite: its networks are no longer changed, simulated or evaluated. The other members are not affected.
+longer finite, or when its simulator produces NaN: its networks are no longer changed, simulated or evaluated. The other
+members are not affected.
 """
 
 from contextlib import ExitStack
@@ -17,7 +18,9 @@ from torch.optim.lr_scheduler import LinearLR
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
+from torchrl_h2o.data.transition_checks import UnstableSimulatorError
 from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.divergence import are_finite
 from torchrl_h2o.training.environments import as_observed, sim_capacity_of
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
@@ -95,6 +98,9 @@ class PopulationTraining(Training):
             self.failures[member] = failure
             tqdm.write(f"{member} stopped after {failure['updates']} updates: {failure['why']}; the others go on")
 
+    def _check_parameters(self) -> None:
+        """Does nothing: the learner checks each member, and the others go on."""
+
     @property
     def failures(self) -> dict[str, dict]:
         """By stopped member: the number of updates that it made, and the reason."""
@@ -155,7 +161,12 @@ def train_population(
             if not running:
                 break
             for number, _, trainee in running:
-                trainee.begin_epoch(epoch)
+                try:
+                    trainee.begin_epoch(epoch)
+                except UnstableSimulatorError as error:
+                    if not len(trainee.learner.replay.sim):  # a batch needs simulated rows of every member
+                        raise UnstableSimulatorError(f"{name}: {error}") from error
+                    learner.note_failure(number, str(error))
                 learner.start_stream(number)
             for _ in training.epoch_updates():
                 terms = learner.update()
@@ -188,8 +199,9 @@ def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outco
     rotation = CheckpointRotation(checkpoint_folder(training.directory / name, training.name), keep_last=1)
     failure = training.failures.get(name)
     updates = training.updates if failure is None else failure["updates"]
-    with uninterrupted():
-        rotation.save(Checkpoint(format="archive", **policies), step=updates)
+    if are_finite(policies.values()):  # a policy that diverged cannot be evaluated
+        with uninterrupted():
+            rotation.save(Checkpoint(format="archive", **policies), step=updates)
     return Outcome(
         trainee.policy,
         training.rows_of(name),
