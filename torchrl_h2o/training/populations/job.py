@@ -22,15 +22,7 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
         cfg: the configuration that the members share.
         members: the configuration of each member, by name.
         directory: the population's folder.
-
-    Raises:
-        ValueError: for any method except H2O+, or for baselines.
     """
-    if cfg.method != "h2o_plus" or cfg.baselines:
-        raise ValueError(
-            f"method={cfg.method} baselines={cfg.baselines}: a population trains h2o_plus alone; "
-            "use --multirun for other methods"
-        )
     start = time.perf_counter()
     for own in members.values():
         task_of(own).make_simulator()  # fails before the data are loaded if a gap does not fit the model
