@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationToMissingValueError
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
@@ -32,17 +33,16 @@ def check_options(cfg: DictConfig, model: type[Options], *, saved: bool = False)
         ValueError: in one line, for each wrong option: its value, what is allowed, and the most similar name.
 
     Examples:
+        >>> from pydantic import create_model
         >>> from torchrl_h2o.options.types import Count, Share
-        >>> class Small(Options):
-        ...     gamma: Share
-        ...     seeds: list[Count]
-        >>> check_options(OmegaConf.create({"gamma": 0.99, "seeds": [1, 2]}), Small)
-        >>> check_options(OmegaConf.create({"gamma": 1.5, "seeds": [1]}), Small)
+        >>> Small = create_model("Small", __base__=Options, gamma=Share, updates=Count)
+        >>> check_options(OmegaConf.create({"gamma": 0.99, "updates": 100}), Small)
+        >>> check_options(OmegaConf.create({"gamma": 1.5, "updates": 100}), Small)
         Traceback (most recent call last):
         ...
         ValueError: gamma=1.5: must be a number from 0 to 1
     """
-    values = _given(OmegaConf.to_container(cfg, resolve=not OmegaConf.missing_keys(cfg)))
+    values = _given(cfg)
     try:
         model.model_validate(values)
     except ValidationError as error:
@@ -53,10 +53,18 @@ def check_options(cfg: DictConfig, model: type[Options], *, saved: bool = False)
             raise ValueError("; ".join(problems)) from None
 
 
-def _given(value: Any) -> Any:
-    """The entries that have a value: OmegaConf writes ``???`` for one that must be given and is not."""
-    if isinstance(value, dict):
-        return {key: _given(one) for key, one in value.items() if one != "???"}
+def _given(cfg: DictConfig) -> Any:
+    """The entries that have a value."""
+    try:
+        values = OmegaConf.to_container(cfg, resolve=True)
+    except InterpolationToMissingValueError:
+        values = OmegaConf.to_container(cfg)
+    return _without_missing(values)
+
+
+def _without_missing(value: Any) -> Any:
+    if isinstance(value, dict):  # OmegaConf writes ??? for an entry that must be given and is not
+        return {key: _without_missing(one) for key, one in value.items() if one != "???"}
     return value
 
 
@@ -82,7 +90,7 @@ def _problem(error: ErrorDetails, schema: Schema, values: Mapping[str, Any]) -> 
         return f"no option {'.'.join([*folder, unknown])}{did_you_mean(unknown, _entries(own, schema)) or LISTED}"
     name = ".".join(path)
     if error["type"] == MISSING:
-        return f"{name} is missing: give {allowed(own)}"
+        return f"{name} is missing: write {name}=..., {allowed(own)}"
     said = str(error.get("ctx", {}).get("error", error["msg"]))
     if error["type"] in SAID and (not path or _entries(own, schema)):
         return said  # of several options together

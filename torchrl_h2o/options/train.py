@@ -78,6 +78,9 @@ class AnyMethodOptions(ExperimentOptions):
     collector: CollectorOptions
     method: Method
     baselines: list[Method]
+    seeds: Seeds | None
+    gaps: Gaps | None
+    mixings: Mixings | None
     device: DeviceName
     h2o: H2OOptions
     iql: IQLOptions
@@ -88,10 +91,6 @@ class AnyMethodOptions(ExperimentOptions):
 
 class TrainOptions(AnyMethodOptions, RunOptions):
     """Options of train.py, with the relations between them."""
-
-    seeds: Seeds | None
-    gaps: Gaps | None
-    mixings: Mixings | None
 
     @model_validator(mode="after")
     def _fit_the_method(self) -> TrainOptions:
