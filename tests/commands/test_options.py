@@ -219,6 +219,15 @@ def test_an_environment_of_the_user_may_have_entries_of_its_own_but_no_misspelt_
         check_options(cfg, TrainOptions)
 
 
+@pytest.mark.parametrize("name", ["Hopper-v5", "Hopper", "gymnasium.envs.mujoco:Hopper-v5"])
+def test_every_name_that_gymnasium_completes_is_a_task(name):
+    folder = ROOT / "torchrl_h2o" / "config"
+    check_options(
+        composed("close_the_loop", "simulator=gymnasium", f"simulator.task='{name}'", folder=folder),
+        CloseTheLoopOptions,
+    )
+
+
 def test_a_configuration_of_an_earlier_version_passes_but_not_with_a_wrong_value():
     cfg = composed("train", "data=recorded")
     with open_dict(cfg):

@@ -36,11 +36,13 @@ class MakeOptions(Options):
     @field_validator("env_name")
     @classmethod
     def _is_registered(cls, name: str | None, info: ValidationInfo) -> str | None:
-        if name is not None and str(info.data.get("target")).endswith("GymEnv"):
-            try:
-                gymnasium.spec(name)
-            except (gymnasium.error.Error, ModuleNotFoundError) as error:
-                raise ValueError(str(error).replace("`", "")) from None
+        # Gymnasium itself completes names without a version, and imports the module in module:name
+        if name is None or ":" in name or "-v" not in name or not str(info.data.get("target")).endswith("GymEnv"):
+            return name
+        try:
+            gymnasium.spec(name)
+        except gymnasium.error.UnregisteredEnv as error:
+            raise ValueError(str(error).replace("`", "")) from None
         return name
 
 

@@ -13,7 +13,7 @@ def allowed(schema: Schema) -> str:
     """Returns the allowed values in words.
 
     Args:
-        schema: JSON schema of one option. its ``description`` comes before words from its type.
+        schema: JSON schema of one option; its ``description`` comes before words from its type.
 
     Examples:
         >>> allowed({"type": "integer", "minimum": 1})
