@@ -245,7 +245,7 @@ def test_a_configuration_of_an_earlier_version_passes_but_not_with_a_wrong_value
     ("devices", "device", "said"),
     [
         (0, "cuda", "device=cuda: this machine has no CUDA device that torch can use; choose device=cpu"),
-        (1, "cuda:1", "device=cuda:1: this machine has 1 CUDA devices, numbered from 0"),
+        (1, "cuda:1", "device=cuda:1: the last CUDA device of this machine is cuda:0"),
         (1, "cuda", None),
         (0, "cpu", None),
     ],

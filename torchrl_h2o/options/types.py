@@ -54,8 +54,8 @@ def require_available(device: str) -> str:
     """
     if device != "cpu" and not torch.cuda.is_available():
         raise ValueError("this machine has no CUDA device that torch can use; choose device=cpu")
-    if device != "cpu" and int(device.partition(":")[2] or 0) >= torch.cuda.device_count():
-        raise ValueError(f"this machine has {torch.cuda.device_count()} CUDA devices, numbered from 0")
+    if device != "cpu" and int(device.partition(":")[2] or 0) >= (count := torch.cuda.device_count()):
+        raise ValueError(f"the last CUDA device of this machine is cuda:{count - 1}")
     return device
 
 
