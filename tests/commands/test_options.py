@@ -68,6 +68,9 @@ TRAIN = {
     "n_steps=500": "n_steps=500: must be from 1 to 499, less than the 500 steps of each world in an epoch "
     "(steps_per_epoch=2000 of num_worlds=4)",
     "num_worlds=2001": "num_worlds=2001: must be at most steps_per_epoch=2000, which the worlds share",
+    "mend=posterior collector=multi_sync collector.workers=5 steps_per_epoch=2020": "collector.workers=5 "
+    "num_worlds=10: the worlds of all workers share the steps of an epoch equally; choose numbers such that "
+    "steps_per_epoch=2020 is a multiple of their product",
     "columns=nowhere.yaml": "columns=nowhere.yaml: there is no such file, and the library's layouts are "
     "double_pendulum, simple_pendulum, wheel_legged_moving_forward, wheel_legged_standing_still",
     "gap_fix=report.jsn": f"gap_fix=report.jsn: {NOWHERE}",

@@ -145,21 +145,26 @@ class RunOptions(ExperimentOptions):
         self._check_mending()
         return self
 
+    @property
+    def worlds(self) -> int:
+        """Number of worlds in which transitions are collected, in each worker."""
+        return max(self.num_worlds, POSTERIOR_WORLDS) if self.mend == "posterior" else self.num_worlds
+
     def _check_gap(self) -> None:
         if self.gap is None and self.gap_strength is not None:
             raise ValueError(f"gap_strength={self.gap_strength} belongs to a gap: name one, such as gap=gravity")
 
     def _check_steps(self) -> None:
-        per_world = self.steps_per_epoch // self.num_worlds
+        per_world = self.steps_per_epoch // self.worlds
         if not per_world:
             raise ValueError(
-                f"num_worlds={self.num_worlds}: must be at most steps_per_epoch={self.steps_per_epoch}, which the "
+                f"num_worlds={self.worlds}: must be at most steps_per_epoch={self.steps_per_epoch}, which the "
                 "worlds share"
             )
         if not self.n_steps < max(2, per_world):
             raise ValueError(
                 f"n_steps={self.n_steps}: must be from 1 to {max(1, per_world - 1)}, less than the {per_world} steps "
-                f"of each world in an epoch (steps_per_epoch={self.steps_per_epoch} of num_worlds={self.num_worlds})"
+                f"of each world in an epoch (steps_per_epoch={self.steps_per_epoch} of num_worlds={self.worlds})"
             )
 
     def _check_mending(self) -> None:
@@ -178,9 +183,8 @@ class RunOptions(ExperimentOptions):
                 f"env={self.env.name} is not batched: use mend=true, or set env.batched=true for a Gymnasium MuJoCo "
                 "task"
             )
-        worlds = max(self.num_worlds, POSTERIOR_WORLDS)
-        if self.steps_per_epoch % worlds:
+        if self.steps_per_epoch % self.worlds:
             raise ValueError(
-                f"mend=posterior num_worlds={worlds}: the worlds share the steps of an epoch equally; make "
-                f"steps_per_epoch={self.steps_per_epoch} a multiple of {worlds}"
+                f"mend=posterior num_worlds={self.worlds}: the worlds share the steps of an epoch equally; make "
+                f"steps_per_epoch={self.steps_per_epoch} a multiple of {self.worlds}"
             )

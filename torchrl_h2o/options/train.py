@@ -124,9 +124,9 @@ class TrainOptions(AnyMethodOptions, RunOptions):
         if self.collector.backend == "ray" and find_spec("ray") is None:
             raise ValueError("collector=ray needs Ray: pip install 'torchrl_h2o[ray]', here and where workers run")
         workers = self.collector.workers
-        if self.steps_per_epoch % (workers * self.num_worlds):
+        if self.steps_per_epoch % (workers * self.worlds):
             raise ValueError(
-                f"collector.workers={workers} num_worlds={self.num_worlds}: the worlds of all workers share the steps "
+                f"collector.workers={workers} num_worlds={self.worlds}: the worlds of all workers share the steps "
                 f"of an epoch equally; choose numbers such that steps_per_epoch={self.steps_per_epoch} is a multiple "
                 "of their product"
             )
