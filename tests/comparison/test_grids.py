@@ -350,12 +350,12 @@ def checkpoint_of(folder, method):
 
 @pytest.mark.slow
 def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):
-    grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "ratio_estimator=guess", script="paper.py")
+    grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "sim_capacity=1e12", script="paper.py")
     done = subprocess.run(**grid, text=True, check=False)
     assert done.returncode != 0
     assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
     assert "these runs failed:\n  method=h2o_plus" in done.stdout
-    assert "ValueError: ratio_estimator=guess: choose paper" in done.stdout
+    assert "allocate memory" in done.stdout  # for the simulated buffer, which IQL does not fill
     assert done.stdout.count("run folder:") == 3  # IQL once, H2O+ twice, because it is tried again once
 
 
