@@ -24,6 +24,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate, make_actor, make_qvalue, total_loss
+from torchrl_h2o.options import RunOptions
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import sim_capacity_of
@@ -41,7 +42,7 @@ from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resum
 from torchrl_h2o.training.task import Task
 
 
-@hydra_main("config", "h2o_plus")
+@hydra_main("config", "h2o_plus", RunOptions)
 def main(cfg: DictConfig) -> None:
     cfg, folder = open_run(cfg)
     with claimed(folder), resumable(folder):

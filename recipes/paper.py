@@ -21,18 +21,16 @@ from omegaconf import DictConfig
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.comparison.grids import check_overrides, chosen_grid, group_name
 from torchrl_h2o.comparison.launching import GridLauncher, shared_overrides
+from torchrl_h2o.comparison.options import PaperOptions
 from torchrl_h2o.comparison.recorded_run import train_grid_run
 
 
-@hydra_main("config", "paper")
+@hydra_main("config", "paper", PaperOptions)
 def main(cfg: DictConfig) -> None:
     shared = shared_overrides(HydraConfig.get().overrides.task)
-    try:
-        results = Path(cfg.results or Path(__file__).parent / "results" / f"{group_name(cfg)}.csv").resolve()
-        runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))
-        check_overrides(shared, runs)
-    except ValueError as error:
-        sys.exit(f"{type(error).__name__}: {error}")
+    results = Path(cfg.results or Path(__file__).parent / "results" / f"{group_name(cfg)}.csv").resolve()
+    runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))
+    check_overrides(shared, runs)
     grid = GridLauncher.of_this_job(results, shared, train_grid_run)
     try:
         failed = grid.run(runs, cfg.retries)

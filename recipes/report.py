@@ -16,17 +16,20 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_h2o.commands.hydra_main import hydra_main
-from torchrl_h2o.comparison.results_file import read_rows
+from torchrl_h2o.comparison.grids import FIGURES, TABLES
+from torchrl_h2o.comparison.options import ReportOptions
+from torchrl_h2o.comparison.results_file import read_rows, require_groups
 from torchrl_h2o.comparison.robot_figures import draw_robot
 from torchrl_h2o.comparison.robot_trajectories import kept_results
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
 from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_seeds
 
 
-@hydra_main("config", "report")
+@hydra_main("config", "report", ReportOptions)
 def main(cfg: DictConfig) -> None:
     results = Path(cfg.results or Path(__file__).parent / "results")
     to = Path(cfg.to or results)
+    require_groups(results, [*cfg.groups, *cfg.by_seed], TABLES | FIGURES)
     references = REFERENCES | {env: tuple(returns) for env, returns in cfg.references.items()}
     refused = []
     for group in cfg.groups:

@@ -16,12 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.comparison.recorded_run import train_and_record
+from torchrl_h2o.options import TrainOptions
 from torchrl_h2o.training.populations.job import run_population
 from torchrl_h2o.training.populations.loop import members_of
 from torchrl_h2o.training.run_folder import claimed, open_run, resumable
 
 
-@hydra_main("config", "train")
+@hydra_main("config", "train", TrainOptions)
 def main(cfg: DictConfig) -> None:
     if OmegaConf.is_missing(cfg, "resume"):
         cfg.overrides = list(HydraConfig.get().overrides.task)

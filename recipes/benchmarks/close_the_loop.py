@@ -10,20 +10,21 @@ Writes results.json, results.csv (one row per case) and each case's report.html 
 
 from pathlib import Path
 
-import hydra
 from families import choose_families
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from options import CloseTheLoopBenchmarkOptions
 from results_table import print_speed, print_table
 from running import Job, run_all
 from speed import steps_per_second
 from systems import SYSTEMS
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.residuals import Simulation, close_the_loop
 
 
-@hydra.main(config_path="../config", config_name="close_the_loop_benchmark", version_base=None)
+@hydra_main("../config", "close_the_loop_benchmark", CloseTheLoopBenchmarkOptions)
 def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     logs = None if cfg.logs is None else Path(cfg.logs).resolve()

@@ -15,18 +15,19 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import hydra
 import numpy as np
 from corruption_cases import CORRUPTIONS, Corruption
 from corruption_controls import drawn_controls, real_controls
 from corruption_logs import DamagedLog, GoodLog, good_log
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from options import CorruptionsOptions
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.residuals import Simulation
 
@@ -126,7 +127,7 @@ def print_table(rows: list[dict]) -> None:
                   f"{row.get('words', '')}")  # fmt: skip
 
 
-@hydra.main(config_path="../config", config_name="corruptions_benchmark", version_base=None)
+@hydra_main("../config", "corruptions_benchmark", CorruptionsOptions)
 def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     directory.mkdir(parents=True, exist_ok=True)

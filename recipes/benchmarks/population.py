@@ -13,14 +13,15 @@ import platform
 from collections.abc import Callable
 from pathlib import Path
 
-import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from options import PopulationOptions
 from turns import calls_per_second
 from update import action_spec, recipe_on, some_transitions
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.learner import Learner
@@ -123,7 +124,7 @@ def print_table(result: dict) -> None:
     )
 
 
-@hydra.main(config_path="../config", config_name="population_benchmark", version_base=None)
+@hydra_main("../config", "population_benchmark", PopulationOptions)
 def main(cfg: DictConfig) -> None:
     run = recipe_on(cfg)
     lines = measure(cfg, run)

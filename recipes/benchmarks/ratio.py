@@ -16,15 +16,16 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
-import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
+from options import RatioOptions
 from ratio_systems import SYSTEMS, System
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
 from torchrl_h2o.objectives import (
     DynamicsRatioLoss,
@@ -146,7 +147,7 @@ def _cell(values: list[float]) -> str:
     return f"{f'{values_.mean():.2f} ± {values_.std(correction=0):.2f}':>15}"
 
 
-@hydra.main(config_path="../config", config_name="ratio_benchmark", version_base=None)
+@hydra_main("../config", "ratio_benchmark", RatioOptions)
 def main(cfg: DictConfig) -> None:
     torch.set_num_threads(cfg.threads)
     directory = Path(HydraConfig.get().runtime.output_dir)

@@ -15,12 +15,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import hydra
 import torch
 from cost_figure import draw_scaling
 from hydra.core.hydra_config import HydraConfig
 from memory import held, room_in_memory, room_on_disk, taken_by
 from omegaconf import DictConfig, OmegaConf
+from options import ScalingOptions
 from population import make_population
 from tensordict import TensorDict
 from tqdm import tqdm
@@ -28,6 +28,7 @@ from turns import calls_per_second
 from update import action_spec, recipe_on, some_transitions
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus
@@ -136,7 +137,7 @@ def print_table(costs: list[Cost]) -> None:
         print(f"{cost!s:<40}{times}{cost.memory / 1e6:>10.1f}")
 
 
-@hydra.main(config_path="../config", config_name="scaling_benchmark", version_base=None)
+@hydra_main("../config", "scaling_benchmark", ScalingOptions)
 def main(cfg: DictConfig) -> None:
     run = recipe_on(cfg)
     with TemporaryDirectory(dir=cfg.scratch) as scratch:

@@ -14,19 +14,20 @@ from collections.abc import Callable
 from itertools import cycle
 from pathlib import Path
 
-import hydra
 import mujoco
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from mujoco.rollout import Rollout
 from omegaconf import DictConfig
+from options import SimulatorOptions
 from tensordict import TensorDict
 from torchrl.envs import EnvBase, GymEnv
 from torchrl.envs.utils import step_mdp
 from turns import calls_per_second
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.envs import BatchedMujocoEnv, WheelLeggedEnv
 
 AHEAD = 20  # control steps of one call of mujoco.rollout
@@ -85,7 +86,7 @@ def bare_rollout(env: BatchedMujocoEnv, threads: int) -> Callable[[], object]:
     return lambda: pool.rollout(model, data, next(pieces), control)
 
 
-@hydra.main(config_path="../config", config_name="simulator_benchmark", version_base=None)
+@hydra_main("../config", "simulator_benchmark", SimulatorOptions)
 def main(cfg: DictConfig) -> None:
     threads = cfg.threads or os.cpu_count()
     functions = {"TorchRL's env": stepping(make(cfg)), "Gymnasium alone": gymnasium_stepping(make(cfg))}

@@ -13,10 +13,10 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from options import UpdateOptions
 from tensordict import TensorDict
 from textbook import TextbookH2OPlus
 from torch.utils.flop_counter import FlopCounterMode
@@ -24,6 +24,7 @@ from torchrl.data import Bounded
 from turns import calls_per_second
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import HybridLoss
 from torchrl_h2o.objectives.network_calls import NetworkCalls
@@ -140,7 +141,7 @@ def recipe_on(cfg: DictConfig) -> DictConfig:
     return OmegaConf.load(Path(__file__).parents[1] / "config" / "experiment.yaml")
 
 
-@hydra.main(config_path="../config", config_name="update_benchmark", version_base=None)
+@hydra_main("../config", "update_benchmark", UpdateOptions)
 def main(cfg: DictConfig) -> None:
     run = recipe_on(cfg)
     functions = contenders(cfg, run)

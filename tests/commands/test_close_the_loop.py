@@ -196,7 +196,6 @@ def test_the_catalogue_is_filtered_by_names_of_classes(compose, robot):
     ("overrides", "said"),
     [
         (["simulator=Hopper-v5"], "data=recorded requires the wheel-legged robot"),
-        (["simulator=wheel_legged", "simulator.gap_strength=2", "data=log.csv"], "belongs to a gap"),
         (["simulator=robot.xml", "data=log.csv"], "angle"),
         (["simulator=robot.xml", "data=log.csv", "simulator.coordinates={pitch: pivot}"], "the log observes angle"),
         (["simulator=nowhere.xml", "data=log.csv"], "nowhere.xml"),

@@ -117,14 +117,14 @@ def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(co
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["backbone=huber"], "choose expectile, sparse or exponential"),
+        (["backbone=huber"], "must be expectile, sparse or exponential"),
         (["gap_strength=2"], "belongs to a gap"),
-        (["n_steps=0"], "choose 1 to 499"),
+        (["n_steps=0"], "must be an integer of at least 1"),
         (["n_steps=500"], "less than the 500 steps of each world"),
-        (["num_qvalue_nets=0"], "choose at least 1"),
+        (["num_qvalue_nets=0"], "must be an integer of at least 1"),
         (["env=halfcheetah", "data=recorded"], "name a data set"),
-        (["keep=best"], "choose last or best_in_simulator"),
-        (["compiled=maybe"], "choose auto, true or false"),
+        (["keep=best"], "must be last or best_in_simulator"),
+        (["compiled=maybe"], "must be auto, true, false or null"),
         (["resume=nowhere"], "not the folder of a run"),
     ],
 )

@@ -14,6 +14,7 @@ from torchrl.envs import GymEnv
 from tests.small_runs import ROBOT, ROOT, SMALL, run
 from torchrl_h2o.effects import ActionDelay, Gravity
 from torchrl_h2o.envs import mujoco_model
+from torchrl_h2o.options import RunOptions, check_options
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.report.contents import (
     NOT_EXPLAINED,
@@ -27,7 +28,7 @@ from torchrl_h2o.training import cached_search
 from torchrl_h2o.training.cached_search import BLOCK, MOST_ROWS, digest, searched_rows
 from torchrl_h2o.training.environments import simulator_maker, task_of
 from torchrl_h2o.training.judging import table_of_population, table_of_run, write_summary
-from torchrl_h2o.training.mending import POSTERIOR_WORLDS, check_mending, find_missing_effects, report_of_run
+from torchrl_h2o.training.mending import POSTERIOR_WORLDS, find_missing_effects, prepare_mending, report_of_run
 from torchrl_h2o.training.real_data import cache_folder
 from torchrl_h2o.training.returns import Evaluation
 from torchrl_h2o.training.run_folder import load_config, save_config
@@ -133,7 +134,7 @@ def test_effects_that_the_report_does_not_recommend_are_left_out(pendulum, capsy
 )
 def test_a_report_that_advises_against_its_effects_is_named(compose, tmp_path, capsys, report, said):
     cfg, _ = compose(f"gap_fix={report.save(tmp_path)}", config="h2o_plus")
-    check_mending(cfg)
+    prepare_mending(cfg)
     written = capsys.readouterr().out
     assert said in written
     assert bool(written) == bool(said)
@@ -229,7 +230,7 @@ def test_mending_comes_after_the_gap_in_every_simulator_of_the_run(compose, tmp_
 
 def test_each_world_of_the_collection_has_a_draw_and_evaluations_the_best_values(compose, tmp_path):
     cfg, real = compose("gap=gravity", "mend=posterior", config="h2o_plus")
-    check_mending(cfg)
+    prepare_mending(cfg)
     found(Gravity(0.5), others=(ActionDelay(0.01),)).save(tmp_path / "mended")
     cfg.mended = find_missing_effects(cfg, task_of(cfg), real, tmp_path)
     task = task_of(cfg)
@@ -252,8 +253,7 @@ def test_each_world_of_the_collection_has_a_draw_and_evaluations_the_best_values
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["mend=first"], "mend=first: choose null, true or posterior"),
-        (["mend=true", "gap_fix=report.json"], "leave one of them out"),
+        (["mend=true", f"gap_fix={__file__}"], "leave one of them out"),
         (["mend=posterior", "env.batched=false"], "is not batched: use mend=true"),
         (["mend=posterior", "num_worlds=12"], "a multiple of 12"),
     ],
@@ -262,12 +262,12 @@ def test_settings_that_contradict_each_other_are_refused(overrides, said):
     with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
         cfg = hydra.compose("h2o_plus", overrides)
     with pytest.raises(ValueError, match=said):
-        check_mending(cfg)
+        check_options(cfg, RunOptions)
 
 
 def test_without_mend_nothing_changes(compose, tmp_path):
     cfg, real = compose(config="h2o_plus")
-    check_mending(cfg)
+    prepare_mending(cfg)
     assert cfg.num_worlds == 4
     assert find_missing_effects(cfg, task_of(cfg), real, tmp_path) is None
     assert not list(tmp_path.iterdir())

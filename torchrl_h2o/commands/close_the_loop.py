@@ -26,6 +26,7 @@ from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
+from torchrl_h2o.options import CloseTheLoopOptions
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 from torchrl_h2o.residuals.report.json_file import write_json
 from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
@@ -39,16 +40,11 @@ def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
         recording: measured data, for the coordinates and control step of an MJCF file.
 
     Raises:
-        ValueError: for a gap strength without a gap, or a recording that does not fit the model.
+        ValueError: for a recording that does not fit the model.
     """
     effects = [instantiate(effect) for effect in cfg.simulator.effects]
     if cfg.simulator.gap is not None:
         effects.append(paper_gap(cfg.simulator.gap, cfg.simulator.gap_strength))
-    elif cfg.simulator.gap_strength is not None:
-        raise ValueError(
-            f"simulator.gap_strength={cfg.simulator.gap_strength} belongs to a gap: choose one, such as "
-            "simulator.gap=gravity"
-        )
     if "path" in cfg.simulator:
         names, step = recording.coordinates(cfg.simulator.coordinates), cfg.simulator.control_step
         simulation = Simulation.from_mjcf(cfg.simulator.path, names, step or recording.control_step(), effects)
@@ -76,7 +72,7 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
     return [entry for entry in entries if any(fnmatchcase(names[entry.name], pattern) for pattern in patterns)]
 
 
-@hydra_main("../config", "close_the_loop")
+@hydra_main("../config", "close_the_loop", CloseTheLoopOptions)
 def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
@@ -103,11 +99,8 @@ def audited(cfg: DictConfig, recording: Recording, simulation: Simulation) -> Au
     """Audit the data, print the findings, and stop at severe ones; None with ``audit=false``.
 
     Raises:
-        ValueError: for an unknown value of ``audit``.
         DataError: for severe findings, unless ``audit=warn``.
     """
-    if cfg.audit not in (True, False, "warn"):
-        raise ValueError(f"audit={cfg.audit}: choose true, warn (goes on in spite of severe findings) or false")
     if not cfg.audit:
         return None
     found = audit(recording.transitions, simulation)

@@ -11,6 +11,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.options import EvaluateOptions
 from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of, task_of
 from torchrl_h2o.training.film import film
 from torchrl_h2o.training.methods import method_named
@@ -21,11 +22,9 @@ from torchrl_h2o.training.trained_policy import load_policy
 WORLDS = {"reality": make_reality, "simulator": make_simulator}
 
 
-@hydra_main("../config", "evaluate")
+@hydra_main("../config", "evaluate", EvaluateOptions)
 def main(options: DictConfig) -> None:
     directory, world = Path(options.checkpoint), options["in"]
-    if world not in WORLDS:
-        raise ValueError(f"in={world}: choose {' or '.join(WORLDS)}")
     cfg = load_config(directory)
     method = options.method or method_named(cfg.get("method", "h2o_plus")).title
     policy = load_policy(cfg, directory, method)

@@ -4,7 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
+
+from torchrl_h2o.options.nearest import did_you_mean
 
 WHOLE = 83.0  # s, all real data: the recording and the real robot's log both have 16,588 rows, 82.94 s
 SIZES = (2.5, 10.0, 30.0, WHOLE)
@@ -90,13 +92,10 @@ def chosen_data_sizes(cfg: DictConfig) -> DataSizeGrid:
     for key, known in {"methods": METHODS, "tasks": tuple(TASKS), "sizes": SIZES}.items():
         if cfg[key] is None:
             continue
-        if not OmegaConf.is_list(cfg[key]):
-            raise ValueError(f"{key}={cfg[key]}: give a list, {key}=[{cfg[key]}]")
         for unknown in set(cfg[key]) - set(known):
-            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(map(str, known))}")
+            names = list(map(str, known))
+            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}{did_you_mean(unknown, names)}")
         chosen[key] = tuple(cfg[key])
     if cfg.log is None and LOG in chosen.get("tasks", ()):
         raise ValueError("tasks=[log] needs the file of the real robot's log: log=standing_still.txt")
-    if cfg.log is not None and not Path(cfg.log).is_file():
-        raise ValueError(f"log={cfg.log}: there is no such file")
     return DataSizeGrid(**chosen, log=None if cfg.log is None else str(Path(cfg.log).resolve()))

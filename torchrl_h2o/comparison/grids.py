@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import cast
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torchrl_h2o.comparison.data_size_grid import DataSizeGrid, chosen_data_sizes
 from torchrl_h2o.comparison.results_file import key_of
 from torchrl_h2o.effects import PAPER_GAPS
+from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.training.methods import METHODS
 
 SIX = ("sac", "cql", "iql", "darc", "h2o", "h2o_plus")
@@ -100,17 +101,8 @@ FIGURES = {
 
 
 def group_name(cfg: DictConfig) -> str:
-    """Return the name of the requested table or figure.
-
-    Raises:
-        ValueError: for an unknown name, or unless exactly one table or figure is named.
-    """
-    if (cfg.table is None) == (cfg.figure is None):
-        raise ValueError(f"name one: table={' | '.join(TABLES)}, or figure={' | '.join(FIGURES)}")
-    kind, name, known = ("table", cfg.table, TABLES) if cfg.figure is None else ("figure", cfg.figure, FIGURES)
-    if name not in known:
-        raise ValueError(f"{kind}={name}: choose {', '.join(known)}")
-    return name
+    """Return the name of the requested table or figure."""
+    return cfg.table if cfg.figure is None else cfg.figure
 
 
 def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid:
@@ -125,13 +117,9 @@ def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid:
     if idle := [key for key in ("sizes", "log") if cfg[key] is not None]:
         raise ValueError(f"only figure=data_size has amounts of real data: leave out {' and '.join(idle)}")
     lists = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
-    for key, value in lists.items():
-        if not OmegaConf.is_list(value):
-            raise ValueError(f"{key}={value}: give a list, {key}=[{value}]")
     chosen = {key: tuple(value) for key, value in lists.items()}
-    for key, names in {"methods": METHODS, "gaps": PAPER_GAPS}.items():
-        for unknown in set(chosen.get(key, ())) - set(names):
-            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}")
+    for unknown in set(chosen.get("methods", ())) - set(METHODS):
+        raise ValueError(f"methods=[{unknown}]: choose {', '.join(METHODS)}{did_you_mean(unknown, METHODS)}")
     for data in chosen.get("datasets", ()):
         if env_of(data) is None:
             raise ValueError(

@@ -7,6 +7,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from torchrl_h2o.comparison.results_file import append_run
+from torchrl_h2o.options import TrainOptions, check_options
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.job import run_job
 from torchrl_h2o.training.methods import method_named
@@ -44,6 +45,7 @@ def train_grid_run(cfg: DictConfig) -> None:
     """
     cfg.overrides = list(HydraConfig.get().overrides.task)
     cfg.seeds = cfg.gaps = None  # in the grid they select runs; in a single run they would start a population
+    check_options(cfg, TrainOptions, saved=True)  # as saved, because it also has the options of the grid
     results = cfg.results
     cfg, directory = open_run(cfg, go_on=True)
     cfg.results = results  # an interrupted run may have been started for another results file

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 
 from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import PAPER_GAPS
+from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.training.run_folder import uninterrupted
 
 IDENTITY = (
@@ -215,6 +216,17 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     with open(path, newline="") as file:
         return list(csv.DictReader(file))
+
+
+def require_groups(results: Path, groups: Iterable[str], known: Iterable[str]) -> None:
+    """Require that groups of results have a file, or at least a known name.
+
+    Raises:
+        ValueError: for a group that has neither.
+    """
+    names = sorted({*known, *(path.stem for path in results.glob("*.csv"))})
+    for unknown in [group for group in groups if group not in names]:
+        raise ValueError(f"{unknown}: there is no {results / unknown}.csv{did_you_mean(unknown, names)}")
 
 
 def recorded(path: Path) -> set[tuple[str, ...]]:

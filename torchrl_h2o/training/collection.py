@@ -6,7 +6,6 @@ simulator and random streams, seeded from the run's seed.
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from importlib.util import find_spec
 from operator import methodcaller
 from typing import cast
 
@@ -29,25 +28,6 @@ class SeededCollector(Collector):
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         torch.manual_seed(seed)
         return super().set_seed(seed, static_seed)
-
-
-def check_collector(cfg: DictConfig) -> None:
-    """Validates the collector's settings before a run.
-
-    Raises:
-        ModuleNotFoundError: if Ray is chosen and not installed.
-        ValueError: if ``steps_per_epoch`` is not a multiple of the number of worlds of all workers.
-    """
-    chosen = _chosen(cfg)
-    if chosen.backend == "ray" and find_spec("ray") is None:
-        raise ModuleNotFoundError("collector=ray needs Ray: pip install 'torchrl_h2o[ray]', here and where workers run")
-    workers = chosen.get("workers", 1)
-    if workers < 1 or cfg.num_worlds < 1 or cfg.steps_per_epoch % (workers * cfg.num_worlds):
-        raise ValueError(
-            f"collector.workers={workers} num_worlds={cfg.num_worlds}: the worlds of all workers share the steps of an "
-            f"epoch equally; choose numbers such that steps_per_epoch={cfg.steps_per_epoch} is a multiple of their "
-            "product"
-        )
 
 
 def simulated_transitions(simulator: EnvBase, actor: torch.nn.Module, steps_per_epoch: int) -> Collector:

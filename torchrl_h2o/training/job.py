@@ -8,7 +8,6 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
-from torchrl_h2o.training.collection import check_collector
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.environments import measure_observation_norm, preprocessing_of, task_of
 from torchrl_h2o.training.film import try_to_film
@@ -64,10 +63,9 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
 
 
 def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
-    """Validates gap, report and collector, loads the real data, and saves the configuration with the normalisation."""
+    """Validates gap and report, loads the real data, and saves the configuration with the normalisation."""
     task = task_of(cfg)
     task.make_simulator()
-    check_collector(cfg)
     real = task.read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds"))
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from torchrl_h2o.data.readers.sources import Source, words_of
 from torchrl_h2o.effects import Effect, effect_to_dict
+from torchrl_h2o.options.run import POSTERIOR_WORLDS
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.report.contents import DataSummary
 from torchrl_h2o.training.cached_search import cached_report, write_whole
@@ -20,46 +21,21 @@ from torchrl_h2o.training.task import Task
 
 FOLDER = "mended"
 POSTERIOR = "posterior"
-POSTERIOR_WORLDS = 10  # smallest number of worlds with mend=posterior; each of them has one draw for the whole run
 
 
-def check_mending(cfg: DictConfig) -> None:
-    """Checks the options ``mend`` and ``gap_fix``, and sets ``num_worlds`` to the number that ``mend=posterior`` needs.
+def prepare_mending(cfg: DictConfig) -> None:
+    """Sets ``num_worlds`` to the number that ``mend=posterior`` needs, and reads the report of ``gap_fix``.
 
-    Writes a message if the report of ``gap_fix`` does not recommend its effects.
+    Writes a message if the number changes, or the report does not recommend its effects.
 
     Raises:
         torchrl_h2o.data.DataError: if the report of ``gap_fix`` cannot be read.
-        ValueError: for an unknown value, together with ``gap_fix``, or for ``mend=posterior`` with a task that is not
-            batched or steps per epoch that its worlds cannot share equally.
     """
-    mend = cfg.get("mend")
-    if mend not in (None, False, True, POSTERIOR):
-        raise ValueError(f"mend={mend}: choose null, true or {POSTERIOR}")
-    if not mend:
-        if cfg.get("gap_fix") is not None and (against := Report.load(cfg.gap_fix).why_not_recommended()):
-            tqdm.write(f"gap_fix={cfg.gap_fix}: this report does not recommend its effects for training: {against}")
-        return
-    if cfg.get("gap_fix") is not None:
-        raise ValueError(
-            f"gap_fix={cfg.gap_fix} mend={mend}: gap_fix takes the effects from a report, mend searches for them in "
-            "the run's own data; leave one of them out"
-        )
-    if mend != POSTERIOR:
-        return
-    if not cfg.env.get("batched", False):
-        raise ValueError(
-            f"mend={POSTERIOR} gives each world of a batched simulator its own effects, and env={cfg.env.name} is not "
-            "batched: use mend=true, or set env.batched=true for a Gymnasium MuJoCo task"
-        )
-    if cfg.num_worlds < POSTERIOR_WORLDS:
+    if cfg.gap_fix is not None and (against := Report.load(cfg.gap_fix).why_not_recommended()):
+        tqdm.write(f"gap_fix={cfg.gap_fix}: this report does not recommend its effects for training: {against}")
+    if cfg.mend == POSTERIOR and cfg.num_worlds < POSTERIOR_WORLDS:
         tqdm.write(f"mend={POSTERIOR}: num_worlds={POSTERIOR_WORLDS} instead of {cfg.num_worlds}, one draw per world")
         cfg.num_worlds = POSTERIOR_WORLDS
-    if cfg.steps_per_epoch % cfg.num_worlds:
-        raise ValueError(
-            f"mend={POSTERIOR} num_worlds={cfg.num_worlds}: the worlds share the steps of an epoch equally; make "
-            f"steps_per_epoch={cfg.steps_per_epoch} a multiple of {cfg.num_worlds}"
-        )
 
 
 def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, directory: Path) -> dict[str, Any] | None:

@@ -17,9 +17,8 @@ from torchrl_h2o import __version__
 from torchrl_h2o.data import DataError, check_specs, episodes, load, read_ted, write_ted
 from torchrl_h2o.data.readers.sources import Source, is_log, words_of
 from torchrl_h2o.envs import record
+from torchrl_h2o.options.sources import RECORDED
 from torchrl_h2o.training.returns import Evaluation
-
-RECORDED = "recorded"
 
 
 def read_real_data(

@@ -17,10 +17,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_h2o.training.mending import check_mending
-
-KEEP = ("last", "best_in_simulator")
-BACKBONES = ("expectile", "sparse", "exponential")
+from torchrl_h2o.options import TrainOptions, check_options
+from torchrl_h2o.training.mending import prepare_mending
 
 
 def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
@@ -34,7 +32,7 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         The run's configuration and its folder.
 
     Raises:
-        ValueError: for other overrides together with ``resume``, or settings that contradict each other.
+        ValueError: for other overrides together with ``resume``, or wrong options in the folder's configuration.
         FileNotFoundError: if the folder given by ``resume`` is not the folder of a run.
         FileExistsError: if the folder of a new run already contains a run.
     """
@@ -46,44 +44,18 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         if not any(directory.iterdir()):
             directory.rmdir()  # Hydra has made it; a mistyped name shall not leave a folder
         cfg = load_config(directory)
+        check_options(cfg, TrainOptions, saved=True)
     elif (directory / "config.yaml").exists():
         if not go_on:
             raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
         cfg = load_config(directory)
     else:
-        check_settings(cfg)
-        check_mending(cfg)
+        prepare_mending(cfg)
         resolve_paths(cfg)
         save_config(cfg, directory)
     torch.set_num_threads(cfg.threads)
     tqdm.write(f"run folder: {os.path.relpath(directory)}")
     return cfg, directory
-
-
-def check_settings(cfg: DictConfig) -> None:
-    """Checks settings whose errors would otherwise appear only late in a run.
-
-    Raises:
-        ValueError: for an invalid setting; the message lists the allowed values.
-    """
-    if cfg.updates < 1:
-        raise ValueError(f"updates={cfg.updates}: train for at least one")
-    if cfg.backbone not in BACKBONES:
-        raise ValueError(f"backbone={cfg.backbone}: choose {', '.join(BACKBONES[:-1])} or {BACKBONES[-1]}")
-    if cfg.get("keep", "last") not in KEEP:
-        raise ValueError(f"keep={cfg.keep}: choose {' or '.join(KEEP)}")
-    if cfg.get("compiled") not in (None, "auto", True, False):
-        raise ValueError(f"compiled={cfg.compiled}: choose auto, true or false")
-    steps_per_world = cfg.steps_per_epoch // cfg.num_worlds
-    if not 1 <= cfg.get("n_steps", 1) < max(2, steps_per_world):
-        raise ValueError(
-            f"n_steps={cfg.n_steps}: choose 1 to {max(1, steps_per_world - 1)}, less than the {steps_per_world} steps "
-            f"of each world in an epoch (steps_per_epoch={cfg.steps_per_epoch} of num_worlds={cfg.num_worlds})"
-        )
-    if cfg.get("num_qvalue_nets", 2) < 1:
-        raise ValueError(f"num_qvalue_nets={cfg.num_qvalue_nets}: choose at least 1; 2 is usual")
-    if cfg.gap is None and cfg.get("gaps") is None and cfg.gap_strength is not None:
-        raise ValueError(f"gap_strength={cfg.gap_strength} belongs to a gap: name one, such as gap=gravity")
 
 
 def resolve_paths(cfg: DictConfig) -> None:

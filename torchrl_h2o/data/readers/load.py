@@ -78,7 +78,7 @@ def _read(
     if path.is_dir():
         _require_no_columns(columns, source)
         return _read_folder(path, task)
-    if path.exists() or _looks_like_a_path(source):
+    if path.exists() or looks_like_a_path(source):
         return _read_file(path, columns, reward, task)
     _require_no_columns(columns, source)
     return read_minari(str(source), task=task)
@@ -139,6 +139,6 @@ def _read_file(
     return read_robot_log(path, columns, reward=reward)
 
 
-def _looks_like_a_path(source: str | Path) -> bool:
+def looks_like_a_path(source: str | Path) -> bool:
     """Whether a source is a path; a Minari name has no file suffix, does not start with / and ends in a version."""
     return isinstance(source, Path) or not re.fullmatch(r"[-\w]+(/[-\w]+)*-v\d+", source)

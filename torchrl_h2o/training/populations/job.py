@@ -25,14 +25,8 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
         directory: the population's folder.
 
     Raises:
-        ValueError: for any method except H2O+, or for baselines.
         DivergenceError: at the end, with the members that diverged.
     """
-    if cfg.method != "h2o_plus" or cfg.baselines:
-        raise ValueError(
-            f"method={cfg.method} baselines={cfg.baselines}: a population trains h2o_plus alone; "
-            "use --multirun for other methods"
-        )
     start = time.perf_counter()
     for own in members.values():
         task_of(own).make_simulator()  # fails before the data are loaded if a gap does not fit the model

@@ -32,26 +32,14 @@ SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
 
 def members_of(cfg: DictConfig) -> dict[str, DictConfig]:
-    """Build the configuration of each member, by name such as ``seed_0_gravity``; empty for a single run.
-
-    Raises:
-        ValueError: if a swept setting is not a list, is empty, or has a value twice.
-    """
-    swept = {one: _listed(cfg, many) for many, one in SWEPT.items() if cfg.get(many) is not None}
+    """Build the configuration of each member, by name such as ``seed_0_gravity``; empty for a single run."""
+    swept = {one: list(cfg[many]) for many, one in SWEPT.items() if cfg.get(many) is not None}
     members = {}
     for values in product(*swept.values()) if swept else ():
         chosen = dict(zip(swept, values, strict=True))
         name = "_".join(_word(key, value) for key, value in chosen.items())
-        if name in members:
-            raise ValueError(f"{name} is in the population twice: name each of seeds, gaps and mixings once")
         members[name] = OmegaConf.merge(cfg, chosen, dict.fromkeys(SWEPT))
     return members
-
-
-def _listed(cfg: DictConfig, key: str) -> list:
-    if not OmegaConf.is_list(cfg[key]) or not len(cfg[key]):
-        raise ValueError(f"{key}={cfg[key]}: give a list of at least one, such as {key}=[{cfg[SWEPT[key]]}]")
-    return list(cfg[key])
 
 
 def _word(key: str, value: object) -> str:

@@ -1,0 +1,283 @@
+"""Wrong options end a command with one line, before any work and without files; right ones pass."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from hydra.core.singleton import Singleton
+from omegaconf import OmegaConf, open_dict
+
+from tests.run_fixtures import ROOT
+from torchrl_h2o.comparison.options import PaperOptions, ReportOptions
+from torchrl_h2o.effects import PAPER_GAPS
+from torchrl_h2o.options import (
+    CloseTheLoopOptions,
+    EvaluateOptions,
+    RunOptions,
+    TrainOptions,
+    check_options,
+)
+from torchrl_h2o.training.methods import METHODS
+
+GAPS = ", ".join(PAPER_GAPS)
+COUNT = "must be an integer of at least 1"
+NOWHERE = "there is no such file or folder"
+NOT_A_RUN = "it is not the folder of a run, which has a config.yaml"
+
+TRAIN = {
+    "updates=0": f"updates=0: {COUNT}",
+    "updates_per_epoch=0": f"updates_per_epoch=0: {COUNT}",
+    "eval_every=0": f"eval_every=0: {COUNT}",
+    "checkpoint_every=0": f"checkpoint_every=0: {COUNT}",
+    "steps_per_epoch=0": f"steps_per_epoch=0: {COUNT}",
+    "batch_size=8": "batch_size=8: must be two integers of at least 1, [real,simulated], such as [128,128]",
+    "seed=-1": "seed=-1: must be an integer from 0 to 4294967295",
+    "gamma=1.5": "gamma=1.5: must be a number from 0 to 1",
+    "num_cells=[]": "num_cells=[]: must be the sizes of at least one layer, such as [256,256]",
+    "device=cuda": "device=cuda: a single run trains on the CPU; device is an option of populations, such as "
+    "seeds=[0,1]",
+    "update=100": "no option update; did you mean updates?",
+    "method=h2oplus": "method=h2oplus: must be sac, cql, iql, darc, h2o, h2o_plus, rlpd or td3; did you mean h2o_plus?",
+    "gap=gravty": f"gap=gravty: must be {GAPS} or null; did you mean gravity?",
+    "env=halfcheeta": "env=halfcheeta: must be halfcheetah, walker2d, wheel_legged, wheel_legged_forward or "
+    "wheel_legged_poor; did you mean halfcheetah?",
+    "data=halfcheetah/medium-repaly-v0": "data=halfcheetah/medium-repaly-v0: there is no such data set on this "
+    "machine; did you mean halfcheetah/medium-replay-v0?",
+    "data=standing_stil.txt": f"data=standing_stil.txt: {NOWHERE}; did you mean standing_still.txt?",
+    "preset=papr": "preset=papr: must be paper; did you mean paper?",
+    "collector=multisync": "collector=multisync: must be multi_sync, ray or sync; did you mean multi_sync?",
+    "backbone=expectil": "backbone=expectil: must be expectile, sparse or exponential; did you mean expectile?",
+    "ratio_estimator=pair": "ratio_estimator=pair: must be paper, change or pairs; did you mean pairs?",
+    "keep=best": "keep=best: must be last or best_in_simulator",
+    # further ones
+    "lr=nan": "lr=nan: must be a number above 0",
+    "layer_norm=2": "layer_norm=2: must be true or false",
+    "change_noise=-1": "change_noise=-1: must be auto or a number of at least 0",
+    "compiled=maybe": "compiled=maybe: must be auto, true, false or null",
+    "mend=first": "mend=first: must be true, false, posterior or null",
+    "baselines=[sca]": "baselines=[sca]: must be a list out of sac, cql, iql, darc, h2o, h2o_plus, rlpd, td3; did you "
+    "mean sac?",
+    "seeds=4": "seeds=4: must be null or a list of one or more integers from 0 to 4294967295, such as [0,1,2]",
+    "seeds=[1,1]": "seeds=[1,1]: 1 is in the population twice; name each value once",
+    "seeds=[0,1] method=sac": "method=sac baselines=[]: a population trains h2o_plus alone; use --multirun for other "
+    "methods",
+    "gap_strength=2": "gap_strength=2.0 belongs to a gap: name one, such as gap=gravity",
+    "n_steps=500": "n_steps=500: must be from 1 to 499, less than the 500 steps of each world in an epoch "
+    "(steps_per_epoch=2000 of num_worlds=4)",
+    "num_worlds=2001": "num_worlds=2001: must be at most steps_per_epoch=2000, which the worlds share",
+    "mend=posterior collector=multi_sync collector.workers=5 steps_per_epoch=2020": "collector.workers=5 "
+    "num_worlds=10: the worlds of all workers share the steps of an epoch equally; choose numbers such that "
+    "steps_per_epoch=2020 is a multiple of their product",
+    "columns=nowhere.yaml": "columns=nowhere.yaml: there is no such file, and the library's layouts are "
+    "double_pendulum, simple_pendulum, wheel_legged_moving_forward, wheel_legged_standing_still",
+    "gap_fix=report.jsn": f"gap_fix=report.jsn: {NOWHERE}",
+    "resume=nowhere": f"resume=nowhere: {NOT_A_RUN}",
+    "env.make.max_episode_steps=0": f"env.make.max_episode_steps=0: {COUNT} or null",
+    "env.make.tsk=moving": "no option env.make.tsk; did you mean env.make.task?",
+    "env=halfcheetah env.make.env_name=HalfCheeta-v5": "env.make.env_name=HalfCheeta-v5: Environment HalfCheeta "
+    "doesn't exist. Did you mean: HalfCheetah?",
+    "presets=paper": "no option presets; did you mean preset?",
+    "+foo=1": "no option foo; --help lists the options",
+    "num_cells=[": "num_cells=[: cannot be read; write name=value, and quote a value that has special characters",
+    "gamma=2 lr=0": "gamma=2: must be a number from 0 to 1; lr=0: must be a number above 0",
+}
+OTHERS = {
+    ("h2o_plus", "tau=0"): "tau=0: must be a number above 0 and at most 1",
+    ("torchrl_h2o.commands.evaluate", "checkpoint=nowhere"): f"checkpoint=nowhere: {NOT_A_RUN}",
+    ("torchrl_h2o.commands.evaluate", ""): "checkpoint is missing: write checkpoint=..., the folder of a run",
+    ("torchrl_h2o.commands.evaluate", "checkpoint=runs/firts in=realty"): "checkpoint=runs/firts: "
+    f"{NOT_A_RUN}; did you mean runs/first?; in=realty: must be reality or simulator; did you mean reality?",
+    ("torchrl_h2o.commands.close_the_loop", "data=nowhere.csv"): f"data=nowhere.csv: {NOWHERE}",
+    ("torchrl_h2o.commands.close_the_loop", "simulator=robto.xml"): f"simulator.path=robto.xml: {NOWHERE}; did you "
+    "mean robot.xml?",
+    ("torchrl_h2o.commands.close_the_loop", "simulator=nothing"): "simulator=nothing: must be gymnasium, mjcf or "
+    "wheel_legged",
+    ("torchrl_h2o.commands.close_the_loop", "simulator.gap_strength=2"): "simulator.gap_strength=2.0 belongs to a gap: "
+    "choose one, such as simulator.gap=gravity",
+    ("torchrl_h2o.commands.close_the_loop", "catalogue=[Gravty]"): "catalogue=[Gravty]: Gravty: matches no effect; did "
+    "you mean Gravity?",
+    ("torchrl_h2o.commands.close_the_loop", "held_out=0"): "held_out=0: must be a share of the rows above 0 and below "
+    "1, or the names of logs, such as [c.csv]",
+    ("torchrl_h2o.commands.close_the_loop", "audit=maybe"): "audit=maybe: must be true, false or warn",
+    ("paper", "table=retuns"): "table=retuns: must be returns, mixing, gaps, methods or null; did you mean returns?",
+    ("paper", "figure=backbone"): "figure=backbone: must be backbones, wheel_legged, data_size or null; did you mean "
+    "backbones?",
+    ("paper", "table=returns methods=[h2oplus]"): "methods=[h2oplus]: choose sac, cql, iql, darc, h2o, h2o_plus, rlpd, "
+    "td3; did you mean h2o_plus?",
+    ("paper", "table=returns device=cuda"): "device=cuda: each run of a grid trains on the CPU; leave device out",
+    ("report", "groups=[retuns]"): f"retuns: there is no {ROOT}/recipes/results/retuns.csv; did you mean returns?",
+    ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
+    "environment, such as +references.mine=[0,1000]",
+    ("simulator", "seconds=0"): "seconds=0: must be a number above 0",
+    ("population", "device=gpu"): "device=gpu: must be cpu, cuda or a numbered device such as cuda:1",
+}
+
+
+@pytest.fixture
+def refused(tmp_path, monkeypatch, capsys):
+    """Call a command in a folder with a few files; return its line, having checked status, output and files."""
+    for name in ("standing_still.txt", "robot.xml", "runs/first/config.yaml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "minari" / "halfcheetah" / "medium-replay-v0" / "data").mkdir(parents=True)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.chdir(tmp_path)
+    before, state = sorted(tmp_path.rglob("*")), Singleton.get_state()
+
+    def call(module, *overrides):
+        command = importlib.import_module(module)
+        # Hydra looks for the configuration of an imported module in a package, which recipes/config is not
+        folder = [] if module.startswith("torchrl_h2o") else ["--config-path", str(ROOT / "recipes" / "config")]
+        monkeypatch.setattr(sys, "argv", [module, *folder, *overrides])
+        with pytest.raises(SystemExit) as ended:
+            getattr(command, "run", command.main)()
+        printed = capsys.readouterr()
+        assert (ended.value.code, printed.out) == (1, "")
+        assert sorted(tmp_path.rglob("*")) == before
+        (line,) = printed.err.splitlines()
+        return line
+
+    yield call
+    Singleton.set_state(state)
+
+
+@pytest.mark.parametrize("typed", TRAIN)
+def test_a_wrong_option_of_a_run_is_one_line_with_what_is_allowed(refused, typed):
+    assert refused("train", *typed.split()) == f"ValueError: {TRAIN[typed]}"
+
+
+@pytest.mark.parametrize(("module", "typed"), OTHERS)
+def test_a_wrong_option_of_any_command_is_one_line_with_what_is_allowed(refused, module, typed):
+    assert refused(module, *typed.split()) == f"ValueError: {OTHERS[module, typed]}"
+
+
+def test_a_wrong_option_of_a_job_of_a_multirun_is_one_line(refused, tmp_path):
+    sweep = f"hydra.sweep.dir={tmp_path.parent / 'sweep'}"
+    assert refused("train", "-m", "gamma=1.5,2", sweep) == f"ValueError: {TRAIN['gamma=1.5']}"
+
+
+def composed(config, *overrides, folder=ROOT / "recipes" / "config"):
+    with hydra.initialize_config_dir(str(folder), version_base=None):
+        return hydra.compose(config, list(overrides))
+
+
+ENVS = [path.stem for path in (ROOT / "torchrl_h2o" / "config" / "env").glob("*.yaml")]
+
+
+@pytest.mark.parametrize("env", ENVS)
+@pytest.mark.parametrize("chosen", [[], ["preset=paper", "collector=multi_sync"], ["collector=ray"]])
+def test_the_options_that_ship_with_every_environment_pass(env, chosen):
+    check_options(composed("train", f"env={env}", *chosen), TrainOptions)
+
+
+@pytest.mark.parametrize(
+    ("config", "model"), [("h2o_plus", RunOptions), ("paper", PaperOptions), ("report", ReportOptions)]
+)
+def test_the_options_that_ship_with_the_other_recipes_pass(config, model):
+    check_options(composed(config, *(["table=returns"] if config == "paper" else [])), model)
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [[], ["simulator=gymnasium", "simulator.task=Hopper-v5"], ["simulator=mjcf", f"simulator.path={__file__}"]],
+)
+def test_the_options_that_ship_with_the_commands_pass(chosen, tmp_path):
+    folder = ROOT / "torchrl_h2o" / "config"
+    check_options(composed("close_the_loop", *chosen, folder=folder), CloseTheLoopOptions)
+    (tmp_path / "config.yaml").touch()
+    check_options(composed("evaluate", f"checkpoint={tmp_path}", folder=folder), EvaluateOptions)
+
+
+@pytest.mark.parametrize(
+    ("config", "model"),
+    {
+        "simulator": "SimulatorOptions",
+        "update": "UpdateOptions",
+        "population": "PopulationOptions",
+        "scaling": "ScalingOptions",
+        "close_the_loop": "CloseTheLoopBenchmarkOptions",
+        "corruptions": "CorruptionsOptions",
+        "ratio": "RatioOptions",
+    }.items(),
+)
+def test_the_options_that_ship_with_the_benchmarks_pass(config, model):
+    check_options(composed(f"{config}_benchmark"), getattr(importlib.import_module("options"), model))
+
+
+def test_the_names_of_methods_are_those_that_there_are():
+    schema = TrainOptions.model_json_schema()["properties"]["method"]
+    assert schema["enum"] == list(METHODS)
+
+
+def test_an_environment_of_the_user_may_have_entries_of_its_own_but_no_misspelt_option():
+    cfg = composed("train", "+env.colour=red", "+env.make.wheels=2", "updates=${steps_per_epoch}")
+    check_options(cfg, TrainOptions)
+    with open_dict(cfg):
+        cfg.upates = 5  # as a line in env/mine.yaml
+    with pytest.raises(ValueError, match=r"^no option upates; did you mean updates\?$"):
+        check_options(cfg, TrainOptions)
+
+
+@pytest.mark.parametrize("name", ["Hopper-v5", "Hopper", "gymnasium.envs.mujoco:Hopper-v5"])
+def test_every_name_that_gymnasium_completes_is_a_task(name):
+    folder = ROOT / "torchrl_h2o" / "config"
+    check_options(
+        composed("close_the_loop", "simulator=gymnasium", f"simulator.task='{name}'", folder=folder),
+        CloseTheLoopOptions,
+    )
+
+
+def test_a_configuration_of_an_earlier_version_passes_but_not_with_a_wrong_value():
+    cfg = composed("train", "data=recorded")
+    with open_dict(cfg):
+        for later in ("collector", "n_steps", "mend", "mended", "data_seconds", "gap_fix", "keep", "compiled", "h2o"):
+            del cfg[later]
+        cfg.data, cfg.columns, cfg.long_gone = "/moved/elsewhere.txt", "/moved/columns.yaml", 1
+    check_options(cfg, TrainOptions, saved=True)
+    cfg.gamma = 1.5
+    with pytest.raises(ValueError, match=r"^gamma=1\.5: must be a number from 0 to 1$"):
+        check_options(cfg, TrainOptions, saved=True)
+    check_options(OmegaConf.create({"checkpoint": "moved"}), EvaluateOptions, saved=True)
+
+
+@pytest.mark.parametrize(
+    ("devices", "device", "said"),
+    [
+        (0, "cuda", "device=cuda: this machine has no CUDA device that torch can use; choose device=cpu"),
+        (1, "cuda:1", "device=cuda:1: the last CUDA device of this machine is cuda:0"),
+        (1, "cuda", None),
+        (0, "cpu", None),
+    ],
+)
+def test_a_population_trains_on_a_device_that_this_machine_has(monkeypatch, devices, device, said):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: devices > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: devices)
+    cfg = composed("train", "seeds=[0,1]", f"device={device}")
+    if said is None:
+        check_options(cfg, TrainOptions)
+    else:
+        with pytest.raises(ValueError, match=f"^{said}$"):
+            check_options(cfg, TrainOptions)
+
+
+def test_a_data_set_that_is_not_on_this_machine_may_be_downloaded_and_several_files_are_data(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    (tmp_path / "mine" / "quiet-v1" / "data").mkdir(parents=True)
+    (tmp_path / "a.csv").touch()
+    for data in ("D4RL/door/human-v2", "mine/quiet-v1", "mine/quiet-v2", f"[{tmp_path}/a.csv]", f"{tmp_path}/*.csv"):
+        check_options(composed("train", f"data={data}"), TrainOptions)
+    with pytest.raises(ValueError, match=r"did you mean mine/quiet-v1\?"):
+        check_options(composed("train", "data=mine/quite-v1"), TrainOptions)
+    with pytest.raises(ValueError, match=f"b.csv: {NOWHERE}; did you mean .*a.csv"):
+        check_options(composed("train", f"data=[{tmp_path}/a.csv,{tmp_path}/b.csv]"), TrainOptions)
+
+
+def test_no_folder_of_the_user_is_removed(refused, tmp_path):
+    elsewhere = Path(tmp_path.parent / "empty" / "run")
+    elsewhere.parent.mkdir()
+    assert refused("train", "gamma=2", f"hydra.run.dir={elsewhere}").startswith("ValueError: gamma=2")
+    assert list(elsewhere.parent.iterdir()) == []

@@ -1,0 +1,74 @@
+"""Options of close-the-loop, config/close_the_loop.yaml and simulator/*.yaml."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+import torchrl_h2o.effects
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.options.nearest import did_you_mean
+from torchrl_h2o.options.run import MakeOptions
+from torchrl_h2o.options.sources import AnyPath, Data, Layout
+from torchrl_h2o.options.types import Count, Gap, Inside, Options, Positive, Seed
+
+EFFECTS = sorted(
+    name for name, one in vars(torchrl_h2o.effects).items() if isinstance(one, type) and issubclass(one, Effect)
+)
+
+
+def _require_match(pattern: str) -> str:
+    if not any(fnmatchcase(name, pattern) for name in EFFECTS):
+        near = did_you_mean(pattern, EFFECTS)
+        raise ValueError(f"matches no effect{near or '; choose from ' + ', '.join(EFFECTS)}")
+    return pattern
+
+
+Pattern = Annotated[
+    str, AfterValidator(_require_match), Field(description="a pattern of effects' names, such as Joint*")
+]
+
+
+class SimulatorOptions(Options):
+    """``simulator``: files in simulator/*.yaml, also those of users, which may have further entries."""
+
+    model_config = ConfigDict(extra="allow")
+
+    path: AnyPath | None = None
+    make: MakeOptions | None = None
+    task: str | None = None
+    coordinates: list[str] | dict[str, str] | None = None
+    control_step: Positive | None = None
+    gap: Gap | None = None
+    gap_strength: float | None = None
+    effects: list[dict[str, Any]]
+    columns: Layout | None = None
+    recorded: str | None = None
+
+    @model_validator(mode="after")
+    def _has_a_gap(self) -> SimulatorOptions:
+        if self.gap is None and self.gap_strength is not None:
+            raise ValueError(
+                f"simulator.gap_strength={self.gap_strength} belongs to a gap: choose one, such as "
+                "simulator.gap=gravity"
+            )
+        return self
+
+
+class CloseTheLoopOptions(Options):
+    """Options of close-the-loop."""
+
+    simulator: SimulatorOptions
+    data: Data
+    columns: Layout | None
+    transitions: Count | None
+    first_row: Annotated[int, Field(ge=0)]
+    held_out: Inside | str | list[str] = Field(
+        description="a share of the rows above 0 and below 1, or the names of logs, such as [c.csv]"
+    )
+    audit: bool | Literal["warn"]
+    start_from: AnyPath | None
+    catalogue: Pattern | list[Pattern] | None
+    seed: Seed

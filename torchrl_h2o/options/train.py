@@ -1,0 +1,132 @@
+"""Options of train.py, recipes/config/any_method.yaml and collector/*.yaml."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+
+from torchrl_h2o.options.run import ExperimentOptions, RunOptions
+from torchrl_h2o.options.types import (
+    Count,
+    DeviceName,
+    Gap,
+    Inside,
+    NotNegative,
+    Options,
+    Positive,
+    Seed,
+    Share,
+    require_available,
+)
+
+Method = Literal["sac", "cql", "iql", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
+
+
+def _each_once(values: list) -> list:
+    twice = [value for value in values if values.count(value) > 1]
+    if twice:
+        raise ValueError(f"{twice[0]} is in the population twice; name each value once")
+    return values
+
+
+Seeds = Annotated[list[Seed], Field(min_length=1, examples=[[0, 1, 2]]), AfterValidator(_each_once)]
+Gaps = Annotated[list[Gap | None], Field(min_length=1), AfterValidator(_each_once)]
+Mixings = Annotated[list[Share], Field(min_length=1, examples=[[0.1, 0.5]]), AfterValidator(_each_once)]
+
+
+class H2OOptions(Options):
+    """``h2o``: the conservative term."""
+
+    alpha_c: NotNegative
+    num_samples: Count
+
+
+class IQLOptions(Options):
+    """``iql``: arguments of TorchRL's IQLLoss, of which others may be added."""
+
+    model_config = ConfigDict(extra="allow")
+
+    expectile: Inside
+    temperature: Positive
+
+
+class CQLOptions(Options):
+    """``cql``: arguments of TorchRL's CQLLoss, of which others may be added."""
+
+    model_config = ConfigDict(extra="allow")
+
+    min_q_weight: NotNegative
+    num_random: Count
+
+
+class CollectorOptions(Options):
+    """``collector``: where the simulators run."""
+
+    model_config = ConfigDict(extra="allow")
+
+    backend: Literal["direct", "process", "ray"]
+    workers: Count = 1
+    resources: dict[str, Any] | None = None
+    init: dict[str, Any] | None = None
+
+
+class AnyMethodOptions(ExperimentOptions):
+    """The options of any_method.yaml, each by itself."""
+
+    collector: CollectorOptions
+    method: Method
+    baselines: list[Method]
+    seeds: Seeds | None
+    gaps: Gaps | None
+    mixings: Mixings | None
+    device: DeviceName
+    h2o: H2OOptions
+    iql: IQLOptions
+    cql: CQLOptions
+    results: str | None
+    overrides: list[str] | None
+
+
+class TrainOptions(AnyMethodOptions, RunOptions):
+    """Options of train.py, with the relations between them."""
+
+    @model_validator(mode="after")
+    def _fit_the_method(self) -> TrainOptions:
+        self._check_population()
+        self._check_collector()
+        return self
+
+    def _check_gap(self) -> None:
+        if self.gaps is None:
+            super()._check_gap()
+
+    def _check_population(self) -> None:
+        if self.seeds is None and self.gaps is None and self.mixings is None:
+            if self.device != "cpu":
+                raise ValueError(
+                    f"device={self.device}: a single run trains on the CPU; device is an option of populations, such "
+                    "as seeds=[0,1]"
+                )
+            return
+        if self.method != "h2o_plus" or self.baselines:
+            raise ValueError(
+                f"method={self.method} baselines=[{','.join(self.baselines)}]: a population trains h2o_plus alone; "
+                "use --multirun for other methods"
+            )
+        try:
+            require_available(self.device)
+        except ValueError as error:
+            raise ValueError(f"device={self.device}: {error}") from None
+
+    def _check_collector(self) -> None:
+        if self.collector.backend == "ray" and find_spec("ray") is None:
+            raise ValueError("collector=ray needs Ray: pip install 'torchrl_h2o[ray]', here and where workers run")
+        workers = self.collector.workers
+        if self.steps_per_epoch % (workers * self.worlds):
+            raise ValueError(
+                f"collector.workers={workers} num_worlds={self.worlds}: the worlds of all workers share the steps "
+                f"of an epoch equally; choose numbers such that steps_per_epoch={self.steps_per_epoch} is a multiple "
+                "of their product"
+            )

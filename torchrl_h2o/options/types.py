@@ -1,0 +1,65 @@
+"""Types of options that several commands share: numbers with bounds, and names out of a table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from torchrl_h2o.effects import PAPER_GAPS
+
+
+class Options(BaseModel):
+    """Options of a command: unknown ones are refused, and text is not converted to numbers."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Accepts the names of a table, such as the paper's gaps; a ``Literal`` whose values are known at run time.
+
+    Args:
+        names: the accepted names.
+    """
+
+    names: tuple[str, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.literal_schema(list(self.names))
+
+
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]  # NumPy's and Gymnasium's generators accept no larger ones
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Inside = Annotated[float, Field(gt=0, lt=1)]
+Gap = Annotated[str, OneOf(tuple(PAPER_GAPS))]
+Rows = Annotated[
+    list[Count],
+    Field(min_length=2, max_length=2, description="two integers of at least 1, [real,simulated], such as [128,128]"),
+]
+Widths = Annotated[list[Count], Field(min_length=1, description="the sizes of at least one layer, such as [256,256]")]
+
+
+def require_available(device: str) -> str:
+    """Requires a device that torch can use on this machine.
+
+    Raises:
+        ValueError: if there is none of that name.
+    """
+    if device != "cpu" and not torch.cuda.is_available():
+        raise ValueError("this machine has no CUDA device that torch can use; choose device=cpu")
+    if device != "cpu" and int(device.partition(":")[2] or 0) >= (count := torch.cuda.device_count()):
+        raise ValueError(f"the last CUDA device of this machine is cuda:{count - 1}")
+    return device
+
+
+DeviceName = Annotated[
+    str, Field(pattern=r"^(cpu|cuda(:\d+)?)$", description="cpu, cuda or a numbered device such as cuda:1")
+]
+Device = Annotated[DeviceName, AfterValidator(require_available)]
