@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 from cases import Case, Family
+from leg import JOINTS
 from pendulum import CONTROL_STEP, PendulumEnv
 from scoring import (
     depends_on_time,
@@ -18,7 +19,15 @@ from scoring import (
 from systems import SYSTEMS
 from undeclared_effects import CubicWind, DriftingTorque, LateForce, MovingSpring, PlaceFriction, TorqueRipple
 
-from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry, Effect, JointDamping
+from torchrl_h2o.effects import (
+    ActionGain,
+    Armature,
+    BodyMass,
+    CatalogueEntry,
+    Effect,
+    JointDamping,
+    JointFrictionLoss,
+)
 from torchrl_h2o.residuals import Measured, Report, Simulation, residuals
 
 SENSOR_NOISE = 0.01
@@ -32,6 +41,8 @@ TRIES = 200
 EXPLAINABLE = 0.95  # of the error above the floor, of declared effects
 EXPLAINABLE_UNDECLARED = 0.8
 DAMPING_RATIO = (0.007, 0.015)  # of slow viscous friction: about 1 % of critical
+FRICTION, ARMATURE = (0.2, 0.9), (0.004, 0.012)  # N·m and kg·m², of each joint of the leg
+WITHIN = 0.15  # relative error of the leg's values
 DRIFT = (0.05, 0.15)  # N·m, torque that a drifting motor reaches at the end of the data
 
 
@@ -235,8 +246,44 @@ def judge_drift(report: Report, case: Case) -> dict:
     return {"ok": len(found) == 1 and depends_on_time(found[0])}
 
 
+def joints(number: int, rng: np.random.Generator) -> Case:
+    """Dry friction and rotor inertia of a leg's three joints, which differ from joint to joint."""
+    truth = tuple(
+        effect
+        for joint in JOINTS
+        for effect in (
+            JointFrictionLoss(float(rng.uniform(*FRICTION)), joint),
+            Armature(float(rng.uniform(*ARMATURE)), joint),
+        )
+    )
+    return Case(
+        name=f"leg {number}",
+        system="leg",
+        judge=judge_joints,
+        truth=truth,
+        in_reality=truth,
+        noise=SENSOR_NOISE,
+        seed=int(rng.integers(2**31)),
+        episode=10**6,
+    )
+
+
+def judge_joints(report: Report, case: Case) -> dict:
+    """Passed if friction and rotor inertia of every joint are right within 15 %, and nothing else is named."""
+    simulation = case.simulation()
+    true, found = (simulation.with_effects(*effects).model for effects in (case.truth, report.effects))
+    errors = np.abs(
+        np.concatenate(
+            [found.dof_frictionloss / true.dof_frictionloss - 1.0, found.dof_armature / true.dof_armature - 1.0]
+        )
+    )
+    others = [effect for effect in report.effects if not isinstance(effect, JointFrictionLoss | Armature)]
+    return {"ok": bool(errors.max() <= WITHIN) and not others, "parameter_error": float(errors.max())}
+
+
 SEVERAL = Family(several, 20, 17, "the exact set or its group, 95 % of the explainable error gone", stream=4)
 UNDECLARED_FORCE = Family(undeclared, 10, 9, "marked undeclared, 80 % of the residual gone", stream=5)
 NOTHING = Family(nothing, 20, 20, "'nothing missing'", stream=1)
 DECOY = Family(decoy, 4, 4, "reported as a group", stream=0)
 SLOW = Family(slow, 10, 8, "viscous friction or a torque that depends on time", stream=6)
+JOINT_BY_JOINT = Family(joints, 6, 5, "friction and rotor inertia of each joint within 15 %", stream=7)

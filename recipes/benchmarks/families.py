@@ -5,7 +5,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from cases import Family
-from drawn_cases import DECOY, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
+from drawn_cases import DECOY, JOINT_BY_JOINT, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
 from log_cases import log_families
 from paper_cases import PAPER, PAPER_WITH_NOISE
 
@@ -18,6 +18,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "nothing": NOTHING,
         "decoy": DECOY,
         "slow": SLOW,
+        "joints": JOINT_BY_JOINT,
     }
 )
 

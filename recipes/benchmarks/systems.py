@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import torch
 from gymnasium.wrappers import TimeLimit
+from leg import LegEnv
 from pendulum import PendulumEnv
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
@@ -130,6 +131,11 @@ def _gymnasium(
     )
 
 
+def _held_joints(stiffness: float, brake: float) -> torch.Tensor:
+    """Gains from angle and velocity of each of the leg's joints to its motor, as a controller of position has them."""
+    return torch.cat([stiffness * torch.eye(3), brake * torch.eye(3)], 1)
+
+
 def _braked_joints(actions: int, observations: int, brake: float) -> torch.Tensor:
     """Gains from each joint's velocity to its motor; the velocities are the last observations."""
     gains = torch.zeros(actions, observations)
@@ -159,6 +165,10 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
         "swinging pendulum": System(
             lambda episode: GymWrapper(TimeLimit(PendulumEnv(), episode)),
             lambda: Excitation(torch.tensor([3.0]), strongest=0.15, brake=torch.tensor([[0.0, 0.05]])),
+        ),
+        "leg": System(
+            lambda episode: GymWrapper(TimeLimit(LegEnv(), episode)),
+            lambda: Excitation(torch.full((3,), 12.0), strongest=0.5, brake=_held_joints(4.0, 0.3)),
         ),
         "wheel_legged": System(
             lambda episode: WheelLeggedEnv(max_episode_steps=episode), lambda: noisy_balance_controller()
