@@ -18,7 +18,9 @@ from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
+from torchrl_h2o.training.checkpoint import load_checkpoint
 from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
+from torchrl_h2o.whole_file import whole_file
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,7 @@ class Training:
         folder = checkpoint_folder(directory, name)
         self.rotation = CheckpointRotation(folder, keep_last=1)
         if (latest := self.rotation.latest()) is not None:
-            self.checkpoint.load(latest)
-            self.progress = Checkpoint.manifest(latest)["metadata"]["progress"]
+            self.progress = load_checkpoint(latest, self.checkpoint)["progress"]
         elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
             raise RuntimeError(
                 f"{folder} contains no checkpoint that can be read: remove it to train {name} from the start"
@@ -138,7 +139,7 @@ def write_metrics(directory: Path, method: str, rows: list[dict]) -> None:
             rows = [row for row in csv.DictReader(file) if row["method"] != method] + rows
     first = ["method", "updates", "return_real", "return_real_std", "length_real"]
     others = {key for row in rows for key in row} - set(first)
-    with open(path, "w", newline="") as file:
+    with whole_file(path) as partial, open(partial, "w", newline="") as file:
         writer = csv.DictWriter(file, [*first, *sorted(others)])
         writer.writeheader()
         writer.writerows(rows)

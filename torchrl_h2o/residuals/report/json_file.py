@@ -12,7 +12,6 @@ import numpy as np
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
-from torchrl_h2o.residuals.report.atomic import write_text
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     DimensionError,
@@ -33,6 +32,7 @@ from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.sentence import sentence
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow, WindowQuantity
 from torchrl_h2o.residuals.report.words import effect_name
+from torchrl_h2o.whole_file import write_text
 
 FILE = "report.json"
 _ARRAYS = ("before", "after", "states")

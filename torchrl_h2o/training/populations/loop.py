@@ -18,12 +18,13 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
 from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.environments import as_observed, sim_capacity_of
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
 from torchrl_h2o.training.progress import Budget, Training, write_metrics
-from torchrl_h2o.training.run_folder import checkpoint_folder, save_config, uninterrupted
+from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
