@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import CheckpointRotation
 from tqdm import tqdm
 
-from torchrl_h2o.training.checkpoint import load_checkpoint
+from torchrl_h2o.training.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
 from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
 from torchrl_h2o.whole_file import whole_file
 
@@ -71,8 +71,7 @@ class Training:
     def __init__(self, name: str, directory: Path, budget: Budget, **components: Any) -> None:
         self.name, self.directory, self.budget = name, directory, budget
         self.progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
-        # "archive", because a damaged ZIP raises an error, while a damaged folder of memory maps is read as zeros.
-        self.checkpoint = Checkpoint(format="archive", **components)
+        self.checkpoint = make_checkpoint(**components)
         directory.mkdir(parents=True, exist_ok=True)
         folder = checkpoint_folder(directory, name)
         self.rotation = CheckpointRotation(folder, keep_last=1)
@@ -105,7 +104,7 @@ class Training:
             self.progress["seconds"] += time.perf_counter() - start
             if last or (epoch + 1) % self.budget.checkpoint_every == 0:
                 with uninterrupted():
-                    self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
+                    save_checkpoint(self.rotation, self.checkpoint, epoch + 1, {"progress": self.progress})
         self._bar.close()
 
     def epoch_updates(self) -> Iterator[int]:

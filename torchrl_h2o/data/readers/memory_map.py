@@ -6,8 +6,10 @@ stores entries that are not tensors as pickles.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import cast
 
@@ -19,6 +21,7 @@ from torchrl_h2o.data.readers.file_kind import is_pickle
 from torchrl_h2o.data.readers.ted import entry_name, require_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 
+_BLOCK = 4096  # bytes by which the size of a file is rounded up
 _FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
 
 
@@ -55,8 +58,22 @@ def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
                 column=entry_name(key),
             )
     with whole_folder(folder) as partial:
-        td.detach().contiguous().memmap(cast("str", partial))  # annotated for strings; it takes paths as well
+        map_to_files(td.detach().contiguous(), partial)
     return Path(folder)
+
+
+def map_to_files(td: TensorDictBase, folder: Path) -> None:
+    """Write the entries of a TensorDict into a folder, one file each.
+
+    Raises:
+        OSError: if the disk is full. Writing to a mapped file would then end the process with a bus error.
+    """
+    sizes = [leaf.nbytes for leaf in td.values(True, True)]
+    needed = sum(sizes) + _BLOCK * (len(sizes) + 2)
+    folder.mkdir(exist_ok=True)
+    if (free := shutil.disk_usage(folder).free) < needed:
+        raise OSError(errno.ENOSPC, f"the disk has {free} bytes left, and the data need {needed}", str(folder))
+    td.memmap(cast("str", folder), copy_existing=True)  # annotated for strings; it takes paths as well
 
 
 def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:

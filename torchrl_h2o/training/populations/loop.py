@@ -14,9 +14,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import CheckpointRotation
 from tqdm import tqdm
 
+from torchrl_h2o.training.checkpoint import make_checkpoint, save_checkpoint
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.environments import as_observed, sim_capacity_of
@@ -190,7 +191,7 @@ def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outco
     failure = training.failures.get(name)
     updates = training.updates if failure is None else failure["updates"]
     with uninterrupted():
-        rotation.save(Checkpoint(format="archive", **policies), step=updates)
+        save_checkpoint(rotation, make_checkpoint(**policies), updates)
     return Outcome(
         trainee.policy,
         training.rows_of(name),
