@@ -16,7 +16,7 @@ from torchrl_h2o.training.run_folder import claimed, resumable
 
 MOMENTS = 20
 FORK = multiprocessing.get_context("fork")  # the packages are imported once, so a run takes seconds
-MEASURED = {"wall_s", "updates_per_second"}  # differ from run to run
+UNEQUAL = {"wall_s", "updates_per_second", "versions"}  # times, and the state of the repository
 
 
 def run_once(cfg, folder):
@@ -52,7 +52,7 @@ def children_seconds():
 
 def results(folder):
     summary = json.loads((folder / "summary.json").read_text())
-    summary = {key: value for key, value in summary.items() if key not in MEASURED}
+    summary = {key: value for key, value in summary.items() if key not in UNEQUAL}
     return trained(folder), rows(folder), summary, (folder / FILE).read_bytes()
 
 

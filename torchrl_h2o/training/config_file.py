@@ -8,7 +8,6 @@ from typing import cast
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_h2o.data import DataError
 from torchrl_h2o.training.targets import require_known_targets
@@ -78,7 +77,7 @@ def _read(path: Path) -> DictConfig:
         cfg = OmegaConf.create(text)
     except DataError:
         raise
-    except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except Exception as error:  # yaml and omegaconf raise errors of all kinds for damaged files
         raise DataError(f"the file cannot be read as YAML: {error}", _REMEDY, source=path) from error
     if not isinstance(cfg, DictConfig):
         raise DataError("the file is not a mapping", _REMEDY, source=path)

@@ -289,4 +289,7 @@ def test_causes_are_one_short_line():
     error = DataError("a\n" + 500 * "b" + "\nend", "do this", source="log.csv")
     assert str(error).startswith("log.csv: a bbb")
     assert str(error).endswith("bb end; do this")
-    assert len(str(error)) == len("log.csv: ") + 300 + len("; do this")
+    assert len(str(error)) == len("log.csv") + 300
+    named = str(DataError("wrong", 200 * "correct it ", source="log.csv", column=1000 * "c\x1b"))
+    assert named.isprintable()
+    assert len(named) <= len("log.csv") + 300

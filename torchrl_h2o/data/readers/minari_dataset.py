@@ -249,7 +249,9 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
                 place = {"column": f"episode_{number}/{field}", "source": source}
                 require_real(values, **place)
                 parts[field].append(require_flags(values, **place) if field in _FLAGS else values)
-    except (OSError, KeyError, RuntimeError, AssertionError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # h5py and minari raise errors of all kinds for damaged files
         raise DataError(
             f"episode {len(parts['truncations'])} cannot be read: {error}",
             "the file is truncated: copy or download it again",
