@@ -1,16 +1,17 @@
 """Damaged report.json files: Report.load returns a report that can be written again, or raises a short DataError."""
 
+import dataclasses
 import json
 
 import pytest
 from hypothesis import given
 
 from tests.fuzzing import changes_of_entries, damaged, few, many, outcome, text_damages, with_changed_entries
-from tests.residuals.report.made_up_reports import windowed
+from tests.residuals.report.made_up_reports import trace, windowed
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals import Report
 
-ENTRIES = windowed().to_json()
+ENTRIES = dataclasses.replace(windowed(), trace=trace(rows=20)).to_json()
 TEXT = json.dumps(ENTRIES).encode()
 
 

@@ -10,6 +10,7 @@ import errno
 import json
 import math
 import shutil
+from operator import index
 from pathlib import Path
 from typing import cast
 
@@ -130,10 +131,12 @@ def load_memory_map(folder: str | Path) -> TensorDict:
                 "write the data again with write_ted, which stores only tensors",
                 source=path,
             )
-    _require_whole_files(folder)
     try:
+        _require_whole_files(folder)
         return TensorDict.load_memmap(folder, allow_pickle=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # tensordict raises errors of all kinds for damaged descriptions
         raise DataError(f"unreadable: {error}", "write it again", source=folder) from error
 
 
@@ -141,11 +144,12 @@ def _require_whole_files(folder: Path) -> None:
     try:
         meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
         sizes = {
-            folder / f"{key}.memmap": math.prod(entry["shape"])  # not numpy's, which overflows
+            folder / f"{key}.memmap": math.prod(map(index, entry["shape"]))  # not numpy's, which overflows
             * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
             for key, entry in meta.items()
             if isinstance(entry, dict) and "dtype" in entry
         }
+        nested = [key for key, entry in meta.items() if isinstance(entry, dict) and entry.get("is_nested")]
         inner = [key for key, entry in meta.items() if isinstance(entry, dict) and "type" in entry]
     except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
         raise DataError(
@@ -153,6 +157,9 @@ def _require_whole_files(folder: Path) -> None:
             "copy or write the folder again",
             source=folder / "meta.json",
         ) from error
+    if nested:
+        problem = "the entry is a nested tensor, whose rows differ in length"
+        raise DataError(problem, "write rows of one length", source=folder / "meta.json", column=nested[0])
     for path, size in sizes.items():
         found = path.stat().st_size if path.is_file() else 0
         if found != size:

@@ -181,8 +181,9 @@ def _open(source: str | Path) -> MinariDataset:
     try:
         if data.is_dir():
             _require_plausible_count(data)
-            return minari.MinariDataset(data)
-        return minari.load_dataset(str(source), download=True)
+        dataset = minari.MinariDataset(data) if data.is_dir() else minari.load_dataset(str(source), download=True)
+        int(dataset.total_steps)  # minari converts it when it is asked for
+        return dataset
     except DataError:
         raise
     except Exception as error:  # each hosting service raises its own network errors
