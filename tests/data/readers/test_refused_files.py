@@ -302,11 +302,11 @@ def test_a_memory_map_with_another_kind_of_entry_is_refused(tmp_path, entry, val
         load(folder)
 
 
-@pytest.mark.parametrize("value", [[8], "many", {}])
-def test_a_minari_dataset_whose_number_of_steps_is_none_is_refused(tmp_path, value):
+@pytest.mark.parametrize(("entry", "value"), [("total_steps", [8]), ("total_steps", "many"), ("dataset_id", "")])
+def test_a_minari_dataset_with_an_entry_of_a_wrong_kind_is_refused(tmp_path, entry, value):
     folder = write_minari(make_recording(LENGTHS, ENDINGS), "test-v0", root=tmp_path)
     path = folder / "data" / "metadata.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"total_steps": value}))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {entry: value}))
     with pytest.raises(DataError, match="no Minari dataset can be opened"):
         read_minari(folder)
 

@@ -182,7 +182,7 @@ def _open(source: str | Path) -> MinariDataset:
         if data.is_dir():
             _require_plausible_count(data)
         dataset = minari.MinariDataset(data) if data.is_dir() else minari.load_dataset(str(source), download=True)
-        int(dataset.total_steps)  # minari converts it when it is asked for
+        _ = int(dataset.total_steps), dataset.spec  # minari checks these entries when they are asked for
         return dataset
     except DataError:
         raise
