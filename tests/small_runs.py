@@ -40,8 +40,15 @@ def run(options):
 def trained(directory, method="h2o+"):
     """Reads the last checkpoint: the bytes of its components, by file name."""
     latest = CheckpointRotation(directory / "checkpoints" / method, keep_last=1).latest()
+    contents = {}
     with zipfile.ZipFile(latest) as archive:
-        return {name: archive.read(name) for name in archive.namelist() if name.startswith("components")}
+        for name in archive.namelist():
+            if name.endswith(".tdz"):  # an archive inside, whose members have dates
+                with zipfile.ZipFile(archive.open(name)) as state:
+                    contents |= {f"{name}/{inner}": state.read(inner) for inner in state.namelist()}
+            elif name.startswith("components"):
+                contents[name] = archive.read(name)
+    return contents
 
 
 def rows(directory):

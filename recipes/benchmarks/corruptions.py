@@ -30,6 +30,7 @@ import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.residuals import Simulation
+from torchrl_h2o.whole_file import whole_file
 
 COLUMNS = ("system", "number", "corruption", "seed", "right", "outcome", "check", "severity", "words", "warnings")
 TIMES = ("wall_s", "cpu_s")
@@ -104,7 +105,7 @@ def control_rows(cfg: DictConfig) -> Iterator[dict]:
 
 
 def save(rows: list[dict], path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*COLUMNS, *TIMES])
         writer.writeheader()
         writer.writerows(row | {key: f"{row[key]:.2f}" for key in TIMES} for row in rows)

@@ -7,6 +7,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+from torchrl_h2o.whole_file import whole_file
+
 LABELS = {
     "buffer": "simulated transitions in the buffer",
     "batch": "rows of a stream in a batch",
@@ -49,5 +51,6 @@ def draw_scaling(path: Path, costs: list[dict]) -> None:
     for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=150)
     plt.close(figure)

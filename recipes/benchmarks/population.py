@@ -28,6 +28,7 @@ from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus
 from torchrl_h2o.training.populations import PopulationReplay
 from torchrl_h2o.training.populations.learner import PopulationLearner
+from torchrl_h2o.whole_file import write_text
 
 SINGLE = "a single run"
 
@@ -133,7 +134,7 @@ def main(cfg: DictConfig) -> None:
     table = {"tasks": tasks, "seeds": seeds, "updates": updates, "hours": tasks * seeds * updates / best / 3600}
     result = {"lines": lines, "device": device_name(cfg.device), "table": table, "torch": torch.__version__}
     directory = Path(HydraConfig.get().runtime.output_dir)
-    (directory / "population.json").write_text(json.dumps(result, indent=2) + "\n")
+    write_text(directory / "population.json", json.dumps(result, indent=2) + "\n")
     print_table(result)
     print(f"\nresults    {os.path.relpath(directory)}/population.json")
 

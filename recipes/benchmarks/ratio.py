@@ -34,6 +34,7 @@ from torchrl_h2o.objectives import (
     make_dynamics_ratio_estimator,
     total_loss,
 )
+from torchrl_h2o.whole_file import whole_file
 
 NEXT = ("next", "observation")
 KEYS = ("observation", "action", NEXT)
@@ -162,7 +163,7 @@ def main(cfg: DictConfig) -> None:
                 case = {"system": name, "seed": seed, "estimator": estimator, "rows": rows, "steps": steps}
                 lines.append(train_and_measure(cfg, case, system, new))
                 bar.update()
-                with open(directory / "ratio.csv", "w", newline="") as file:
+                with whole_file(directory / "ratio.csv") as partial, partial.open("w", newline="") as file:
                     writer = csv.DictWriter(file, [*case, *COLUMNS], extrasaction="ignore")
                     writer.writeheader()
                     writer.writerows(lines)

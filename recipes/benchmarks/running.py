@@ -16,6 +16,7 @@ from speed import CountingSimulation
 from tqdm import tqdm
 
 from torchrl_h2o.residuals import Report
+from torchrl_h2o.whole_file import whole_file, write_text
 
 COLUMNS = ("family", "number", "name", "system", "truth", "found", "ok")
 MEASURED = ("error_before", "error_after", "error_floor", "auc_before", "auc_after", "wall_s", "steps", "simulating_s")
@@ -125,8 +126,9 @@ def _row(job: Job, outcome: Callable[[], dict]) -> dict:
 def save_rows(rows: Sequence[dict], directory: Path) -> None:
     """Write results.json (all fields) and results.csv (the columns of a table)."""
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "results.json").write_text(json.dumps(rows, indent=1, default=float, ensure_ascii=False) + "\n")
-    with open(directory / "results.csv", "w", newline="", encoding="utf-8") as file:
+    text = json.dumps(rows, indent=1, default=float, ensure_ascii=False)
+    write_text(directory / "results.json", text + "\n")
+    with whole_file(directory / "results.csv") as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*COLUMNS, *MEASURED], extrasaction="ignore")
         writer.writeheader()
         writer.writerows(rows)

@@ -33,6 +33,7 @@ from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus
 from torchrl_h2o.training.populations.learner import PopulationLearner
+from torchrl_h2o.whole_file import write_text
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     result = {"costs": [asdict(cost) for cost in costs], "torch": torch.__version__}
     result |= {"threads": cfg.threads, "device": cfg.device}
-    (directory / "scaling.json").write_text(json.dumps(result, indent=2) + "\n")
+    write_text(directory / "scaling.json", json.dumps(result, indent=2) + "\n")
     draw_scaling(directory / "scaling.png", result["costs"])
     print_table(costs)
     print(f"\nresults    {os.path.relpath(directory)}/scaling.json, scaling.png")

@@ -29,6 +29,7 @@ from turns import calls_per_second
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.envs import BatchedMujocoEnv, WheelLeggedEnv
+from torchrl_h2o.whole_file import write_text
 
 AHEAD = 20  # control steps of one call of mujoco.rollout
 EPISODE = 1000  # control steps of the recorded trajectory
@@ -107,7 +108,7 @@ def main(cfg: DictConfig) -> None:
         print(f"{name:<34}{rate:>16,.0f}{share:>20}")
     directory = Path(HydraConfig.get().runtime.output_dir)
     result = {"task": cfg.task, "threads": threads, "steps_per_second": per_second, "mujoco": mujoco.__version__}
-    (directory / "simulator.json").write_text(json.dumps(result, indent=2) + "\n")
+    write_text(directory / "simulator.json", json.dumps(result, indent=2) + "\n")
     print(f"\nresults    {os.path.relpath(directory)}/simulator.json")
 
 

@@ -31,6 +31,7 @@ from torchrl_h2o.objectives.network_calls import NetworkCalls
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus, rlpd, sac
+from torchrl_h2o.whole_file import write_text
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
 
@@ -152,7 +153,7 @@ def main(cfg: DictConfig) -> None:
     result = {"updates_per_second": measured, "flop": flop, "gflop_per_second": gflops, "limit": gflops * 1e9 / flop}
     directory = Path(HydraConfig.get().runtime.output_dir)
     result |= {"torch": torch.__version__, "threads": cfg.threads, "device": cfg.device}
-    (directory / "update.json").write_text(json.dumps(result, indent=2) + "\n")
+    write_text(directory / "update.json", json.dumps(result, indent=2) + "\n")
     print_table(result)
     print(f"\nresults    {os.path.relpath(directory)}/update.json")
 

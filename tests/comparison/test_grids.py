@@ -30,9 +30,9 @@ from torchrl_h2o.comparison.results_file import (
 )
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.options import check_options
+from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
-from torchrl_h2o.training.run_folder import load_config
 
 
 def chosen(runs, key):

@@ -13,6 +13,7 @@ from tensordict import NonTensorData, TensorDict
 from torchrl.envs import GymEnv
 
 from tests.data.recordings import assert_same, make_recording, recordings
+from tests.ended_process import ended_process
 from torchrl_h2o.data import DataError, episodes, read_ted, write_ted
 from torchrl_h2o.data.readers.ted import require_continuous, require_ted
 
@@ -247,8 +248,9 @@ def test_row_that_begins_elsewhere_is_named(row):
 
 def test_killed_writer_is_no_obstacle(tmp_path):
     """A partial folder left by a killed process does not prevent the next write."""
-    (tmp_path / ".recording.partial").mkdir()
-    (tmp_path / ".recording.partial" / "junk").write_text("junk")
+    left = tmp_path / f".recording.{ended_process()}.partial"
+    left.mkdir()
+    (left / "junk").write_text("junk")
     folder = write_ted(make_recording(), tmp_path / "recording")
     assert not (folder / "junk").exists()
     assert_same(read_ted(folder), make_recording())

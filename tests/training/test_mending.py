@@ -26,12 +26,12 @@ from torchrl_h2o.residuals.report.contents import (
 )
 from torchrl_h2o.training import cached_search
 from torchrl_h2o.training.cached_search import BLOCK, MOST_ROWS, digest, searched_rows
+from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.environments import simulator_maker, task_of
 from torchrl_h2o.training.judging import table_of_population, table_of_run, write_summary
 from torchrl_h2o.training.mending import POSTERIOR_WORLDS, find_missing_effects, prepare_mending, report_of_run
 from torchrl_h2o.training.real_data import cache_folder
 from torchrl_h2o.training.returns import Evaluation
-from torchrl_h2o.training.run_folder import load_config, save_config
 from torchrl_h2o.training.task import Task
 
 PENDULUM = {

@@ -12,12 +12,13 @@ from omegaconf import DictConfig
 
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.options import EvaluateOptions
+from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of, task_of
 from torchrl_h2o.training.film import film
 from torchrl_h2o.training.methods import method_named
 from torchrl_h2o.training.returns import evaluate
-from torchrl_h2o.training.run_folder import load_config
 from torchrl_h2o.training.trained_policy import load_policy
+from torchrl_h2o.whole_file import write_text
 
 WORLDS = {"reality": make_reality, "simulator": make_simulator}
 
@@ -25,14 +26,14 @@ WORLDS = {"reality": make_reality, "simulator": make_simulator}
 @hydra_main("../config", "evaluate", EvaluateOptions)
 def main(options: DictConfig) -> None:
     directory, world = Path(options.checkpoint), options["in"]
-    cfg = load_config(directory)
+    cfg = load_config(directory, trust=options.trust)
     method = options.method or method_named(cfg.get("method", "h2o_plus")).title
     policy = load_policy(cfg, directory, method)
     result = evaluate(WORLDS[world](cfg, options.episodes), policy, options.episodes, options.seed)
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]
     print(f"{method} in {world}: return {result.mean:.1f} ± {result.std:.1f}, episodes of {seconds} s")
     summary = {"method": method, "in": world, "seed": options.seed, **result.summary()}
-    (directory / "evaluation.json").write_text(json.dumps(summary | {"returns": result.returns}, indent=2) + "\n")
+    write_text(directory / "evaluation.json", json.dumps(summary | {"returns": result.returns}, indent=2) + "\n")
     if options.film is not None:
         path = directory / options.film
         task, preprocessing = task_of(cfg), preprocessing_of(cfg)

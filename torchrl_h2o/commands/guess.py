@@ -12,6 +12,7 @@ from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.layout_text import Coordinates, guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names
+from torchrl_h2o.whole_file import write_text
 
 GUESS = "--guess"
 
@@ -37,12 +38,10 @@ def guess_columns(arguments: Sequence[str]) -> None:
     log = Path(sources_of(given["data"].strip("[]").split(","))[0])
     path = Path(given.get("columns", f"{log.stem}.yaml"))
     guessed = guess_layout(log, _coordinates_of(given["simulator"]) if "simulator" in given else None)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(guessed.text)
-    except FileExistsError:
+    if path.exists():
         problem = "the file exists and is not overwritten"
-        raise DataError(problem, "remove it, or choose another name with columns=", source=path) from None
+        raise DataError(problem, "remove it, or choose another name with columns=", source=path)
+    write_text(path, guessed.text)
     print(
         f"{path} describes the columns of {log}; correct it, then run\n\n{_command(given, path, guessed.coordinates)}"
     )

@@ -16,6 +16,7 @@ from torchrl_h2o.comparison.data_size import FAULTLESS, FORWARD, POOR, REAL_LOG,
 from torchrl_h2o.comparison.data_size_grid import METHODS, SIZES
 from torchrl_h2o.training.learning_curve import COLOURS
 from torchrl_h2o.training.methods import METHODS as ALL_METHODS
+from torchrl_h2o.whole_file import whole_file
 
 LINES, DOTS = (STANDING, FORWARD), (POOR, REAL_LOG)
 WIDTHS = {STANDING: 3.0, FORWARD: 2.4}
@@ -54,8 +55,8 @@ def draw_data_size(path: Path, points: Points, reps: int) -> None:
     number = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     title = f"Mean of {number} seed{'s' * (counts[-1] > 1)}, 95 % bootstrap intervals; returns below 0 are cut off"
     figure.suptitle(title, fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=130)
     plt.close(figure)
 
 

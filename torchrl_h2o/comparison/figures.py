@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from torchrl_h2o.comparison.aggregates import Interval
 from torchrl_h2o.comparison.scores import Row, Task, task_of
 from torchrl_h2o.training.learning_curve import COLOURS
+from torchrl_h2o.whole_file import whole_file
 
 
 def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> None:
@@ -111,6 +112,6 @@ def _draw_intervals(axis: Axes, intervals: Mapping[str, Interval], titles: Mappi
 
 
 def _save(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=130)
     plt.close(figure)

@@ -7,10 +7,13 @@ evaluation, for learning curves.
 import csv
 import fcntl
 import json
+import os
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from omegaconf import DictConfig
 
@@ -18,6 +21,7 @@ from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.training.run_folder import uninterrupted
+from torchrl_h2o.whole_file import whole_file
 
 IDENTITY = (
     "method",
@@ -160,22 +164,30 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
         rows: the rows to append.
         who: the run's identity.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a+", newline="") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may finish at the same time
-        file.seek(0)
+    with _locked(path) as file:
         earlier = list(csv.DictReader(file))
         if any(_key(row) == _key(who) for row in earlier):
             return
         columns = list(columns)
         if earlier and (unknown := sorted(earlier[0].keys() - set(columns))):
             raise ValueError(f"{path} has the columns {', '.join(unknown)}, so it is no file of such results")
-        writer = csv.DictWriter(file, columns)
-        if not earlier or len(earlier[0]) < len(columns):  # the file is empty, or an earlier version wrote it
-            file.truncate(0)
+        with whole_file(path) as partial, partial.open("w", newline="") as new:
+            writer = csv.DictWriter(new, columns)
             writer.writeheader()
-            writer.writerows(earlier)
-        writer.writerows(rows)
+            writer.writerows([*earlier, *rows])
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[TextIO]:
+    """Opens a file, created if missing, that no other process replaces before the end of the block."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        with open(path, "a+", newline="") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may finish at the same time
+            if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):  # else it was replaced in the meantime
+                file.seek(0)
+                yield file
+                return
 
 
 def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
@@ -186,7 +198,7 @@ def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
         runs: identities of the runs to copy.
     """
     missing = {_key(who) for who in runs} - recorded(path)
-    for other in sorted(path.parent.glob("*.csv")):
+    for other in sorted(path.parent.glob("[!.]*.csv")):
         if other == path or not _is_group(other):
             continue
         rows, curves = read_rows(other), read_rows(curves_of(other))

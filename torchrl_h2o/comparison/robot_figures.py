@@ -16,6 +16,7 @@ from torchrl_h2o.comparison.robot_trajectories import BINS, COMPARED, EVERY, SHO
 from torchrl_h2o.envs.wheel_legged.env import TARGET_VELOCITY
 from torchrl_h2o.training.learning_curve import COLOURS
 from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.whole_file import whole_file
 
 LIMITS = {"standing_still": (-1.0, 1.0), "moving_forward": (-0.5, 1.0)}
 LABELS = {"standing_still": "displacement (m)", "moving_forward": "velocity (m/s)"}
@@ -104,6 +105,6 @@ def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]
 
 
 def _save(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=130)
     plt.close(figure)

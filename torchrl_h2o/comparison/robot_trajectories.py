@@ -18,11 +18,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_h2o.comparison.results_file import IDENTITY, identity
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
+from torchrl_h2o.training.checkpoint import load_checkpoint
+from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.environments import make_reality, make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import SEED
-from torchrl_h2o.training.run_folder import checkpoint_folder, load_config
+from torchrl_h2o.training.run_folder import checkpoint_folder
 from torchrl_h2o.training.trained_policy import load_policy
+from torchrl_h2o.whole_file import whole_file
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
 EVERY = 0.2  # s
@@ -52,8 +55,8 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
             if cfg.method in COMPARED:
                 arrays[f"states {name}"] = counted(simulated_states(cfg, summary.parent))
     if arrays:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(path, **arrays)
+        with whole_file(path) as partial:
+            np.savez_compressed(partial, **arrays)
     return {key: array for key, array in arrays.items() if key.partition(" ")[2] in asked.values()}
 
 
@@ -81,7 +84,7 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     replay = make_replay(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds")))
     title = METHODS[cfg.method].title
     latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
-    Checkpoint(replay=replay).load(cast(Path, latest))  # a run with a summary has one
+    load_checkpoint(cast(Path, latest), Checkpoint(replay=replay))  # a run with a summary has one
     return _in_units(cfg, replay.sim[:]["observation"], ("theta", "theta_dot")).numpy()
 
 

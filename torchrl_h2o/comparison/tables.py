@@ -20,6 +20,7 @@ from torchrl_h2o.comparison.scores import (
 )
 from torchrl_h2o.comparison.seed_table import seed_tables
 from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.whole_file import write_text
 
 TITLES = {name: method.title for name, method in METHODS.items()}
 SCORES = (
@@ -74,7 +75,7 @@ def report(group: str, rows: list[Row], results: Path, to: Path, references: dic
         lines += ["", *aggregate_lines(group, common_scores(table, references), len(table), to, reps)]
     text = "\n".join(lines) + "\n"
     to.mkdir(parents=True, exist_ok=True)
-    (to / f"{group}.md").write_text(text)
+    write_text(to / f"{group}.md", text)
     print(f"\n{group}\n\n{text}")
     budget = {row["updates"] for row in rows}
     curves = [row for row in read_rows(curves_of(results / f"{group}.csv")) if row["updates"] in budget]
@@ -99,7 +100,7 @@ def report_data_size(rows: list[Row], to: Path, reps: int) -> None:
     budgets = " or ".join(f"{int(updates):,}" for updates in sorted({row["updates"] for row in rows}, key=int))
     text = f"{data_size.markdown(points)}\nAfter {budgets} updates, with the last policy.\n"
     to.mkdir(parents=True, exist_ok=True)
-    (to / "data_size.md").write_text(text)
+    write_text(to / "data_size.md", text)
     print(f"\ndata_size\n\n{text}")
     draw_data_size(to / "data_size.png", points, reps)
 
@@ -117,7 +118,7 @@ def report_seeds(results: Path, group: str, to: Path, at: Sequence[int]) -> None
     if at:
         text += "\nDuring training:\n\n" + seed_tables(read_rows(curves_of(results / f"{group}.csv")), at)
     to.mkdir(parents=True, exist_ok=True)
-    (to / f"{group}_by_seed.md").write_text(text)
+    write_text(to / f"{group}_by_seed.md", text)
     print(f"\n{group} by seed\n\n{text}")
 
 

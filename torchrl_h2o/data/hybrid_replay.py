@@ -13,7 +13,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
@@ -26,7 +26,7 @@ from torchrl.data import (
 )
 
 from torchrl_h2o.data.multi_step import STEPS, OngoingMultiStep, multi_step_keys, original_key
-from torchrl_h2o.data.readers.memory_map import load_memory_map
+from torchrl_h2o.data.readers.memory_map import load_memory_map, map_to_files
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 from torchrl_h2o.data.transition_checks import require_usable_real, require_usable_simulated, select_entries
 
@@ -242,10 +242,10 @@ class HybridReplayBuffer:
             (folder / "stream.json").write_text(json.dumps(state), encoding="utf-8")
             if self._sim_rows:
                 rows = TensorDict(dict(zip(self.keys, self._sim_rows, strict=True)), [len(self.sim)])
-                rows.cpu().memmap(cast("str", folder / "rows"), copy_existing=True)  # as in write_ted
+                map_to_files(rows.cpu(), folder / "rows")
             if waiting := self._waiting_rows():
                 rows = TensorDict(dict(zip(self.stream_keys, waiting, strict=True)), waiting[0].shape[:-1])
-                rows.cpu().memmap(cast("str", folder / "waiting"), copy_existing=True)
+                map_to_files(rows.cpu(), folder / "waiting")
 
     def loads(self, path: str | Path) -> None:
         """Read a folder written by :meth:`dumps` into a buffer with the same real data and keys.

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from torchrl_h2o.options.sources import RunFolder
-from torchrl_h2o.options.types import Count, Options, Positive, Seed
+from torchrl_h2o.options.types import Count, Options, Positive, Seed, Trust
 
 
 class EvaluateOptions(Options):
@@ -20,3 +20,4 @@ class EvaluateOptions(Options):
     seed: Seed
     film: str | None
     seconds: Positive
+    trust: Trust

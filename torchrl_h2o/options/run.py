@@ -18,6 +18,7 @@ from torchrl_h2o.options.types import (
     Rows,
     Seed,
     Share,
+    Trust,
     Widths,
 )
 
@@ -133,6 +134,7 @@ class ExperimentOptions(Options):
     checkpoint_every: Count
     render: bool
     resume: RunFolder | None = None
+    trust: Trust = False
 
 
 class RunOptions(ExperimentOptions):

@@ -43,6 +43,7 @@ Rows = Annotated[
     list[Count],
     Field(min_length=2, max_length=2, description="two integers of at least 1, [real,simulated], such as [128,128]"),
 ]
+Trust = Annotated[bool | list[str], Field(description="true, false or names, such as [my_package.MyEnv]")]
 Widths = Annotated[list[Count], Field(min_length=1, description="the sizes of at least one layer, such as [256,256]")]
 
 

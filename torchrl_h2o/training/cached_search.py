@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -24,6 +22,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_h2o import __version__
+from torchrl_h2o.data.readers.whole_folder import whole_folder
 from torchrl_h2o.effects import Effect, effect_to_dict
 from torchrl_h2o.residuals import LoopSettings, Report, close_the_loop
 from torchrl_h2o.training.real_data import cache_folder
@@ -65,18 +64,15 @@ def cached_report(
             tqdm.write(f"mend: searching {chosen} for effects that the simulator lacks; this takes minutes")
             report = close_the_loop(simulator, rows, source=f"{source}, {chosen}", **SEARCH)
             write_whole(report, cached)
-    copied = Path(tempfile.mkdtemp(dir=folder.parent)) / folder.name
-    shutil.copytree(cached, copied)
-    os.replace(copied, folder)
-    copied.parent.rmdir()
+    with whole_folder(folder) as partial:
+        shutil.copytree(cached, partial, dirs_exist_ok=True)
     return Report.load(folder)
 
 
 def write_whole(report: Report, folder: Path) -> None:
     """Writes a report such that the folder appears with all its files or not at all."""
-    partial = Path(tempfile.mkdtemp(dir=folder.parent))
-    report.save(partial)
-    os.replace(partial, folder)
+    with whole_folder(folder) as partial:
+        report.save(partial)
 
 
 def searched_rows(real: TensorDictBase) -> TensorDictBase:

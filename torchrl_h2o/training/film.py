@@ -14,6 +14,7 @@ from tqdm import tqdm
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import run_episode
 from torchrl_h2o.training.task import Task
+from torchrl_h2o.whole_file import whole_file
 
 FPS = 25
 
@@ -60,11 +61,13 @@ def film(
     import imageio.v3 as iio
 
     if path.suffix == ".mp4":
-        iio.imwrite(path, frames, fps=1 / (_stride(task) * task.seconds_per_step), codec="libx264")
+        with whole_file(path) as partial:
+            iio.imwrite(partial, frames, fps=1 / (_stride(task) * task.seconds_per_step), codec="libx264")
     else:
         path.mkdir(parents=True, exist_ok=True)
         for index, frame in enumerate(frames):
-            iio.imwrite(path / f"{index:04d}.png", frame)
+            with whole_file(path / f"{index:04d}.png") as partial:
+                iio.imwrite(partial, frame)
     return path
 
 

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.environments import measure_observation_norm, preprocessing_of, task_of
 from torchrl_h2o.training.film import try_to_film
@@ -15,7 +16,6 @@ from torchrl_h2o.training.judging import judge, run_settings, table_of_run, writ
 from torchrl_h2o.training.loop import Method, train
 from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.real_data import behaviour_of, is_cut
-from torchrl_h2o.training.run_folder import save_config
 
 
 def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None:

@@ -23,6 +23,7 @@ from torchrl_h2o.training.mending import lines_of_mending, summary_of_mending
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
+from torchrl_h2o.whole_file import write_text
 
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 DATA = "the data's behaviour"
@@ -118,7 +119,7 @@ def write_summary(directory: Path, summary: dict) -> None:
             "command": shlex.join(["python", *sys.argv]),
         }
     )
-    (directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    write_text(directory / "summary.json", json.dumps(summary, indent=2) + "\n")
 
 
 def _commit() -> dict[str, str]:

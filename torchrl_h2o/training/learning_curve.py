@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 
 from torchrl_h2o.training.returns import Evaluation
 from torchrl_h2o.training.task import Task
+from torchrl_h2o.whole_file import whole_file
 
 COLOURS = {
     "H2O+": "#0b6e4f",
@@ -77,7 +78,8 @@ def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour:
     for axis in (left, right):
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=150)
     plt.close(figure)
 
 

@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor, nn
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import CheckpointRotation
 from tqdm import tqdm
 
+from torchrl_h2o.training.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
 from torchrl_h2o.training.divergence import DivergenceError, are_finite, not_finite_losses
 from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
+from torchrl_h2o.whole_file import whole_file
 
 
 @dataclass(frozen=True)
@@ -72,16 +74,14 @@ class Training:
     def __init__(self, name: str, directory: Path, budget: Budget, **components: Any) -> None:
         self.name, self.directory, self.budget = name, directory, budget
         self.progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
-        # "archive", because a damaged ZIP raises an error, while a damaged folder of memory maps is read as zeros.
-        self.checkpoint = Checkpoint(format="archive", **components)
+        self.checkpoint = make_checkpoint(**components)
         self._components = components
         self._update = 0  # of the current epoch
         directory.mkdir(parents=True, exist_ok=True)
         folder = checkpoint_folder(directory, name)
         self.rotation = CheckpointRotation(folder, keep_last=1)
         if (latest := self.rotation.latest()) is not None:
-            self.checkpoint.load(latest)
-            self.progress = Checkpoint.manifest(latest)["metadata"]["progress"]
+            self.progress = load_checkpoint(latest, self.checkpoint)["progress"]
         elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
             raise RuntimeError(
                 f"{folder} contains no checkpoint that can be read: remove it to train {name} from the start"
@@ -110,7 +110,7 @@ class Training:
             self.progress["seconds"] += time.perf_counter() - start
             if last or (epoch + 1) % self.budget.checkpoint_every == 0:
                 with uninterrupted():
-                    self.rotation.save(self.checkpoint, step=epoch + 1, metadata={"progress": self.progress})
+                    save_checkpoint(self.rotation, self.checkpoint, epoch + 1, {"progress": self.progress})
                 self._saved = epoch + 1
         self._bar.close()
 
@@ -184,7 +184,7 @@ def write_metrics(directory: Path, method: str, rows: list[dict]) -> None:
             rows = [row for row in csv.DictReader(file) if row["method"] != method] + rows
     first = ["method", "updates", "return_real", "return_real_std", "length_real"]
     others = {key for row in rows for key in row} - set(first)
-    with open(path, "w", newline="") as file:
+    with whole_file(path) as partial, open(partial, "w", newline="") as file:
         writer = csv.DictWriter(file, [*first, *sorted(others)])
         writer.writeheader()
         writer.writerows(rows)

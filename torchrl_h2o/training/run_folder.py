@@ -18,14 +18,17 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_h2o.options import TrainOptions, check_options
+from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.mending import prepare_mending
+from torchrl_h2o.training.remnants import remove_remnants
 
 
 def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
     """Opens the folder of a new run, or of the run given by ``resume``.
 
     Args:
-        cfg: configuration from the command line. A resumed run uses the configuration in its folder instead.
+        cfg: configuration from the command line. A resumed run uses the configuration in its folder instead, in which
+            it allows the names that ``trust`` lists, see :mod:`torchrl_h2o.training.targets`.
         go_on: whether to continue a run that exists in the folder, as with ``resume``.
 
     Returns:
@@ -35,20 +38,21 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         ValueError: for other overrides together with ``resume``, or wrong options in the folder's configuration.
         FileNotFoundError: if the folder given by ``resume`` is not the folder of a run.
         FileExistsError: if the folder of a new run already contains a run.
+        torchrl_h2o.data.DataError: if the configuration in the folder cannot be read, or names what must not be built.
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
     if not OmegaConf.is_missing(cfg, "resume"):
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "trust="))]
         if others:
             raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
         if not any(directory.iterdir()):
             directory.rmdir()  # Hydra has made it; a mistyped name shall not leave a folder
-        cfg = load_config(directory)
+        cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
         check_options(cfg, TrainOptions, saved=True)
     elif (directory / "config.yaml").exists():
         if not go_on:
             raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
-        cfg = load_config(directory)
+        cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
     else:
         prepare_mending(cfg)
         resolve_paths(cfg)
@@ -76,13 +80,16 @@ def _absolute(name: str) -> str:
 
 @contextmanager
 def claimed(directory: Path) -> Iterator[None]:
-    """Locks a run's folder against other processes; the lock is also released if the process is killed.
+    """Locks a run's folder against other processes, and removes the unfinished files of a killed one.
+
+    The lock is also released if the process is killed.
 
     Raises:
         RuntimeError: if another process has locked it.
     """
     try:
         with FileLock(directory / "run.lock", blocking=False):
+            remove_remnants(directory)
             yield
     except Timeout:
         raise RuntimeError(
@@ -113,25 +120,6 @@ def uninterrupted() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
         if came:
             signal.raise_signal(signal.SIGINT)
-
-
-def save_config(cfg: DictConfig, directory: Path) -> None:
-    """Writes config.yaml."""
-    OmegaConf.save(cfg, directory / "config.yaml", resolve=True)
-
-
-def load_config(directory: str | Path) -> DictConfig:
-    """Reads the configuration of a run.
-
-    Raises:
-        FileNotFoundError: if the folder is not the folder of a run.
-    """
-    saved = Path(directory) / "config.yaml"
-    if not saved.exists():
-        raise FileNotFoundError(f"{directory} is not the folder of a run: it has no config.yaml")
-    cfg = OmegaConf.load(saved)
-    assert isinstance(cfg, DictConfig)
-    return cfg
 
 
 def keeps_best(cfg: DictConfig) -> bool:

@@ -8,6 +8,7 @@ from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from torchrl_h2o.objectives import make_actor
+from torchrl_h2o.training.checkpoint import load_checkpoint
 from torchrl_h2o.training.environments import make_reality
 from torchrl_h2o.training.run_folder import checkpoint_folder, keeps_best
 
@@ -22,6 +23,7 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
 
     Raises:
         FileNotFoundError: if the folder has no checkpoint of that method.
+        torchrl_h2o.data.DataError: if the checkpoint contains more than tensors and numbers.
     """
     latest = CheckpointRotation(checkpoint_folder(directory, method), keep_last=1).latest()
     if latest is None:
@@ -31,5 +33,5 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
     has_best = "policy" in Checkpoint.manifest(latest)["components"]  # offline methods have none
     component: dict[str, Any] = {"policy" if keeps_best(cfg) and has_best else "actor": actor}
-    Checkpoint(**component).load(latest)
+    load_checkpoint(latest, Checkpoint(**component))
     return actor

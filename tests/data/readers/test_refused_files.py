@@ -285,8 +285,46 @@ def test_a_fifo_in_a_memory_map_is_refused(tmp_path):
     assert in_time(lambda: load(folder))
 
 
+@pytest.mark.parametrize(
+    ("entry", "value", "said"),
+    [
+        ("is_nested", True, "nested tensor"),
+        ("shape", [[8], 3], "cannot be read"),
+        ("shape", [8, 3.0], "cannot be read"),
+    ],
+)
+def test_a_memory_map_with_another_kind_of_entry_is_refused(tmp_path, entry, value, said):
+    folder = write_ted(make_recording(), tmp_path / "ted")
+    meta = json.loads((folder / "meta.json").read_text())
+    meta["observation"][entry] = value
+    (folder / "meta.json").write_text(json.dumps(meta))
+    with pytest.raises(DataError, match=said):
+        load(folder)
+
+
+@pytest.mark.parametrize(("entry", "value"), [("total_steps", [8]), ("total_steps", "many"), ("dataset_id", "")])
+def test_a_minari_dataset_with_an_entry_of_a_wrong_kind_is_refused(tmp_path, entry, value):
+    folder = write_minari(make_recording(LENGTHS, ENDINGS), "test-v0", root=tmp_path)
+    path = folder / "data" / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {entry: value}))
+    with pytest.raises(DataError, match="no Minari dataset can be opened"):
+        read_minari(folder)
+
+
+def test_a_damaged_directory_of_an_npz_is_refused(tmp_path):
+    path = tmp_path / "run.npz"
+    np.savez(path, t=np.zeros(4), u=np.zeros(4))
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"PK\x01\x02", b"PK\x01\x00", 1))
+    with pytest.raises(DataError, match="cannot be read as"):
+        load(path, columns="simple_pendulum")
+
+
 def test_causes_are_one_short_line():
     error = DataError("a\n" + 500 * "b" + "\nend", "do this", source="log.csv")
     assert str(error).startswith("log.csv: a bbb")
     assert str(error).endswith("bb end; do this")
-    assert len(str(error)) == len("log.csv: ") + 300 + len("; do this")
+    assert len(str(error)) == len("log.csv") + 300
+    named = str(DataError("wrong", 200 * "correct it ", source="log.csv", column=1000 * "c\x1b"))
+    assert named.isprintable()
+    assert len(named) <= len("log.csv") + 300

@@ -110,7 +110,9 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
             names = [*_REQUIRED, *(["next_observations"] if "next_observations" in file else [])]
             require_own_data(file, names, source=path)
             arrays = {name: np.asarray(file[name]) for name in names}
-    except (OSError, RuntimeError, TypeError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # h5py raises errors of all kinds for damaged files
         raise DataError(
             f"the file cannot be read as HDF5: {error}",
             "the file is truncated or of another format: copy or download it again",

@@ -11,15 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-_LONGEST_CAUSE = 300  # characters
+_LONGEST = 300  # characters of a message without its source
+_LONGEST_REMEDY = 170
+_LONGEST_COLUMN = 60  # a damaged file may have names of any length
 
 
 class DataError(ValueError):
     """Invalid data, with its location and a remedy.
 
     Args:
-        problem: the problem, with the invalid value; put on one line and cut to 300 characters.
-        remedy: how to correct it.
+        problem: the problem, with the invalid value; put on one line.
+        remedy: how to correct it. The message has at most 300 characters without the source; longer ones are cut.
         source: the file, folder or dataset name; also an attribute.
         column: the column's name, or the path inside a file; also an attribute.
         row: the row, counted from 1 (in text files, the line number); also an attribute.
@@ -44,17 +46,21 @@ class DataError(ValueError):
         self.row = row
         place = [
             self.source,
-            None if column is None else f"column {column!r}",
+            None if column is None else f"column {_one_line(repr(column), _LONGEST_COLUMN)}",
             None if row is None else f"row {row}",
         ]
         where = ", ".join(part for part in place if part)
-        super().__init__(f"{where + ': ' if where else ''}{_one_line(problem)}; {remedy}")
+        remedy = _one_line(remedy, _LONGEST_REMEDY)
+        begin = f"{where}: " if where else ""
+        problem = _one_line(problem, _LONGEST - len(begin) + len(self.source or "") - len(f"; {remedy}"))
+        super().__init__(f"{begin}{problem}; {remedy}")
 
 
-def _one_line(text: str) -> str:
-    """The text without line breaks, cut in the middle to 300 characters: libraries give causes of many lines."""
-    text = " ".join(text.split())
-    return text if len(text) <= _LONGEST_CAUSE else f"{text[:200]} ... {text[5 + 200 - _LONGEST_CAUSE :]}"
+def _one_line(text: str, most: int) -> str:
+    """The text without line breaks and invisible characters, cut in the middle to a number of characters."""
+    text = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+    first = 2 * most // 3
+    return text if len(text) <= most else f"{text[:first]} ... {text[first + 5 - most :]}"
 
 
 def require_finite(

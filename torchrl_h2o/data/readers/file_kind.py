@@ -32,8 +32,11 @@ def is_pickle(path: str | Path) -> bool:
     path = Path(path)
     if path.suffix.lower() == ".npz" and path.is_file() and zipfile.is_zipfile(path):
         # objects in the arrays are refused where the arrays are read
-        with zipfile.ZipFile(path) as archive:
-            return not all(name.endswith(".npy") for name in archive.namelist())
+        try:
+            with zipfile.ZipFile(path) as archive:
+                return not all(name.endswith(".npy") for name in archive.namelist())
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, OSError):
+            return False  # read_npz says what is wrong with the archive
     if path.suffix.lower() in _PICKLE_SUFFIXES:
         return True
     with path.open("rb") as file:

@@ -6,8 +6,11 @@ stores entries that are not tensors as pickles.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import shutil
+from operator import index
 from pathlib import Path
 from typing import cast
 
@@ -19,6 +22,7 @@ from torchrl_h2o.data.readers.file_kind import is_pickle
 from torchrl_h2o.data.readers.ted import entry_name, require_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 
+_BLOCK = 4096  # bytes by which the size of a file is rounded up
 _FLOATS = ("observation", "action", ("next", "observation"), ("next", "reward"))
 
 
@@ -55,8 +59,22 @@ def write_ted(td: TensorDictBase, folder: str | Path) -> Path:
                 column=entry_name(key),
             )
     with whole_folder(folder) as partial:
-        td.detach().contiguous().memmap(cast("str", partial))  # annotated for strings; it takes paths as well
+        map_to_files(td.detach().contiguous(), partial)
     return Path(folder)
+
+
+def map_to_files(td: TensorDictBase, folder: Path) -> None:
+    """Write the entries of a TensorDict into a folder, one file each.
+
+    Raises:
+        OSError: if the disk is full. Writing to a mapped file would then end the process with a bus error.
+    """
+    sizes = [leaf.nbytes for leaf in td.values(True, True)]
+    needed = sum(sizes) + _BLOCK * (len(sizes) + 2)
+    folder.mkdir(exist_ok=True)
+    if (free := shutil.disk_usage(folder).free) < needed:
+        raise OSError(errno.ENOSPC, f"the disk has {free} bytes left, and the data need {needed}", str(folder))
+    td.memmap(cast("str", folder), copy_existing=True)  # annotated for strings; it takes paths as well
 
 
 def read_ted(folder: str | Path, *, in_memory: bool = True) -> TensorDict:
@@ -113,10 +131,12 @@ def load_memory_map(folder: str | Path) -> TensorDict:
                 "write the data again with write_ted, which stores only tensors",
                 source=path,
             )
-    _require_whole_files(folder)
     try:
+        _require_whole_files(folder)
         return TensorDict.load_memmap(folder, allow_pickle=False)
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # tensordict raises errors of all kinds for damaged descriptions
         raise DataError(f"unreadable: {error}", "write it again", source=folder) from error
 
 
@@ -124,11 +144,12 @@ def _require_whole_files(folder: Path) -> None:
     try:
         meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
         sizes = {
-            folder / f"{key}.memmap": math.prod(entry["shape"])  # not numpy's, which overflows
+            folder / f"{key}.memmap": math.prod(map(index, entry["shape"]))  # not numpy's, which overflows
             * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
             for key, entry in meta.items()
             if isinstance(entry, dict) and "dtype" in entry
         }
+        nested = [key for key, entry in meta.items() if isinstance(entry, dict) and entry.get("is_nested")]
         inner = [key for key, entry in meta.items() if isinstance(entry, dict) and "type" in entry]
     except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
         raise DataError(
@@ -136,6 +157,9 @@ def _require_whole_files(folder: Path) -> None:
             "copy or write the folder again",
             source=folder / "meta.json",
         ) from error
+    if nested:
+        problem = "the entry is a nested tensor, whose rows differ in length"
+        raise DataError(problem, "write rows of one length", source=folder / "meta.json", column=nested[0])
     for path, size in sizes.items():
         found = path.stat().st_size if path.is_file() else 0
         if found != size:

@@ -181,8 +181,9 @@ def _open(source: str | Path) -> MinariDataset:
     try:
         if data.is_dir():
             _require_plausible_count(data)
-            return minari.MinariDataset(data)
-        return minari.load_dataset(str(source), download=True)
+        dataset = minari.MinariDataset(data) if data.is_dir() else minari.load_dataset(str(source), download=True)
+        _ = int(dataset.total_steps), dataset.spec  # minari checks these entries when they are asked for
+        return dataset
     except DataError:
         raise
     except Exception as error:  # each hosting service raises its own network errors
@@ -249,7 +250,9 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
                 place = {"column": f"episode_{number}/{field}", "source": source}
                 require_real(values, **place)
                 parts[field].append(require_flags(values, **place) if field in _FLAGS else values)
-    except (OSError, KeyError, RuntimeError, AssertionError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # h5py and minari raise errors of all kinds for damaged files
         raise DataError(
             f"episode {len(parts['truncations'])} cannot be read: {error}",
             "the file is truncated: copy or download it again",

@@ -34,7 +34,9 @@ def require_own_file(path: str | Path, *, settings: ReaderSettings = READER_SETT
     try:
         with h5py.File(path, "r") as file:
             require_own_data(file, list(file), source=path, settings=settings)
-    except (OSError, RuntimeError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # h5py raises errors of all kinds for damaged files
         raise DataError(
             f"the file cannot be read as HDF5: {error}",
             "the file is truncated or of another format: copy or download it again",

@@ -8,20 +8,22 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.whole_file import partial_name
 
 
 @contextmanager
 def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a temporary folder next to ``folder`` that is renamed to it when the block succeeds.
 
-    If the block raises or the process is killed, ``folder`` is not created.
+    If the block raises or the process is killed, ``folder`` is not created. Its temporary name is that of
+    :mod:`torchrl_h2o.whole_file`, which also removes it after a kill.
 
     Args:
         folder: the final name.
         replace: whether to replace an existing folder of that name, at the end of the block.
 
     Raises:
-        DataError: if the folder exists and ``replace`` is false.
+        DataError: if the folder exists and ``replace`` is false, or another process has made it in the meantime.
 
     Example:
         >>> import pathlib, tempfile
@@ -33,13 +35,13 @@ def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]
         'a'
     """
     folder = Path(folder).expanduser()
-    if folder.exists() and not replace:
-        raise DataError("the folder exists and is never overwritten", "remove it or choose another name", source=folder)
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # left over from a killed process
+    _require_absent(folder, replace)
+    partial = partial_name(folder)  # of this process, because several may make the same folder at once
+    shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
         yield partial
+        _require_absent(folder, replace)
         if folder.exists():  # a folder cannot be renamed onto a folder with files
             replaced = folder.with_name(f".{folder.name}.replaced")
             shutil.rmtree(replaced, ignore_errors=True)
@@ -50,3 +52,8 @@ def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]
             partial.rename(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _require_absent(folder: Path, replace: bool) -> None:
+    if folder.exists() and not replace:
+        raise DataError("the folder exists and is never overwritten", "remove it or choose another name", source=folder)

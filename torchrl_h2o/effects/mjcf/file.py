@@ -6,7 +6,6 @@ The file is written under a temporary name, loaded and compared before it replac
 from __future__ import annotations
 
 import ctypes
-import os
 import re
 import shutil
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects.model.compilation import accepting_total_mass, compile_model
+from torchrl_h2o.whole_file import whole_file
 
 _DIGITS = 17  # of a float64 that is read back unchanged
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{12,}(?:e[-+]?\d+)?")
@@ -53,13 +53,9 @@ def write_mjcf(spec: mujoco.MjSpec, path: str | Path) -> Path:
     compile_model(spec)  # MuJoCo writes a specification that is compiled
     with _all_digits(), accepting_total_mass():
         text = spec.to_xml()
-    partial = path.with_name(f".{path.stem}.partial.xml")
-    try:
+    with whole_file(path) as partial:
         partial.write_text(_LONG_NUMBER.sub(lambda number: repr(float(number[0])), text), encoding="utf-8")
         _require_equal(mujoco.MjModel.from_xml_path(str(partial)), model)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return path
 
 
@@ -91,11 +87,11 @@ def _copied(spec: mujoco.MjSpec, file: str, directory: str, folder: Path, name: 
         own = Path(file).name
         if f"{name}/{own}" in names.values():
             own = f"{len(names)}_{own}"
-        (folder / name).mkdir(exist_ok=True)
-        if content is None:
-            shutil.copyfile(source, folder / name / own)
-        else:
-            (folder / name / own).write_bytes(content if isinstance(content, bytes) else str(content).encode())
+        with whole_file(folder / name / own) as partial:
+            if content is None:
+                shutil.copyfile(source, partial)
+            else:
+                partial.write_bytes(content if isinstance(content, bytes) else str(content).encode())
         names[source] = f"{name}/{own}"
     return names[source]
 

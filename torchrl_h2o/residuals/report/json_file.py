@@ -12,7 +12,6 @@ import numpy as np
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
-from torchrl_h2o.residuals.report.atomic import write_text
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     DimensionError,
@@ -33,10 +32,11 @@ from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.sentence import sentence
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow, WindowQuantity
 from torchrl_h2o.residuals.report.words import effect_name
+from torchrl_h2o.whole_file import write_text
 
 FILE = "report.json"
 _ARRAYS = ("before", "after", "states")
-Read = TypeVar("Read")
+Read = TypeVar("Read", bound=ReportContents)
 
 
 def write_json(report: ReportContents, folder: str | Path) -> Path:
@@ -59,12 +59,15 @@ def read_json(path: str | Path, build: Callable[[Mapping[str, Any]], Read]) -> R
     path = path / FILE if path.is_dir() else path
     remedy = "give the report.json that Report.save wrote, or its folder"
     try:
-        return build(json.loads(path.read_text(encoding="utf-8")))
+        read = build(json.loads(path.read_text(encoding="utf-8")))
+        # an entry of a wrong type would otherwise show itself only where it is used
+        json.dumps(report_to_json(read), allow_nan=False)
+        return read
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", remedy, source=path) from error
     except KeyError as error:
         raise DataError(f"is not a report: it lacks {error}", remedy, source=path) from error
-    except (TypeError, ValueError, AttributeError, IndexError) as error:
+    except Exception as error:  # whatever it is that fails with entries of wrong types
         raise DataError(f"is not a report: {error}", remedy, source=path) from error
 
 

@@ -11,7 +11,6 @@ import jinja2
 
 from torchrl_h2o.effects import is_negligible, quantity_name
 from torchrl_h2o.residuals.report import plots
-from torchrl_h2o.residuals.report.atomic import write_text
 from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
 from torchrl_h2o.residuals.report.mended_model import REMEDY
 from torchrl_h2o.residuals.report.sentence import sentence
@@ -25,6 +24,7 @@ from torchrl_h2o.residuals.report.words import (
     number,
     quantity,
 )
+from torchrl_h2o.whole_file import write_text
 
 FILE = "report.html"
 SHOWN_RUNS = 12  # those with the largest errors; the others are in a list that opens

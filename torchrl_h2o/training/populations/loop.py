@@ -15,18 +15,20 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
+from torchrl.checkpoint import CheckpointRotation
 from tqdm import tqdm
 
 from torchrl_h2o.data.transition_checks import UnstableSimulatorError
+from torchrl_h2o.training.checkpoint import make_checkpoint, save_checkpoint
 from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.divergence import are_finite
 from torchrl_h2o.training.environments import as_observed, sim_capacity_of
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
 from torchrl_h2o.training.progress import Budget, Training, write_metrics
-from torchrl_h2o.training.run_folder import checkpoint_folder, save_config, uninterrupted
+from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
@@ -189,7 +191,7 @@ def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outco
     updates = training.updates if failure is None else failure["updates"]
     if are_finite(policies.values()):  # a policy that diverged cannot be evaluated
         with uninterrupted():
-            rotation.save(Checkpoint(format="archive", **policies), step=updates)
+            save_checkpoint(rotation, make_checkpoint(**policies), updates)
     return Outcome(
         trainee.policy,
         training.rows_of(name),

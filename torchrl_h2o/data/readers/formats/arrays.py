@@ -112,7 +112,9 @@ def _hdf5_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
                     stack = [(f"{name}.{inner}", entry[inner]) for inner in entry] + stack
                 elif isinstance(entry, h5py.Dataset) and entry.dtype.kind in "fiub":
                     yield name, entry[()].T  # MATLAB stores columns first
-    except (OSError, RuntimeError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # h5py raises errors of all kinds for damaged files
         raise DataError(f"the file cannot be read: {error}", "copy or write it again", source=path) from error
 
 
