@@ -168,7 +168,7 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
         ),
         "leg": System(
             lambda episode: GymWrapper(TimeLimit(LegEnv(), episode)),
-            lambda: Excitation(torch.full((3,), 12.0), strongest=0.5, brake=_held_joints(4.0, 0.3)),
+            lambda: Excitation(torch.full((3,), 12.0), strongest=0.25, brake=_held_joints(6.0, 0.6)),
         ),
         "wheel_legged": System(
             lambda episode: WheelLeggedEnv(max_episode_steps=episode), lambda: noisy_balance_controller()
