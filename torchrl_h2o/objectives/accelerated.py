@@ -140,6 +140,8 @@ def _perceptron(
         weight, bias = _weight_and_bias(params, path, frozen)
         if type(layer) is nn.LayerNorm:
             x = _layer_norm(x, layer, weight, cast(Tensor, bias))
+        elif compiling:
+            x = _linear_compiled(x, weight, bias)
         elif weight.ndim == 2:
             x = F.linear(x, weight, bias)
         else:
@@ -148,6 +150,18 @@ def _perceptron(
     if isinstance(x, tuple):
         return tuple(part.reshape(*params.batch_size, *batch_size, part.shape[-1]) for part in x)
     return x.reshape(*params.batch_size, *batch_size, x.shape[-1])
+
+
+def _linear_compiled(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Apply a linear layer such that the compiler adds the bias in the same pass as the activation that follows."""
+    if weight.ndim == 2:
+        x = (x @ weight.mT).unsqueeze(0)
+        return (x if bias is None else x + bias).squeeze(0)
+    if x.ndim == 2:  # all networks have the same inputs, so one product computes them all
+        x = (x @ weight.flatten(0, 1).mT).unflatten(-1, weight.shape[:2]).movedim(-2, 0)
+    else:
+        x = torch.bmm(x, weight.mT)
+    return x if bias is None else x + bias.unsqueeze(1)
 
 
 def _layer_norm(x: Tensor, layer: nn.LayerNorm, weight: Tensor, bias: Tensor) -> Tensor:
