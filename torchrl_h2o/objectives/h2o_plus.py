@@ -274,7 +274,7 @@ class H2OPlusLoss(LossWrapper):
             return {}
         whole = rows
         if self._splits:
-            batch = batch[: self.num_real]
+            batch = cast(TensorDictBase, batch[: self.num_real])
             rows = self.bellman_loss._rows(batch)
         batch.set(value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
         loss = value_loss.value_loss(batch, rows)
