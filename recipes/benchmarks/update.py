@@ -33,6 +33,7 @@ from torchrl_h2o.objectives.network_calls import NetworkCalls
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus, rlpd, sac
+from torchrl_h2o.training.precision import at_precision, has_bf16
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
 
@@ -89,6 +90,10 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
         learner = h2o_plus.make_learner(*what)
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours"] = learner.update
+        if cfg.device == "cpu" and has_bf16():
+            learner = h2o_plus.make_learner(*what)
+            learner.terms_of = compiled(at_precision(learner.terms_of, "bf16"))
+            chosen["ours, precision=bf16"] = learner.update
         learner = not_accelerated(h2o_plus.make_learner(*what))
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours, not accelerated"] = learner.update

@@ -115,7 +115,12 @@ def train_population(
 
     Returns:
         The result of each member, by name.
+
+    Raises:
+        ValueError: for ``precision=bf16``.
     """
+    if cfg.get("precision", "float32") != "float32":
+        raise ValueError(f"precision={cfg.precision}: populations are trained in float32; leave precision out")
     for name, own in members.items():
         (directory / name).mkdir(parents=True, exist_ok=True)
         save_config(own, directory / name)
