@@ -33,6 +33,7 @@ from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.methods.h2o_plus import make_value_loss
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
+from torchrl_h2o.training.precision import at_precision
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
@@ -108,10 +109,11 @@ def train(cfg: DictConfig, folder: Path) -> None:
         ratio_loss,
         weighted=cfg.ratio,
         target_entropy=cfg.target_entropy,
+        num_real=cfg.batch_size[0],
     )
     loss.make_value_estimator(gamma=cfg.gamma)
     accelerate(loss)  # optional: computes the same losses faster
-    loss_fn = maybe_compiled(loss, cfg.compiled, cfg.updates)
+    loss_fn = maybe_compiled(at_precision(loss, cfg.get("precision", "float32")), cfg.compiled, cfg.updates)
 
     # Optimiser, target networks, and the collector of simulated transitions
     budget = Budget(cfg.updates, cfg.updates_per_epoch, cfg.eval_every, cfg.checkpoint_every)

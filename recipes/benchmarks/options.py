@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 
 from torchrl_h2o.options import Options
 from torchrl_h2o.options.sources import AnyPath
-from torchrl_h2o.options.types import Count, Device, NotNegative, Positive, Rows, Seed
+from torchrl_h2o.options.types import Count, Device, NotNegative, Positive, Rows, Seed, Widths
 
 Counts = Annotated[list[Count], Field(min_length=1)]
 Seeds = Annotated[list[Seed], Field(min_length=1)]
@@ -41,6 +41,9 @@ class UpdateOptions(TimingOptions):
     action_dim: Count
     transitions: Count
     compiled: bool
+    authors: AnyPath | None
+    num_cells: Widths
+    layer_norm: bool
 
 
 class PopulationOptions(TimingOptions):

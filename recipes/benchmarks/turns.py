@@ -15,6 +15,7 @@ def calls_per_second(
     turns: int,
     device: str = "cpu",
     least: int = WARM_UP,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
     """Calls per second of each function, the best of several turns.
 
@@ -24,6 +25,8 @@ def calls_per_second(
         turns: number of turns of each function, after one to warm up.
         device: of the computation; a GPU is synchronised.
         least: minimum number of calls in a turn.
+        clock: seconds of wall time, or ``time.process_time``, which on one thread does not count the time that other
+            processes take.
     """
     synchronise = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
     best = dict.fromkeys(functions, 0.0)
@@ -32,12 +35,12 @@ def calls_per_second(
             for name, function in functions.items():
                 bar.set_postfix_str(name)
                 synchronise()
-                start, calls = time.perf_counter(), 0
-                while calls < least or (turn and time.perf_counter() - start < seconds):
+                start, calls = clock(), 0
+                while calls < least or (turn and clock() - start < seconds):
                     function()
                     calls += 1
                 synchronise()
                 if turn:  # the first is to warm up
-                    best[name] = max(best[name], calls / (time.perf_counter() - start))
+                    best[name] = max(best[name], calls / (clock() - start))
                 bar.update()
     return best

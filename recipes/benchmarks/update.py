@@ -2,18 +2,21 @@
 
 python recipes/benchmarks/update.py                        # two minutes; HalfCheetah's sizes, the authors' batches
 python recipes/benchmarks/update.py compiled=false seconds=1
+python recipes/benchmarks/update.py authors=H2Oplus    # also the authors' code, from a clone of t6-thu/H2Oplus
 python recipes/benchmarks/update.py device=cuda
 
-Contenders take turns, so that other load on the machine affects all of them alike. Writes update.json to the run's
-folder. Between machines compare ratios, not updates per second.
+Contenders take turns, so that other load on the machine affects all of them alike. On one thread of a CPU, updates are
+counted per second of CPU time. Writes update.json to the run's folder. Between machines compare ratios.
 """
 
 import json
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from authors import authors_update
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from options import UpdateOptions
@@ -31,6 +34,7 @@ from torchrl_h2o.objectives.network_calls import NetworkCalls
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus, rlpd, sac
+from torchrl_h2o.training.precision import at_precision, has_bf16
 from torchrl_h2o.whole_file import write_text
 
 PRODUCT = 2048  # rows and columns of the matrices whose product is timed
@@ -82,10 +86,16 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
     replay.extend(some_transitions(cfg))
     what = (run, cfg.observation_dim, action_spec(cfg), replay)
     chosen = {"textbook": textbook(cfg, run, replay)}
+    if cfg.authors:
+        chosen["authors' code"] = authors_update(cfg, run, replay)
     if cfg.compiled:
         learner = h2o_plus.make_learner(*what)
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours"] = learner.update
+        if cfg.device == "cpu" and has_bf16():
+            learner = h2o_plus.make_learner(*what)
+            learner.terms_of = compiled(at_precision(learner.terms_of, "bf16"))
+            chosen["ours, precision=bf16"] = learner.update
         learner = not_accelerated(h2o_plus.make_learner(*what))
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours, not accelerated"] = learner.update
@@ -120,15 +130,19 @@ def products_of(update: Callable[[], object]) -> int:
 
 
 def print_table(result: dict) -> None:
-    print(f"\n{'an update of H2O+':<34}{'a second':>10}{'× textbook':>12}{'of the limit':>14}")
-    for name, rate in result["updates_per_second"].items():
+    rates = result["updates_per_second"]
+    references = {"textbook": "textbook", "authors": "authors' code"}
+    references = {title: rates[name] for title, name in references.items() if name in rates}
+    titles = "".join(f"{f'× {title}':>12}" for title in references)
+    print(f"\n{'an update of H2O+':<34}{'a second':>10}{titles}{'of the limit':>14}")
+    for name, rate in rates.items():
         if name.startswith("SAC"):
             continue
-        of_limit = rate / result["limit"]
-        print(f"{name:<34}{rate:>10.1f}{rate / result['updates_per_second']['textbook']:>12.2f}{of_limit:>14.0%}")
+        ratios = "".join(f"{rate / reference:>12.2f}" for reference in references.values())
+        print(f"{name:<34}{rate:>10.1f}{ratios}{rate / result['limit']:>14.0%}")
     gflop = result["flop"] / 1e9
     print(f"{f'matrix products alone ({gflop:.2f} GFLOP)':<34}{result['limit']:>10.1f}")
-    sac_rates = {name: rate for name, rate in result["updates_per_second"].items() if name.startswith("SAC")}
+    sac_rates = {name: rate for name, rate in rates.items() if name.startswith("SAC")}
     print(f"\n{'an update of SAC':<34}{'a second':>10}")
     for name, rate in sac_rates.items():
         print(f"{name:<34}{rate:>10.1f}")
@@ -145,14 +159,16 @@ def recipe_on(cfg: DictConfig) -> DictConfig:
 @hydra_main("../config", "update_benchmark", UpdateOptions)
 def main(cfg: DictConfig) -> None:
     run = recipe_on(cfg)
+    run.num_cells, run.layer_norm = cfg.num_cells, cfg.layer_norm
     functions = contenders(cfg, run)
     flop = products_of(functions["textbook"])
     functions |= {"product": matrix_product(cfg.device)}
-    measured = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device)
+    clock = time.process_time if cfg.device == "cpu" and cfg.threads == 1 else time.perf_counter
+    measured = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device, clock=clock)
     gflops = 2.0 * PRODUCT**3 * measured.pop("product") / 1e9
     result = {"updates_per_second": measured, "flop": flop, "gflop_per_second": gflops, "limit": gflops * 1e9 / flop}
     directory = Path(HydraConfig.get().runtime.output_dir)
-    result |= {"torch": torch.__version__, "threads": cfg.threads, "device": cfg.device}
+    result |= {"torch": torch.__version__, "threads": cfg.threads, "device": cfg.device, "clock": clock.__name__}
     write_text(directory / "update.json", json.dumps(result, indent=2) + "\n")
     print_table(result)
     print(f"\nresults    {os.path.relpath(directory)}/update.json")

@@ -56,6 +56,7 @@ TRAIN = {
     "lr=nan": "lr=nan: must be a number above 0",
     "layer_norm=2": "layer_norm=2: must be true or false",
     "change_noise=-1": "change_noise=-1: must be auto or a number of at least 0",
+    "precision=half": "precision=half: must be float32 or bf16",
     "compiled=maybe": "compiled=maybe: must be auto, true, false or null",
     "mend=first": "mend=first: must be true, false, posterior or null",
     "baselines=[sca]": "baselines=[sca]: must be a list out of sac, cql, iql, darc, h2o, h2o_plus, rlpd, td3; did you "

@@ -258,3 +258,24 @@ def test_one_classifier_trained_on_pairs_takes_the_place_of_two(parts, batch):
     assert set(losses.keys()) == set(loss.out_keys)
     total_loss(losses).backward()
     assert all(p.grad.any() for p in loss.ratio_loss.parameters())
+
+
+def losses_and_gradients(loss, batch):
+    torch.manual_seed(3)
+    terms = torch.compile(loss, fullgraph=True, backend="eager")(batch)
+    total_loss(terms).backward()
+    return terms.detach(), {name: p.grad for name, p in loss.named_parameters() if p.grad is not None}
+
+
+def test_a_compiled_loss_that_knows_where_the_real_rows_are_is_the_same():
+    expected = losses_and_gradients(Parts().h2o_plus(), make_batch(4, 3))
+    terms, gradients = losses_and_gradients(Parts().h2o_plus(num_real=4), make_batch(4, 3))
+    assert gradients.keys() == expected[1].keys()
+    torch.testing.assert_close(terms, expected[0])
+    torch.testing.assert_close(gradients, expected[1])
+
+
+@pytest.mark.parametrize("num_real", [3, 5])
+def test_real_rows_elsewhere_than_promised_give_no_number(num_real):
+    losses, _ = losses_and_gradients(Parts().h2o_plus(num_real=num_real), make_batch(4, 3))
+    assert losses["loss_value"].isnan()

@@ -5,10 +5,12 @@ import shutil
 import pytest
 import torch
 from omegaconf import OmegaConf
+from torch._inductor.utils import fresh_cache
 from torchrl.data import Bounded
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.training.compiling import PAYS_FROM, maybe_compiled
+from torchrl_h2o.objectives.relu_perceptron import relu
+from torchrl_h2o.training.compiling import PAYS_FROM, compiled, maybe_compiled
 from torchrl_h2o.training.methods.h2o_plus import make_learner
 
 
@@ -43,6 +45,21 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-6)
     assert counters["stats"]["unique_graphs"] == 1  # no graph break and no recompilation
     assert not counters["graph_break"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
+def test_what_one_start_compiles_the_next_one_finds():
+    counters = torch._dynamo.utils.counters
+    x = torch.randn(4, 4, requires_grad=True)
+    found = []
+    with fresh_cache():
+        for _ in range(2):
+            torch._dynamo.reset()  # a new process has no compiled functions
+            counters.clear()
+            compiled(lambda x: relu(x).square().sum())(x).backward()
+            found.append(counters["aot_autograd"]["autograd_cache_hit"])
+    assert found == [0, 1]
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Losses of H2O+, and the additional terms of DARC and H2O. Needs only torch, tensordict and torchrl."""
 
 from torchrl_h2o.objectives.accelerated import accelerate
+from torchrl_h2o.objectives.accelerated_cql import AcceleratedCQLLoss
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
 from torchrl_h2o.objectives.conservative import ConservativeLoss, DynamicsDivergence
 from torchrl_h2o.objectives.exploration import EntropyBonus
@@ -23,6 +24,7 @@ from torchrl_h2o.objectives.value import (
 )
 
 __all__ = [
+    "AcceleratedCQLLoss",
     "ConservativeLoss",
     "DynamicsDivergence",
     "DynamicsRatioEstimator",

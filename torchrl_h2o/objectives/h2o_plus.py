@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.objectives import LossModule
 
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss, action_dim_of
@@ -41,6 +42,9 @@ class H2OPlusLoss(LossWrapper):
         fixed_alpha (bool, optional): whether β stays constant. Defaults to ``False``.
         target_entropy (float or "auto", optional): in nats. ``"auto"``, the default, is -dim(A), from the actor's
             spec.
+        num_real (int, optional): a promise that the first ``num_real`` rows of each batch are all its real rows, as in
+            :class:`~torchrl_h2o.data.HybridReplayBuffer`'s batches. The compiled loss then computes V on the real rows
+            only, and the ratio on the simulated rows only; the losses stay the same to rounding. Defaults to ``None``.
 
     Raises:
         ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if their reductions differ, or if the target
@@ -103,12 +107,14 @@ class H2OPlusLoss(LossWrapper):
         weighted: bool = True,
         fixed_alpha: bool = False,
         target_entropy: float | str = "auto",
+        num_real: int | None = None,
     ) -> None:
         _check_shared_value(bellman_loss, value_loss)
         super().__init__(bellman_loss, reduction=bellman_loss.reduction)
         self.value_loss = value_loss
         self.ratio_loss = ratio_loss
         self.weighted = weighted
+        self.num_real = num_real
         for part in self._parts:
             if part.reduction != self.reduction:
                 raise ValueError(
@@ -237,7 +243,9 @@ class H2OPlusLoss(LossWrapper):
             )
         terms = dict(self.ratio_loss(batch if pairs is None else pairs).items())
         if self.weighted:
-            log_ratio, ratio = self.ratio_loss.log_and_clamped_ratio(batch)
+            log_ratio, ratio = self.ratio_loss.log_and_clamped_ratio(batch[self.num_real :] if self._splits else batch)
+            if self._splits:  # real rows are not weighted
+                log_ratio, ratio = (F.pad(values, (len(batch) - len(values), 0)) for values in (log_ratio, ratio))
             batch.set(key, ratio)
             terms |= self._ratio_figures(log_ratio, ratio, rows)
         return terms
@@ -263,8 +271,20 @@ class H2OPlusLoss(LossWrapper):
         value_loss = self.value_loss
         if value_loss is None:
             return {}
+        whole = rows
+        if self._splits:
+            batch = cast(TensorDictBase, batch[: self.num_real])
+            rows = self.bellman_loss._rows(batch)
         batch.set(value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
-        return {"loss_value": value_loss.value_loss(batch, rows)}
+        loss = value_loss.value_loss(batch, rows)
+        if self._splits:  # NaN if real rows are not where num_real says, because the loss would be wrong
+            loss = loss.masked_fill(rows.sim.any() | whole.real[self.num_real :].any(), torch.nan)
+        return {"loss_value": loss}
+
+    @property
+    def _splits(self) -> bool:
+        """Whether terms of one stream are computed on its rows alone. Uncompiled, this would save no time."""
+        return bool(self.num_real) and self.reduction == "mean" and torch.compiler.is_compiling()
 
     @torch.no_grad()
     def _data_qvalue(self, batch: TensorDictBase) -> Tensor:

@@ -20,6 +20,7 @@ from torchrl_h2o.options.types import (
     Share,
     Trust,
     Widths,
+    has_bf16,
 )
 
 POSTERIOR_WORLDS = 10  # smallest number of worlds with mend=posterior; each of them has one draw for the whole run
@@ -119,6 +120,7 @@ class ExperimentOptions(Options):
     tau: Annotated[float, Field(gt=0, le=1)]
     target_entropy: Literal["auto"] | float
     compiled: Literal["auto"] | bool | None
+    precision: Literal["float32", "bf16"] = "float32"
     threads: Count
 
     reward_offset: float
@@ -145,6 +147,7 @@ class RunOptions(ExperimentOptions):
         self._check_gap()
         self._check_steps()
         self._check_mending()
+        self._check_precision()
         return self
 
     @property
@@ -167,6 +170,12 @@ class RunOptions(ExperimentOptions):
             raise ValueError(
                 f"n_steps={self.n_steps}: must be from 1 to {max(1, per_world - 1)}, less than the {per_world} steps "
                 f"of each world in an epoch (steps_per_epoch={self.steps_per_epoch} of num_worlds={self.worlds})"
+            )
+
+    def _check_precision(self) -> None:
+        if self.precision == "bf16" and not has_bf16():
+            raise ValueError(
+                "precision=bf16: this processor has no bfloat16 instructions; choose float32, which is faster on it"
             )
 
     def _check_mending(self) -> None:

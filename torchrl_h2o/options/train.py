@@ -102,8 +102,22 @@ class TrainOptions(AnyMethodOptions, RunOptions):
         if self.gaps is None:
             super()._check_gap()
 
+    def _check_precision(self) -> None:
+        others = {self.method, *self.baselines} - {"h2o_plus", "rlpd"}
+        if self.precision == "bf16" and (others or self.is_population):
+            raise ValueError(
+                "precision=bf16 is for single runs of h2o_plus and rlpd: leave it out with "
+                f"{', '.join(sorted(others)) or 'a population'}"
+            )
+        super()._check_precision()
+
+    @property
+    def is_population(self) -> bool:
+        """Whether several runs are trained together in one process."""
+        return self.seeds is not None or self.gaps is not None or self.mixings is not None
+
     def _check_population(self) -> None:
-        if self.seeds is None and self.gaps is None and self.mixings is None:
+        if not self.is_population:
             if self.device != "cpu":
                 raise ValueError(
                     f"device={self.device}: a single run trains on the CPU; device is an option of populations, such "

@@ -32,6 +32,8 @@ class OneOf:
         return core_schema.literal_schema(list(self.names))
 
 
+BF16_INSTRUCTIONS = ("avx512_bf16", "amx_bf16", "bf16")  # of x86 and of ARM processors, as torch names them
+
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]  # NumPy's and Gymnasium's generators accept no larger ones
 Positive = Annotated[float, Field(gt=0)]
@@ -58,6 +60,12 @@ def require_available(device: str) -> str:
     if device != "cpu" and int(device.partition(":")[2] or 0) >= (count := torch.cuda.device_count()):
         raise ValueError(f"the last CUDA device of this machine is cuda:{count - 1}")
     return device
+
+
+def has_bf16() -> bool:
+    """Whether the processor multiplies matrices in bfloat16."""
+    available = torch.cpu.get_capabilities()
+    return any(available.get(name) for name in BF16_INSTRUCTIONS)
 
 
 DeviceName = Annotated[

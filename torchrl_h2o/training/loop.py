@@ -23,6 +23,7 @@ from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
+from torchrl_h2o.training.precision import at_precision
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy, evaluate
@@ -153,7 +154,9 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     learner = trainee.learner
     if learner.trains_discriminators:
         learner.pairs = trainee.make_pairs(real)
-    compiled = cfg.get("compiled", False)  # configurations of earlier versions have no such entry
+    # cfg.get, because configurations of earlier versions have no such entries.
+    learner.terms_of = at_precision(learner.terms_of, cfg.get("precision", "float32"))
+    compiled = cfg.get("compiled", False)
     learner.terms_of = maybe_compiled(learner.terms_of, compiled, cfg.updates, pays=learner.pays_to_compile)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
     training = Training(method.title, directory, budget, **trainee.components, schedule=schedule)

@@ -31,6 +31,19 @@ def test_updates_are_set_beside_a_textbook_s_and_beside_the_limit(tmp_path):
     assert "of the limit" in out
 
 
+def test_a_folder_without_the_authors_code_is_said(tmp_path):
+    command = [
+        sys.executable,
+        BENCHMARKS / "update.py",
+        f"hydra.run.dir={tmp_path}",
+        f"authors={tmp_path}",
+        "transitions=300",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "clone t6-thu/H2Oplus" in done.stderr
+
+
 def test_steps_are_set_beside_bare_rollouts(tmp_path):
     out = run("simulator.py", tmp_path, "seconds=0.1", "turns=1", "worlds=[1,16]")
     rates = json.loads((tmp_path / "simulator.json").read_text())["steps_per_second"]
