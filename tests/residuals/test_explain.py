@@ -7,6 +7,7 @@ from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
 from torchrl_h2o.residuals import Evidence, explain
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.trace import search
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -47,6 +48,16 @@ def test_a_force_that_starts_late_is_not_called_one_that_was_always_there():
     (term,) = part.effect.parsed
     assert term.factors[0].function == "step"
     assert term.factors[0].numbers[0] == pytest.approx(8.0, abs=0.03)
+
+
+def test_an_error_in_the_search_leaves_what_was_found_before(monkeypatch):
+    def singular(*args):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(search, "simplify", singular)
+    explanation = explained(Gravity(1.3), noise=0.002)
+    assert explanation.effects[0].scale == pytest.approx(1.3, rel=0.02)
+    assert "further effects of the catalogue failed: Singular matrix" in explanation.failures[0]
 
 
 def test_where_the_catalogue_explains_all_no_force_is_made():

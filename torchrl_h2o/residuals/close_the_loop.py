@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -26,8 +27,11 @@ from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.search import trace_effects
 from torchrl_h2o.residuals.undeclared.beside_or_instead import add_undeclared_force
+
+FAILURES = (ValueError, np.linalg.LinAlgError)  # a model that rejects an effect, or singular equations
 
 
 def close_the_loop(
@@ -142,17 +146,11 @@ def explain(
         The explanation, without any parts if nothing is missing.
     """
     simulation, measured = evidence.simulation, evidence.undisturbed
-    trace = trace_effects(
-        simulation,
-        measured,
-        catalogue,
-        rng=rng,
-        progress=progress,
-        known=known,
-        found=lambda trace: so_far(Explanation.of(trace), "effects of the catalogue were tried"),
-        settings=settings,
+    options: dict[str, Any] = {"rng": rng, "progress": progress, "known": known, "settings": settings}
+    declared = _by_catalogue(
+        lambda found: trace_effects(simulation, measured, catalogue, found=found, **options),
+        lambda explanation: so_far(explanation, "effects of the catalogue were tried"),
     )
-    declared = Explanation.of(trace)
     so_far(declared, "undeclared forces were looked for")
     progress.stage(FORCES)
     add_force = partial(add_undeclared_force, rng=rng, settings=settings)
@@ -162,6 +160,24 @@ def explain(
     return _tried("action noise", with_force, lambda: add_action_noise(simulation, measured, with_force, settings))
 
 
+def _by_catalogue(
+    search: Callable[[Callable[[Trace], object]], Trace], so_far: Callable[[Explanation], object]
+) -> Explanation:
+    """The effects of the catalogue that a search finds; those found before it failed, with the failure recorded."""
+    explanations: list[Explanation] = []
+
+    def found(trace: Trace) -> None:
+        explanations.append(Explanation.of(trace))
+        so_far(explanations[-1])
+
+    try:
+        return Explanation.of(search(found))
+    except FAILURES as error:
+        if not explanations:  # the data cannot be searched at all
+            raise
+        return explanations[-1].with_failure(f"the search for further effects of the catalogue failed: {error}")
+
+
 def _tried(what: str, before: Explanation, search: Callable[[], Explanation]) -> Explanation:
     """The result of a search, or the explanation before it with the search recorded as failed.
 
@@ -169,5 +185,5 @@ def _tried(what: str, before: Explanation, search: Callable[[], Explanation]) ->
     """
     try:
         return search()
-    except (ValueError, np.linalg.LinAlgError) as error:
+    except FAILURES as error:
         return before.with_failure(f"the search for {what} failed: {error}")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
-from torchrl_h2o.effects import CatalogueEntry, JointFrictionLoss
+from torchrl_h2o.effects import Armature, CatalogueEntry, JointFrictionLoss
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.per_joint import entries_of_elements
@@ -38,6 +38,20 @@ def test_joints_that_are_equal_share_a_value():
     effects = friction(0.08, 0.08, 0.002)
     assert [effect.joints for effect in effects] == ["*"]
     assert torques(effects) == pytest.approx([0.08, 0.08], rel=0.05)
+
+
+def test_an_effect_that_is_only_possible_beside_another_does_not_end_the_search():
+    """Together they are 0.012 at the shoulder and 0.009 kg·m² at the elbow; alone, the second would be negative."""
+    truth = (Armature(0.012, "shoulder"), Armature(0.009, "elbow"))
+    measured = recorded(SIMULATION.with_effects(*truth), 1500, noise=0.002)
+    trials = ({"inertia": 0.005}, {"inertia": -0.003})
+    catalogue = [CatalogueEntry(Armature(joints=joints), trials) for joints in ("*", "shoulder", "elbow")]
+    known = (Armature(-0.003, "elbow"), Armature(0.012, "*"))
+    with LoopBar(disable=True) as progress:
+        rng = np.random.default_rng(0)
+        trace = trace_effects(SIMULATION, measured, catalogue, known=known, rng=rng, progress=progress)
+    model = SIMULATION.with_effects(*trace.fit.effects).model
+    assert model.dof_armature == pytest.approx([0.012, 0.009], rel=0.15)
 
 
 def test_elements_of_an_effect_on_several_joints():

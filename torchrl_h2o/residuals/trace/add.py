@@ -12,7 +12,13 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import matters
-from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible, promising_sets
+from torchrl_h2o.residuals.trace.screening import (
+    Lead,
+    are_possible_alone,
+    free_parameters,
+    is_possible,
+    promising_sets,
+)
 from torchrl_h2o.residuals.trace.state import SearchState
 
 Sketch = tuple[tuple[Lead, ...], Fit]  # a set of leads, and a quick fit with them
@@ -104,6 +110,8 @@ def _best_of(state: SearchState, sketches: Sequence[Sketch], present: _Candidate
     for chosen, start in sketches:
         entries = (*state.entries, *(lead.entry for lead in chosen))
         fitted = state.refitted(entries, start.effects)
+        if not are_possible_alone(state.problem, fitted.effects):
+            continue
         first_loss = state.first.selection_loss(fitted.effects)
         # each added effect must contribute its share; a set that fails this does not count as a finalist
         if not matters(nothing, present.first_loss, first_loss, len(chosen) * rules.min_share):

@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.per_joint import elements
 from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
-from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible
+from torchrl_h2o.residuals.trace.screening import Lead, are_possible_alone, free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -32,6 +32,8 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
         their loss.
     """
     kept = [effect for i, effect in enumerate(state.fit.effects) if i != index]
+    if not is_possible(state.problem, kept):
+        return state, ()
     state = state.rescaled(state.posed_at(kept))
     with_it = state.selection_losses(state.fit.effects)
     explained = state.selection_losses(kept).mean() - with_it.mean()
@@ -113,7 +115,8 @@ def _attempt(state: SearchState, index: int, rival: tuple[Lead, Fit], with_it: n
 
 def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explained: float) -> bool:
     """Whether an attempt misses a negligible share of the effect's gain, or a small and insignificant one."""
-    if is_outside(attempt.effect, state.problem.simulation.model):
+    problem = state.problem
+    if is_outside(attempt.effect, problem.simulation.model) or not are_possible_alone(problem, attempt.fit.effects):
         return False
     rules, worse = state.settings.trace, (attempt.loss - with_it) / explained
     significant = attempt.p_value <= state.settings.significance.level

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -22,6 +23,8 @@ def _without_one(state: SearchState) -> SearchState | None:
     for index in range(len(state.entries)):
         entries = (*state.entries[:index], *state.entries[index + 1 :])
         kept = (*state.fit.effects[:index], *state.fit.effects[index + 1 :])
+        if not is_possible(state.problem, kept):
+            continue
         fitted = state.refitted(entries, kept)
         after = state.selection_losses(fitted.effects)
         needed = after.mean() > most and state.p_value(after, before) < state.settings.significance.level

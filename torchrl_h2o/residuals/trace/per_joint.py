@@ -11,7 +11,7 @@ from torchrl_h2o.effects import CatalogueEntry, Effect, selection
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.problem import matters
-from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
+from torchrl_h2o.residuals.trace.screening import are_possible_alone, free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -76,8 +76,11 @@ def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:
     if not is_possible(state.problem, effects):
         return None
     entries = (*state.entries[:index], *singles, *state.entries[index + 1 :])
+    fitted = state.refitted(entries, effects)
+    if not are_possible_alone(state.problem, fitted.effects):
+        return None
     rivals = {**state.rivals, **{single.name: state.rivals[entry.name] for single in singles}}
-    return replace(state, entries=entries, fit=state.refitted(entries, effects), rivals=rivals, groups=())
+    return replace(state, entries=entries, fit=fitted, rivals=rivals, groups=())
 
 
 def _pays(state: SearchState, divided: SearchState, rng: np.random.Generator) -> bool:

@@ -9,7 +9,14 @@ from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import losses
-from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, is_possible, promising_sets, screen
+from torchrl_h2o.residuals.trace.screening import (
+    Lead,
+    are_possible_alone,
+    free_parameters,
+    is_possible,
+    promising_sets,
+    screen,
+)
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -78,7 +85,7 @@ def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:
         after = state.selection_losses(fitted.effects)
         close = (after.mean() - with_it.mean()) / explained < rules.alike_loss
         alike = close and state.p_value(after, with_it) > state.settings.significance.level
-        if alike and not _is_ruled_out(state, fitted) and not _places_mass_outside(state, fitted):
+        if alike and _is_plausible(state, fitted) and not _is_ruled_out(state, fitted):
             found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
     return tuple(found)
 
@@ -95,8 +102,10 @@ def _is_worse(state: SearchState, rival: Fit) -> bool:
     return bool(far and state.p_value(other, own) < state.settings.significance.level)
 
 
-def _places_mass_outside(state: SearchState, fitted: Fit) -> bool:
-    return any(is_outside(effect, state.problem.simulation.model) for effect in fitted.effects)
+def _is_plausible(state: SearchState, fitted: Fit) -> bool:
+    """Whether each effect is possible without the others, and none places a mass far outside the model."""
+    outside = any(is_outside(effect, state.problem.simulation.model) for effect in fitted.effects)
+    return not outside and are_possible_alone(state.problem, fitted.effects)
 
 
 def _sketched_sets(state: SearchState) -> list[tuple[list[CatalogueEntry], Fit]]:

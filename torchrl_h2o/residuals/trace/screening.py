@@ -121,6 +121,15 @@ def is_possible(problem: Problem, effects: Sequence[Effect]) -> bool:
         return False
 
 
+def are_possible_alone(problem: Problem, effects: Sequence[Effect]) -> bool:
+    """Whether the model accepts each effect without the others.
+
+    Rotor inertia of all joints and a negative one of the knee may be possible together. The knee's alone is not, so no
+    later step could remove or exchange the other effect.
+    """
+    return all(is_possible(problem, [effect]) for effect in effects)
+
+
 def promising_sets(
     problem: Problem, known: Sequence[Effect], leads: Sequence[Lead], size: int, starts: np.ndarray, keep: int
 ) -> list[tuple[Lead, ...]]:

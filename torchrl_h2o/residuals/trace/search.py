@@ -46,7 +46,7 @@ def trace_effects(
         progress: bar that shows how far the search is.
         known: effects from which the search begins, such as those of an unfinished run; those that are not in the
             catalogue are left out.
-        found: called with the preliminary result whenever an effect has been found.
+        found: called with the preliminary result at the beginning and whenever an effect has been found.
         settings: thresholds and budgets.
 
     Returns:
@@ -56,6 +56,7 @@ def trace_effects(
     horizon = choose_horizon(simulation, measured, rng, settings)
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
+    found(_outcome(state))
     for _ in range(settings.trace.rounds):
         before, state = state, grow(state, rng, progress, lambda grown: found(_outcome(grown)))
         if state.entries == before.entries and len(state.groups) == len(state.entries):
