@@ -109,7 +109,6 @@ def train(cfg: DictConfig, folder: Path) -> None:
         ratio_loss,
         weighted=cfg.ratio,
         target_entropy=cfg.target_entropy,
-        num_real=cfg.batch_size[0],
     )
     loss.make_value_estimator(gamma=cfg.gamma)
     accelerate(loss)  # optional: computes the same losses faster

@@ -14,6 +14,7 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import torch
 from authors import authors_update
@@ -29,7 +30,7 @@ from turns import calls_per_second
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import HybridLoss
+from torchrl_h2o.objectives import H2OPlusLoss, HybridLoss
 from torchrl_h2o.objectives.network_calls import NetworkCalls
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.learner import Learner
@@ -92,10 +93,13 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
         learner = h2o_plus.make_learner(*what)
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours"] = learner.update
+        learner = knowing_real_rows(h2o_plus.make_learner(*what), run)
+        learner.terms_of = compiled(learner.terms_of)
+        chosen["ours, num_real"] = learner.update
         if cfg.device == "cpu" and has_bf16():
-            learner = h2o_plus.make_learner(*what)
+            learner = knowing_real_rows(h2o_plus.make_learner(*what), run)
             learner.terms_of = compiled(at_precision(learner.terms_of, "bf16"))
-            chosen["ours, precision=bf16"] = learner.update
+            chosen["ours, num_real, precision=bf16"] = learner.update
         learner = not_accelerated(h2o_plus.make_learner(*what))
         learner.terms_of = compiled(learner.terms_of)
         chosen["ours, not accelerated"] = learner.update
@@ -106,6 +110,12 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
     chosen["SAC, TorchRL's loss"] = torchrl_sac.update
     chosen["SAC of our parts"] = rlpd.make_learner(*what).update  # on both streams, too
     return chosen
+
+
+def knowing_real_rows(learner: Learner, run: DictConfig) -> Learner:
+    """Let the compiled loss compute each term on the rows of one stream where it needs no others."""
+    cast(H2OPlusLoss, learner.terms_of).num_real = run.batch_size[0]
+    return learner
 
 
 def not_accelerated(learner: Learner) -> Learner:

@@ -34,7 +34,6 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         ratio_loss=ratio_loss,
         weighted=cfg.ratio,
         target_entropy=cfg.target_entropy,
-        num_real=cfg.batch_size[0],
     )
     loss.make_value_estimator(gamma=cfg.gamma)
     accelerate(loss)
