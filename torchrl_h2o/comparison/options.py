@@ -24,7 +24,7 @@ class PaperOptions(AnyMethodOptions):
     methods: Names | None
     datasets: Annotated[list[DataSource], Field(min_length=1)] | None
     gaps: Annotated[list[Gap], Field(min_length=1)] | None
-    strengths: Annotated[list[float], Field(min_length=1)] | None
+    strengths: Annotated[list[float | None], Field(min_length=1)] | None
     tasks: Names | None
     sizes: Annotated[list[Positive], Field(min_length=1, examples=[[2.5, 83]])] | None
     log: AnyPath | None

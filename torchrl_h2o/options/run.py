@@ -43,7 +43,7 @@ class MakeOptions(Options):
             return name
         try:
             gymnasium.spec(name)
-        except gymnasium.error.UnregisteredEnv as error:
+        except gymnasium.error.Error as error:  # unknown, or a version that Gymnasium has removed
             raise ValueError(str(error).replace("`", "")) from None
         return name
 
@@ -155,21 +155,26 @@ class RunOptions(ExperimentOptions):
         """Number of worlds in which transitions are collected, in each worker."""
         return max(self.num_worlds, POSTERIOR_WORLDS) if self.mend == "posterior" else self.num_worlds
 
+    @property
+    def streams(self) -> int:
+        """Number of worlds that share the steps of an epoch."""
+        return self.worlds
+
     def _check_gap(self) -> None:
         if self.gap is None and self.gap_strength is not None:
             raise ValueError(f"gap_strength={self.gap_strength} belongs to a gap: name one, such as gap=gravity")
 
     def _check_steps(self) -> None:
-        per_world = self.steps_per_epoch // self.worlds
+        per_world = self.steps_per_epoch // self.streams
         if not per_world:
             raise ValueError(
-                f"num_worlds={self.worlds}: must be at most steps_per_epoch={self.steps_per_epoch}, which the "
+                f"num_worlds={self.streams}: must be at most steps_per_epoch={self.steps_per_epoch}, which the "
                 "worlds share"
             )
         if not self.n_steps < max(2, per_world):
             raise ValueError(
                 f"n_steps={self.n_steps}: must be from 1 to {max(1, per_world - 1)}, less than the {per_world} steps "
-                f"of each world in an epoch (steps_per_epoch={self.steps_per_epoch} of num_worlds={self.worlds})"
+                f"of each world in an epoch (steps_per_epoch={self.steps_per_epoch} of num_worlds={self.streams})"
             )
 
     def _check_precision(self) -> None:

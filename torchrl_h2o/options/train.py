@@ -98,6 +98,11 @@ class TrainOptions(AnyMethodOptions, RunOptions):
         self._check_collector()
         return self
 
+    @property
+    def streams(self) -> int:
+        """Number of worlds of all workers, which share the steps of an epoch."""
+        return self.worlds * self.collector.workers
+
     def _check_gap(self) -> None:
         if self.gaps is None:
             super()._check_gap()

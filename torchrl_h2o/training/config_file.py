@@ -14,7 +14,7 @@ from torchrl_h2o.training.targets import require_known_targets
 from torchrl_h2o.whole_file import write_text
 
 FILE = "config.yaml"
-LARGEST = 2**20  # bytes; a population's or a posterior's configuration has some ten thousand
+LARGEST = 2**24  # bytes; a population's or a posterior's configuration has some ten thousand
 DEEPEST = 40  # levels of nested lists and mappings; a run's configuration has at most eight
 _EVENTS = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _LAYOUT = {"env": dict, "env.name": str, "env.make": dict, "env.simulator": list, "env.reality": list}

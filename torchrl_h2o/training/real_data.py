@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -95,7 +96,8 @@ def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
         )
     made_of = [config[key] for key in ("make", "reality", "behaviour", "recording")]
     digest = hashlib.sha256(json.dumps([made_of, __version__], sort_keys=True).encode()).hexdigest()[:12]
-    folder = cache_folder() / f"{config['name']}_{digest}"
+    name = re.sub(r"[^\w-]+", "_", config["name"])  # no path, because a folder from somebody else may name the env
+    folder = cache_folder() / f"{name}_{digest}"
     if not folder.exists():
         data = record(reality, instantiate(config["behaviour"]), **config["recording"])
         with contextlib.suppress(DataError):  # another run may have written the folder in the meantime

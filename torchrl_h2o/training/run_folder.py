@@ -21,6 +21,7 @@ from torchrl_h2o.options import TrainOptions, check_options
 from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.mending import prepare_mending
 from torchrl_h2o.training.remnants import remove_remnants
+from torchrl_h2o.training.targets import foreign_names
 
 
 def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
@@ -42,17 +43,21 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
     if not OmegaConf.is_missing(cfg, "resume"):
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "trust="))]
+        allowed = ("resume=", "trust=", "results=")
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith(allowed)]
         if others:
             raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
         if not any(directory.iterdir()):
             directory.rmdir()  # Hydra has made it; a mistyped name shall not leave a folder
+        results = cfg.get("results")
         cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
         check_options(cfg, TrainOptions, saved=True)
+        _name_results(cfg, results)
     elif (directory / "config.yaml").exists():
         if not go_on:
             raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
         cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
+        check_options(cfg, TrainOptions, saved=True)
     else:
         prepare_mending(cfg)
         resolve_paths(cfg)
@@ -60,6 +65,14 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
     torch.set_num_threads(cfg.threads)
     tqdm.write(f"run folder: {os.path.relpath(directory)}")
     return cfg, directory
+
+
+def _name_results(cfg: DictConfig, results: str | None) -> None:
+    """Takes the file of results from this call, because a folder from somebody else could name any file to write to."""
+    if results is None and cfg.get("results") is not None:
+        tqdm.write(f"the results are not added to {cfg.results}; for that, add results={cfg.results} to the command")
+    if "results" in cfg:
+        cfg.results = results
 
 
 def resolve_paths(cfg: DictConfig) -> None:
@@ -103,7 +116,9 @@ def resumable(directory: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}")
+        names = foreign_names(load_config(directory, trust=True)) if (directory / "config.yaml").exists() else []
+        trust = f" 'trust=[{','.join(names)}]'" if names else ""
+        sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}{trust}")
 
 
 @contextmanager

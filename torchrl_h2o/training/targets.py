@@ -1,7 +1,8 @@
 """What the configuration in a run's folder may build: effects, environments, rewards and controllers of this library.
 
 Hydra calls whatever a ``_target_`` names. The folder may come from somebody else, so its names are compared with a list
-before anything is built. What the user typed in this call, such as the names in an own env/mine.yaml, is not limited.
+before anything is built. Names in a configuration that the user gives in this call, such as those in an own
+env/mine.yaml, are not limited; to resume or evaluate such a run, the user lists them once more in ``trust``.
 """
 
 from __future__ import annotations
@@ -84,14 +85,21 @@ def require_known_targets(
         return
     own: Any = {} if typed is None else OmegaConf.to_container(typed, resolve=False, throw_on_missing=False)
     allowed = {use.name for use in _uses(own)} | _names(trust)
-    for use in _uses(entries):
-        if use.problem is not None and use.name not in allowed:
-            raise DataError(
-                use.problem,
-                f"if you know who made this folder and what it runs, add trust=[{use.name}]",
-                source=source,
-                column=use.place,
-            )
+    refused = [use for use in _uses(entries) if use.problem is not None and use.name not in allowed]
+    if refused:
+        names = ",".join(dict.fromkeys(use.name for use in refused))
+        raise DataError(
+            str(refused[0].problem),
+            f"if you know who made this folder and what it runs, add trust=[{names}]",
+            source=source,
+            column=refused[0].place,
+        )
+
+
+def foreign_names(cfg: DictConfig) -> list[str]:
+    """The names in a configuration that only ``trust`` allows, each once."""
+    entries: Any = OmegaConf.to_container(cfg, resolve=False, throw_on_missing=False)
+    return list(dict.fromkeys(use.name for use in _uses(entries) if use.problem is not None))
 
 
 def _names(trust: bool | str | Iterable[str] | None) -> set[str]:

@@ -37,6 +37,16 @@ DAMPING = CatalogueEntry(JointDamping(), ({"damping": 0.04}, {"damping": 0.4}))
 ALL = [GAIN, FRICTION, GRAVITY, DAMPING]
 
 
+def test_groups_belong_to_the_effects_found():
+    """A later round adds effects to those whose alternatives are known; the preliminary result is then without them."""
+    problem = Problem.pose(SIMULATION, recorded(SIMULATION.with_effects(Gravity(1.3)), 300))
+    state = SearchState.begin(problem, ALL, np.random.default_rng(0))
+    one = replace(state.with_found([GRAVITY], state.refitted([GRAVITY], [Gravity(1.2)])), groups=((),))
+    assert one.with_found([GRAVITY], one.fit).groups == ((),)
+    both = one.refitted([GRAVITY, FRICTION], [Gravity(1.2), JointFrictionLoss(0.01)])
+    assert one.with_found([GRAVITY, FRICTION], both).groups == ()
+
+
 def traced(*truth, catalogue=ALL, rows=1000, noise=0.0, seed=0):
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise, seed=seed)
     return traced_in(measured, catalogue)

@@ -56,7 +56,7 @@ def _rivals(state: SearchState, index: int) -> list[Lead]:
     rules, own = state.settings.trace, state.entries[index].name
     leads = state.rivals[own]
     names = {entry.name for entry in state.entries}
-    promise = next(lead.promise for lead in leads if lead.entry.name == own)
+    promise = next((lead.promise for lead in leads if lead.entry.name == own), 0.0)
     others = [lead for lead in leads if lead.entry.name not in names and not _repeats(state, index, lead.entry)]
     nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[: rules.nearest_rivals]
     return list({lead.entry.name: lead for lead in (*nearest, *others[: rules.top_rivals])}.values())

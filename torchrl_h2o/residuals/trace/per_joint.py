@@ -79,7 +79,7 @@ def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:
     fitted = state.refitted(entries, effects)
     if not are_possible_alone(state.problem, fitted.effects):
         return None
-    rivals = {**state.rivals, **{single.name: state.rivals[entry.name] for single in singles}}
+    rivals = {**{single.name: state.rivals[entry.name] for single in singles}, **state.rivals}
     return replace(state, entries=entries, fit=fitted, rivals=rivals, groups=())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
@@ -62,8 +62,7 @@ def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet
     others = tuple(sorted((one for one in (own, *sets) if one is not best), key=lambda one: (one.surprise, one.loss)))
     if best is own:
         return state, others
-    groups = ((),) * len(best.entries)
-    return replace(state, groups=groups).with_found(best.entries, best.fit), others
+    return state.with_found(best.entries, best.fit), others
 
 
 def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:

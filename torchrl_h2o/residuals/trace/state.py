@@ -98,8 +98,9 @@ class SearchState:
         return tuple(entry for entry in self.catalogue if entry.name not in names)
 
     def with_found(self, entries: Sequence[CatalogueEntry], fitted: Fit) -> SearchState:
-        """The state with other effects found."""
-        return replace(self, entries=tuple(entries), fit=fitted)
+        """The state with other effects found; without groups, unless the entries are the same."""
+        entries = tuple(entries)
+        return replace(self, entries=entries, fit=fitted, groups=self.groups if entries == self.entries else ())
 
     def refitted(
         self, entries: Sequence[CatalogueEntry], start: Sequence[Effect], rows: np.ndarray | None = None

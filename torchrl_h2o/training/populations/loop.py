@@ -3,7 +3,8 @@
 Each member has its own simulator, buffer and random stream, and draws from the stream in the order of a single run. On
 a CPU its results therefore equal that run's, up to rounding. A member is stopped when its losses or parameters are no
 longer finite, or when its simulator produces NaN: its networks are no longer changed, simulated or evaluated. The other
-members are not affected.
+members are not affected. Only a simulator that produces NaN in its first epoch ends the whole population, because each
+batch needs simulated rows of every member.
 """
 
 from contextlib import ExitStack
