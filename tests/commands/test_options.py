@@ -9,6 +9,7 @@ import pytest
 import torch
 from hydra.core.singleton import Singleton
 from omegaconf import OmegaConf, open_dict
+from pydantic import ValidationError
 
 from tests.run_fixtures import ROOT
 from torchrl_h2o.comparison.options import PaperOptions, ReportOptions
@@ -20,6 +21,7 @@ from torchrl_h2o.options import (
     TrainOptions,
     check_options,
 )
+from torchrl_h2o.options.run import MakeOptions
 from torchrl_h2o.training.methods import METHODS
 
 GAPS = ", ".join(PAPER_GAPS)
@@ -282,3 +284,8 @@ def test_no_folder_of_the_user_is_removed(refused, tmp_path):
     elsewhere.parent.mkdir()
     assert refused("train", "gamma=2", f"hydra.run.dir={elsewhere}").startswith("ValueError: gamma=2")
     assert list(elsewhere.parent.iterdir()) == []
+
+
+def test_a_version_that_gymnasium_has_removed_is_refused_in_one_line():
+    with pytest.raises(ValidationError, match="HalfCheetah-v1"):
+        MakeOptions.model_validate({"_target_": "torchrl.envs.GymEnv", "env_name": "HalfCheetah-v1"})

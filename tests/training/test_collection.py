@@ -110,6 +110,13 @@ def test_workers_and_worlds_that_can_share_an_epoch_are_taken(compose):
     check_options(compose("collector=multi_sync", "collector.workers=2", "num_worlds=4")[0], TrainOptions)
 
 
+def test_steps_of_a_target_are_fewer_than_those_of_each_world_of_each_worker(compose):
+    options = ("steps_per_epoch=400", "num_worlds=4", "n_steps=60")
+    check_options(compose(*options)[0], TrainOptions)
+    with pytest.raises(ValueError, match="n_steps=60: must be from 1 to 49"):
+        check_options(compose("collector=multi_sync", "collector.workers=2", *options)[0], TrainOptions)
+
+
 def test_ray_that_is_not_installed_is_named_with_what_to_do(compose, monkeypatch):
     monkeypatch.setattr("torchrl_h2o.options.train.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl_h2o\[ray\]'"):

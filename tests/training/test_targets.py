@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import zipfile
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,9 +19,11 @@ from tests.small_runs import ROBOT, SMALL, run
 from torchrl_h2o.data import DataError
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals import Report
+from torchrl_h2o.training import run_folder
 from torchrl_h2o.training.checkpoint import load_checkpoint
 from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.environments import task_of
+from torchrl_h2o.training.run_folder import resumable
 from torchrl_h2o.training.targets import TARGETS
 
 CONFIG = {
@@ -107,6 +110,34 @@ def test_nothing_is_called_before_the_refusal_and_trust_allows_it(tmp_path):
     for trust in (True, "numpy.savetxt", ["numpy.savetxt"]):
         task_of(load_config(folder, trust=trust))
         evidence.unlink()
+
+
+def test_all_refused_names_are_listed_at_once(tmp_path):
+    folder = saved(tmp_path, {"env.make": call("my_package.Env"), "env.reality": [call("my_package.Wind")]})
+    with pytest.raises(DataError, match=r"add trust=\[my_package.Env,my_package.Wind\]"):
+        load_config(folder)
+    load_config(folder, trust=["my_package.Env", "my_package.Wind"])
+
+
+def test_an_interrupted_run_of_an_own_env_names_what_to_trust(tmp_path):
+    folder = saved(tmp_path, {"env.make": call("my_package.Env")})
+    with pytest.raises(SystemExit, match=r"resume=.* 'trust=\[my_package.Env\]'"), resumable(folder):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("typed", "expected"), [(None, None), ("mine.csv", "mine.csv")])
+def test_a_resumed_folder_names_no_file_to_write_to(compose, tmp_path, monkeypatch, typed, expected):
+    cfg, _ = compose()
+    cfg.results = str(tmp_path / ".bash_profile")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    save_config(cfg, folder)
+    this_call = SimpleNamespace(
+        runtime=SimpleNamespace(output_dir=str(folder)), overrides=SimpleNamespace(task=[f"resume={folder}"])
+    )
+    monkeypatch.setattr(run_folder.HydraConfig, "get", lambda: this_call)
+    resumed, _ = run_folder.open_run(OmegaConf.create({"resume": str(folder), "results": typed, "trust": False}))
+    assert resumed.results == expected
 
 
 def test_names_of_this_call_are_allowed(tmp_path):

@@ -95,7 +95,6 @@ class TrainOptions(AnyMethodOptions, RunOptions):
     @model_validator(mode="after")
     def _fit_the_method(self) -> TrainOptions:
         self._check_population()
-        self._check_collector()
         return self
 
     @property
@@ -106,6 +105,12 @@ class TrainOptions(AnyMethodOptions, RunOptions):
     def _check_gap(self) -> None:
         if self.gaps is None:
             super()._check_gap()
+
+    def _check_steps(self) -> None:
+        if self.collector.workers > 1:  # says more than a bound on num_worlds
+            self._check_collector()
+        super()._check_steps()
+        self._check_collector()
 
     def _check_precision(self) -> None:
         others = {self.method, *self.baselines} - {"h2o_plus", "rlpd"}
