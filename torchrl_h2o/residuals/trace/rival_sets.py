@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from torchrl_h2o.effects import CatalogueEntry
@@ -40,7 +40,9 @@ class RivalSet:
         return sum(map(surprise, self.fit.effects))
 
 
-def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet, ...]]:
+def with_most_usual_set(
+    state: SearchState, advance: Callable[[], object] = lambda: None
+) -> tuple[SearchState, tuple[RivalSet, ...]]:
     """Replaces the effects found by a more usual set that explains the data as well, and lists the other sets.
 
     A log in which the torque follows the motion cannot tell a weak motor from friction and rotor inertia. A search that
@@ -48,6 +50,7 @@ def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet
 
     Args:
         state: effects found.
+        advance: called after each set that was fitted.
 
     Returns:
         The state with the most usual set, unchanged if that is the one found, and the other sets, in ascending order of
@@ -55,7 +58,7 @@ def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet
     """
     if state.exact or not state.entries:
         return state, ()
-    sets = rival_sets(state)
+    sets = rival_sets(state, advance)
     own_loss = float(state.selection_losses(state.fit.effects).mean())
     own = RivalSet(state.entries, state.fit, own_loss)
     best = min((own, *sets), key=lambda one: one.surprise)  # the first of equals, so the own set is kept
@@ -65,7 +68,7 @@ def with_most_usual_set(state: SearchState) -> tuple[SearchState, tuple[RivalSet
     return state.with_found(best.entries, best.fit), others
 
 
-def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:
+def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None) -> tuple[RivalSet, ...]:
     """Sets of one to three effects whose loss is not significantly higher than that of the effects found.
 
     Residuals are scaled by their size without effects, which favours no set. There, the noise of one quantity may hide
@@ -79,7 +82,8 @@ def rival_sets(state: SearchState) -> tuple[RivalSet, ...]:
     if explained <= 0.0:
         return ()
     found = []
-    for entries, sketch in _sketched_sets(state):
+    for entries, sketch in _sketched_sets(state, advance):
+        advance()
         fitted = state.refitted(entries, sketch.effects)
         after = state.selection_losses(fitted.effects)
         close = (after.mean() - with_it.mean()) / explained < rules.alike_loss
@@ -107,7 +111,7 @@ def _is_plausible(state: SearchState, fitted: Fit) -> bool:
     return not outside and are_possible_alone(state.problem, fitted.effects)
 
 
-def _sketched_sets(state: SearchState) -> list[tuple[list[CatalogueEntry], Fit]]:
+def _sketched_sets(state: SearchState, advance: Callable[[], object]) -> list[tuple[list[CatalogueEntry], Fit]]:
     """The most promising sets of each size with a quick fit, those that reach a share of the gain."""
     rules, screened = state.settings.trace, state.windows.screened
     leads = screen(state.problem, (), state.catalogue, screened)
@@ -124,6 +128,7 @@ def _sketched_sets(state: SearchState) -> list[tuple[list[CatalogueEntry], Fit]]
             if _is_new(state, leads_of_set) and is_possible(state.problem, [lead.effect for lead in leads_of_set]):
                 free = [free_parameters(entry) for entry in entries]
                 sketch = state.sketched([lead.effect for lead in leads_of_set], free, rules.sketch_evaluations)
+                advance()
                 if few_without - sketch.loss >= needed:
                     sketches.append((entries, sketch))
         chosen += sorted(sketches, key=lambda one: one[1].loss)[: rules.rival_finalists]

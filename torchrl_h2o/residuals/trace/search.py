@@ -22,6 +22,7 @@ from torchrl_h2o.residuals.trace.rival_sets import with_most_usual_set
 from torchrl_h2o.residuals.trace.simplify import simplify
 from torchrl_h2o.residuals.trace.state import SearchState
 
+SET_FITTED = 0.04  # share by which the fit of another set of effects brings the bar closer to the end of its stage
 EFFECT_SIMPLIFIED = 0.25  # share by which one effect brings the bar closer to the end of its stage
 
 
@@ -69,7 +70,7 @@ def trace_effects(
         # a further round helps only where effects have been replaced, by simpler ones or by one for each joint
         if state.entries == grown.entries:
             break
-    state, others = with_most_usual_set(state)
+    state, others = with_most_usual_set(state, lambda: progress.closer(SET_FITTED))
     return replace(_outcome(_fitted_to_all(state)), others=others)
 
 
