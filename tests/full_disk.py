@@ -34,7 +34,7 @@ def small_disk(folder: Path, size: str = "4m") -> Iterator[Path]:
 
 
 def fill(disk: Path, leave: int = 0) -> Path:
-    """Writes a file that leaves so many bytes of a disk, rounded down to whole blocks."""
+    """Fills a disk with one file, except for ``leave`` bytes, rounded down to whole blocks; returns the file."""
     filler = disk / "filler"
     filler.write_bytes(bytes(max(0, shutil.disk_usage(disk).free - leave)))
     return filler

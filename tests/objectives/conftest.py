@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 
 from torchrl_h2o.objectives import (
+    ConservativeLoss,
     DynamicsRatioLoss,
     ExpectileValueLoss,
     H2OPlusLoss,
@@ -93,6 +94,16 @@ def _move_targets(loss):
             target.add_(0.1 * torch.randn_like(target))
     loss._has_update_associated = dict.fromkeys(loss._has_update_associated, True)
     return loss
+
+
+#: one loss of each kind, made of the same networks
+LOSSES = {
+    "value": lambda parts: ExpectileValueLoss(parts.value),
+    "ratio": lambda parts: DynamicsRatioLoss(parts.estimator),
+    "bellman": lambda parts: parts.bellman(),
+    "h2o_plus": lambda parts: parts.h2o_plus(),
+    "conservative": lambda parts: ConservativeLoss(parts.sac()),
+}
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from torchrl.data import Bounded
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import TD3Loss
 
+from tests.objectives import conftest
 from tests.objectives.conftest import CELLS, Parts, make_batch
 from torchrl_h2o.objectives import (
     ConservativeLoss,
@@ -31,13 +32,9 @@ def weighted_td3(parts):
 
 
 LOSSES = {
-    "value": lambda parts: ExpectileValueLoss(parts.value),
-    "ratio": lambda parts: DynamicsRatioLoss(parts.estimator),
-    "bellman": lambda parts: parts.bellman(),
-    "h2o_plus": lambda parts: parts.h2o_plus(),
+    **conftest.LOSSES,
     "accelerated": lambda parts: accelerate(parts.h2o_plus()),
     "sac": lambda parts: parts.sac(),
-    "conservative": lambda parts: ConservativeLoss(parts.sac()),
 }
 losses = pytest.mark.parametrize("name", LOSSES)
 bootstrapping = pytest.mark.parametrize("name", ["bellman", "h2o_plus", "accelerated", "sac", "conservative"])

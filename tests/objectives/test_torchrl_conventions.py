@@ -13,24 +13,16 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, TD1Estimator
 
-from tests.objectives.conftest import ACTION_DIM, OBSERVATION_DIM, Parts, make_actor, make_batch
+from tests.objectives.conftest import ACTION_DIM, LOSSES, OBSERVATION_DIM, Parts, make_actor, make_batch
 from torchrl_h2o.objectives import (
     ConservativeLoss,
     DynamicsRatioLoss,
     EntropyBonus,
-    ExpectileValueLoss,
     H2OPlusLoss,
     ImportanceWeightedLoss,
     MixedBellmanLoss,
 )
 
-LOSSES = {
-    "value": lambda parts: ExpectileValueLoss(parts.value),
-    "ratio": lambda parts: DynamicsRatioLoss(parts.estimator),
-    "bellman": lambda parts: parts.bellman(),
-    "h2o_plus": lambda parts: parts.h2o_plus(),
-    "conservative": lambda parts: ConservativeLoss(parts.sac()),
-}
 losses = pytest.mark.parametrize("name", LOSSES)
 with_q = pytest.mark.parametrize("build", ["bellman", "h2o_plus", "sac"])
 

@@ -13,9 +13,9 @@ class DivergenceError(ArithmeticError):
     """Losses or parameters of a training are no longer finite.
 
     Args:
-        message: what is not finite, at which update, and what to do.
-        why: what is not finite.
-        updates: number of updates before.
+        message: the text of the error: the cause, the update and the advice.
+        why: the cause alone, such as ``loss_qvalue is nan at update 1,234``, for the run's summary.
+        updates: number of updates that were completed before.
     """
 
     def __init__(self, message: str, why: str, updates: int) -> None:
