@@ -14,10 +14,10 @@ from torchrl_h2o.data import DataError
 
 LONGEST = 300  # characters of a message, without the name of the file
 MOST_SECONDS, MOST_BYTES = 5.0, 2 * 2**30
-EXAMPLES = int(os.environ.get("TORCHRL_H2O_FUZZ", "300"))
+EXAMPLES = os.environ.get("TORCHRL_H2O_FUZZ")  # a number: that many examples, others in every run
 _CHECKS = {"suppress_health_check": list(HealthCheck), "deadline": None}
 few = settings(max_examples=20, derandomize=True, **_CHECKS)
-many = settings(max_examples=EXAMPLES, **_CHECKS)
+many = settings(max_examples=int(EXAMPLES or 300), derandomize=EXAMPLES is None, **_CHECKS)
 
 _NUMBERS = [
     b"\xff" * 4,

@@ -35,7 +35,7 @@ def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):
 def test_a_method_that_there_is_not_is_said(command):
     done = subprocess.run(**command("method=ppo", script="train.py"), text=True, check=False)
     assert done.returncode != 0
-    assert "choose sac, cql, iql" in done.stdout
+    assert "method=ppo: must be sac, cql, iql, darc" in done.stdout
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
     except yaml.constructor.ConstructorError as error:
         line = None if error.problem_mark is None else error.problem_mark.line + 1
         raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, no such day, a number of 5,000 digits
         raise DataError(f"invalid YAML: {error}", "correct the file", source=source) from error
     known = _known_entries(layout, entries, source)
     if not isinstance(known.get("columns"), list) or not known["columns"]:
