@@ -137,6 +137,8 @@ class TraceSettings:
     """The same share with noisy sensors, because noise in the start states may imitate an effect."""
     min_share: float = 0.003
     """Share of the whole reduction of the loss that each added effect must contribute."""
+    much_lower: float = 0.5
+    """Share of the present loss below which an addition counts, however small its part of the whole reduction is."""
     beyond_noise: float = 4.0
     """Required multiple of the gain of the same addition in synthetic data with sensor noise only."""
     max_effects: int = 6
@@ -160,7 +162,17 @@ class TraceSettings:
     set_sizes: tuple[tuple[int, int], ...] = ((1, 12), (2, 4), (3, 4))
     """Pairs (size of a set, number of sets of this size that are sketched)."""
     finalists: int = 3
-    """Number of sketched sets of one size that are fitted on all windows of the search."""
+    """Number of sketched sets of one size that are fitted on all windows of the search, at least."""
+    close_sketch: float = 0.4
+    """Share of the gain of the best sketch of one size from which further sets are fitted."""
+    beam_width: int = 3
+    """Largest number of lists of effects that the search grows side by side."""
+    beam_loss: float = 1.25
+    """Multiple of the lowest loss up to which another list is grown as well."""
+    same_fit: float = 1e-3
+    """Relative difference of two losses up to which the shorter list of effects stands for the other one as well."""
+    clearly_needed: float = 1.5
+    """Multiple of the loss that a sketch without an effect must exceed for the effect to be kept without a full fit."""
     sketch_evaluations: int = 6
     """Evaluations of the residual in a sketch (quick fit) of an addition."""
     rival_evaluations: int = 20

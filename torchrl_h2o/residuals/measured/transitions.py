@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, TypeVar, cast
@@ -20,7 +20,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 Result = TypeVar("Result")
 
 HELD_OUT = 0.25  # share of the transitions on which errors are reported
-REMEMBERED = 16  # results that are kept with the data
+REMEMBERED = 32  # results that are kept with the data
 
 
 class Split(IntEnum):
@@ -64,7 +64,7 @@ class Measured:
     source: str
     settings: MeasuredSettings = DEFAULTS.measured
     estimated_std: np.ndarray | None = None
-    _results: OrderedDict[tuple[str, Simulation], Any] = field(default_factory=OrderedDict, init=False, repr=False)
+    _results: OrderedDict[tuple[Hashable, Simulation], Any] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @classmethod
     def from_ted(
@@ -176,11 +176,11 @@ class Measured:
         left_out[reason] = left_out.get(reason, 0) + int((rows & self.usable).sum())
         return replace(self, usable=self.usable & ~rows, left_out=left_out)
 
-    def remembered(self, what: str, simulation: Simulation, compute: Callable[[], Result]) -> Result:
+    def remembered(self, what: Hashable, simulation: Simulation, compute: Callable[[], Result]) -> Result:
         """The result of a computation on these data with a simulation, which is kept for later calls.
 
         Args:
-            what: name of the computation.
+            what: name of the computation, and what else it depends on.
             simulation: the simulation.
             compute: computes the result. Nobody may change the result afterwards.
         """

@@ -11,7 +11,7 @@ from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.per_joint import elements
-from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
+from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.screening import Lead, are_possible_alone, free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -46,8 +46,7 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
 
 def p_value_between(state: SearchState, problem: Problem, worse: Fit, better: Fit) -> float:
     """p-value of the difference between two fits on held-out windows, with residuals scaled as in a problem."""
-    judged = state.windows.selected_on
-    before, after = (losses(problem.residual(fitted.effects, judged)) for fitted in (worse, better))
+    before, after = (problem.selection_losses(fitted.effects) for fitted in (worse, better))
     return state.p_value(before, after)
 
 
@@ -80,9 +79,9 @@ def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
 
     A rival that is far from this share after the first evaluations is given up.
     """
-    rules, effects, screened = state.settings.trace, state.fit.effects, state.windows.screened
+    rules, effects = state.settings.trace, state.fit.effects
     kept = [effect for i, effect in enumerate(effects) if i != index]
-    few_with_it, few_without = (losses(state.problem.residual(e, screened)).mean() for e in (effects, kept))
+    few_with_it, few_without = map(state.screened_loss, (effects, kept))
     gain, near = few_without - few_with_it, []
     for lead in _rivals(state, index):
         instead = [*kept[:index], lead.effect, *kept[index:]]

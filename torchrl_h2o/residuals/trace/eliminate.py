@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from torchrl_h2o.residuals.trace.screening import is_possible
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.problem import matters
+from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -16,6 +18,14 @@ def eliminate(state: SearchState) -> SearchState:
     return state
 
 
+def _is_clearly_needed(state: SearchState, index: int) -> bool:
+    """Whether a quick fit of the other effects leaves a much higher loss; spares most of the full fits."""
+    rules, effects = state.settings.trace, state.fit.effects
+    free = [free_parameters(entry) for i, entry in enumerate(state.entries) if i != index]
+    without = state.sketched([e for i, e in enumerate(effects) if i != index], free, rules.sketch_evaluations).loss
+    return without > rules.clearly_needed * state.screened_loss(effects)
+
+
 def _without_one(state: SearchState) -> SearchState | None:
     """The state without the first effect that is not needed; None if all are needed."""
     before = state.selection_losses(state.fit.effects)
@@ -23,11 +33,18 @@ def _without_one(state: SearchState) -> SearchState | None:
     for index in range(len(state.entries)):
         entries = (*state.entries[:index], *state.entries[index + 1 :])
         kept = (*state.fit.effects[:index], *state.fit.effects[index + 1 :])
-        if not is_possible(state.problem, kept):
+        if not is_possible(state.problem, kept) or _is_clearly_needed(state, index):
             continue
-        fitted = state.refitted(entries, kept)
-        after = state.selection_losses(fitted.effects)
+        # an effect that has become neutral is not needed, however a fit without it ends
+        fits = (state.refitted(entries, kept), state.fit.without(index))
+        after, fitted = min(((state.selection_losses(one.effects), one) for one in fits), key=lambda one: one[0].mean())
         needed = after.mean() > most and state.p_value(after, before) < state.settings.significance.level
-        if not needed:
+        if not needed or not _is_beyond_rounding(state, fitted):
             return state.with_found(entries, fitted)
     return None
+
+
+def _is_beyond_rounding(state: SearchState, smaller: Fit) -> bool:
+    """Whether a smaller fit misses a share of the first loss that rounding does not explain."""
+    without, with_it = (state.first.selection_loss(which.effects) for which in (smaller, state.fit))
+    return matters(state.first_loss, without, with_it, state.settings.trace.same_loss)

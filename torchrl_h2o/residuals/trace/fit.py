@@ -7,7 +7,7 @@ import io
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,14 @@ class Fit:
     free: tuple[Free, ...]
     loss: float
     half_widths: tuple[dict[str, float], ...]
+
+    def without(self, index: int) -> Fit:
+        """The fit without one effect; the other values and the loss are those of the joint fit."""
+        effects, free, half_widths = (
+            tuple(one for i, one in enumerate(all_of_them) if i != index)
+            for all_of_them in (self.effects, self.free, self.half_widths)
+        )
+        return replace(self, effects=effects, free=free, half_widths=half_widths)
 
     def ci95(self, index: int) -> dict[str, tuple[float, float]]:
         """95 % intervals (low, high) of one effect's fitted parameters, in their units."""

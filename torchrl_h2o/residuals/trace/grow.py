@@ -1,19 +1,25 @@
-"""Grows the list of effects: adds the best set, drops what it makes redundant, reorders, and rescales the residuals."""
+"""Grows lists of effects side by side (a beam search): adds sets, drops what they make redundant, and rescales.
+
+A search that keeps only one list goes astray where a wrong effect imitates two right ones. A heavier torso and friction
+of the axles look like heavier wheels until one of the two has been put in.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 
 import numpy as np
 
+from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.add import best_addition
+from torchrl_h2o.residuals.trace.add import additions, distinct
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.order import reorder
-from torchrl_h2o.residuals.trace.screening import Lead, screen
+from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SCREENING, ADDITION = 0.2, 0.3  # shares by which a screening and an addition bring the bar closer to the stage's end
@@ -31,22 +37,75 @@ def grow(
         state: effects found so far.
         rng: generator of synthetic noise.
         progress: bar that moves with every screened entry and names the effects found.
-        found: called after each addition.
+        found: called with the best list of effects after each round of additions.
     """
-    state = _rescale(state)
-    while not state.exact and len(state.entries) < state.settings.trace.max_effects:
-        screened = state.windows.screened
-        one_more = partial(progress.closer, SCREENING / max(1, len(state.others)))
-        leads = screen(state.problem, state.fit.effects, state.others, screened, one_more)
-        grown = best_addition(state, leads, rng)
-        if len(grown.entries) == len(state.entries):
-            return grown
-        grown = _remember_leads(grown, leads, grown.entries[len(state.entries) :])
-        state = _rescale(reorder(eliminate(grown)))
+    beam, complete = [_rescale(state)], []
+    while True:
+        grown = [(one, _grown(one, rng, progress)) for one in beam]
+        complete += [one for one, more in grown if not more]
+        beam = [each for _, more in grown for each in more]
+        if not beam:
+            return _simplest_of_best(complete)
+        exact = [one for one in beam if one.exact]
+        lists = [min(exact, key=_size)] if exact else _closest([*complete, *beam])
+        progress.set_postfix_str(", ".join(entry.name for entry in lists[0].entries))
+        found(lists[0])
+        if exact:
+            return lists[0]
+        beam, complete = ([one for one in lists if one in which] for which in (beam, complete))
+
+
+def _grown(state: SearchState, rng: np.random.Generator, progress: LoopBar) -> list[SearchState]:
+    """The states with one set of effects more; empty if the list is complete."""
+    if state.exact or len(state.entries) >= state.settings.trace.max_effects:
+        return []
+    one_more = partial(progress.closer, SCREENING / max(1, len(state.others)))
+    leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
+    grown = []
+    for added in additions(state, leads, rng):
+        added = _remember_leads(added, leads, added.entries[len(state.entries) :])
+        grown.append(_rescale(reorder(eliminate(added))))
         progress.closer(ADDITION)
-        progress.set_postfix_str(", ".join(entry.name for entry in state.entries))
-        found(state)
-    return state
+        if grown[-1].exact:
+            break
+    return grown
+
+
+def _closest(states: Sequence[SearchState]) -> list[SearchState]:
+    """The states whose loss comes close to the lowest one, in ascending order of their loss; no list of effects twice.
+
+    The losses are compared with residuals scaled by what the best list leaves, because those with the scales of the
+    first effect say little about the last one.
+    """
+    rules = states[0].settings.trace
+    states = list({frozenset(entry.name for entry in one.entries): one for one in reversed(states)}.values())
+    means = [float(losses.mean()) for losses in _comparable_losses(states)]
+    pairs = sorted(zip(means, states, strict=True), key=lambda pair: (pair[0], _size(pair[1])))
+    near = [pair for pair in pairs if pair[0] <= rules.beam_loss * pairs[0][0]]
+    return [state for _, state in distinct(near, itemgetter(0), rules.same_fit)[: rules.beam_width]]
+
+
+def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
+    """Of the states whose loss is not significantly higher than the lowest one, the one with the fewest parameters."""
+    if len(states) == 1:
+        return states[0]
+    losses = _comparable_losses(states)
+    best = min(losses, key=np.mean)
+    level = states[0].settings.significance.level
+    as_good = [one for one, loss in zip(states, losses, strict=True) if states[0].p_value(loss, best) > level]
+    return min(as_good, key=_size)
+
+
+def _comparable_losses(states: Sequence[SearchState]) -> list[np.ndarray]:
+    """Losses of the selection windows, (W) for each state, with residuals scaled by what the best state leaves."""
+    best = min(states, key=lambda one: one.first.selection_loss(one.fit.effects))
+    return [best.selection_losses(one.fit.effects) for one in states]
+
+
+def _size(state: SearchState) -> tuple[int, int]:
+    """Number of fitted parameters, and how unusual the effects are."""
+    free = sum(len(free_parameters(entry)) for entry in state.entries)
+    return free, sum(map(surprise, state.fit.effects))
 
 
 def _remember_leads(state: SearchState, leads: Sequence[Lead], added: Sequence) -> SearchState:
@@ -58,10 +117,10 @@ def _remember_leads(state: SearchState, leads: Sequence[Lead], added: Sequence) 
 
 
 def _rescale(state: SearchState) -> SearchState:
-    """Scales residuals by their present size; refits if the better simulator gives other start states."""
+    """Scales residuals by their present size; refits if the better simulator gives other observed start states."""
     posed = state.posed_at(state.fit.effects)
-    rescaled = state.rescaled(posed)
-    if state.entries and not np.array_equal(state.problem.states, posed.states):
+    rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
+    if state.entries and not np.array_equal(observed(state.problem.states), observed(posed.states)):
         refitted = rescaled.with_found(state.entries, rescaled.refitted(state.entries, state.fit.effects))
         kept = eliminate(refitted)
         posed = kept.posed_at(kept.fit.effects)

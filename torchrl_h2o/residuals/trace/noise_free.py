@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchrl_h2o.residuals.trace.fit import Fit
-from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -31,7 +29,7 @@ def without_noise(state: SearchState) -> SearchState:
     silent = state.rescaled(state.posed_at(state.fit.effects, sensor_std=no_noise))
     free = [free_parameters(entry) for entry in state.entries]
     fitted = silent.sketched(state.fit.effects, free, rules.sketch_evaluations)
-    if fitted.loss > rules.noise_free_loss * _loss(silent, state.fit):
+    if fitted.loss > rules.noise_free_loss * silent.screened_loss(state.fit.effects):
         return state
     for _ in range(rules.noise_free_fits):
         silent = silent.with_found(state.entries, silent.refitted(state.entries, fitted.effects))
@@ -40,8 +38,3 @@ def without_noise(state: SearchState) -> SearchState:
         if posed.within_rounding:
             return replace(silent, exact=True)
     return state
-
-
-def _loss(state: SearchState, fitted: Fit) -> float:
-    """Loss of a fit on the screened windows."""
-    return float(losses(state.problem.residual(fitted.effects, state.windows.screened)).mean())

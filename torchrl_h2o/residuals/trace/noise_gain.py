@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.measured.sensor_noise import stand_in
 from torchrl_h2o.residuals.trace.fit import Free, fit
-from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -37,7 +37,5 @@ def explained_by_noise(
     posed = Problem.pose(mended, data, problem.horizon, sensor_std=problem.sensor_std, settings=problem.settings)
     posed = replace(posed, simulation=problem.simulation)
     fitted = fit(posed, effects, free, state.windows.fitted, settings=state.settings.fit)
-    before, after = (
-        losses(posed.residual(which, state.windows.selected_on)).mean() for which in (state.fit.effects, fitted.effects)
-    )
-    return 1.0 - float(after / before)
+    before, after = (posed.selection_loss(which) for which in (state.fit.effects, fitted.effects))
+    return 1.0 - after / before

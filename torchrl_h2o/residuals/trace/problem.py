@@ -75,7 +75,7 @@ class Problem:
         one = np.ones((1, 1, measured.observation.shape[1]))
         problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std, settings)
         found, rounding = problem._missed((), fitted), problem._rounding(fitted)
-        size = np.maximum(np.nanmean(np.abs(found), axis=(0, 1)), rounding)
+        size = np.maximum(np.nanmedian(np.abs(found), axis=(0, 1)), rounding)
         if sensor_std is None:
             return replace(problem, scale=one * size)
         estimated = replace(problem, states=estimate_states(simulation, measured))
@@ -101,9 +101,32 @@ class Problem:
         """Expected size of the windows' residuals, (W, H, n) or (1, 1, n), in units of the observations."""
         return self.scale[starts] if len(self.scale) > 1 else self.scale
 
+    def settled(self, effects: Sequence[Effect], starts: np.ndarray) -> Problem:
+        """The problem with unobserved start coordinates as they follow from effects; itself if all are observed.
+
+        A larger wheel carries the body higher. With the start states of one list of effects, no other list can win.
+
+        Args:
+            effects: the effects that the preceding steps are simulated with.
+            starts: (W), first rows of the windows in which the coordinates are needed.
+        """
+        hidden = self.simulation.state_map.hidden
+        if not hidden:
+            return self
+        places, states = np.ix_(starts, np.asarray(hidden)), self.states.copy()
+        mended, measured = self.simulation.with_effects(*effects), self.measured
+        what = ("unobserved coordinates", starts.tobytes())
+        states[places] = measured.remembered(what, mended, lambda: start_states(mended, measured, starts)[places])
+        return replace(self, states=states)
+
+    def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
+        """Robust loss of each window by which effects are chosen, (W), with effects put in."""
+        judged = self.measured.selected_on(self.horizon)
+        return losses(self.settled(effects, judged).residual(effects, judged))
+
     def selection_loss(self, effects: Sequence[Effect]) -> float:
-        """Mean robust loss on the windows by which effects are chosen, with effects put in."""
-        return float(losses(self.residual(effects, self.measured.selected_on(self.horizon))).mean())
+        """Mean of :meth:`selection_losses`."""
+        return float(self.selection_losses(effects).mean())
 
     @property
     def within_rounding(self) -> bool:

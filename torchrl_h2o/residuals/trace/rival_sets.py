@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
 from torchrl_h2o.residuals.trace.fit import Fit
-from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import (
     Lead,
     are_possible_alone,
@@ -56,7 +55,7 @@ def with_most_usual_set(
         The state with the most usual set, unchanged if that is the one found, and the other sets, in ascending order of
         their surprise and loss.
     """
-    if state.exact or not state.entries:
+    if not state.entries or (state.exact and len(state.entries) == 1):  # what equals a single effect is in its group
         return state, ()
     sets = rival_sets(state, advance)
     own_loss = float(state.selection_losses(state.fit.effects).mean())
@@ -86,9 +85,14 @@ def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None)
         advance()
         fitted = state.refitted(entries, sketch.effects)
         after = state.selection_losses(fitted.effects)
-        close = (after.mean() - with_it.mean()) / explained < rules.alike_loss
-        alike = close and state.p_value(after, with_it) > state.settings.significance.level
-        if alike and _is_plausible(state, fitted) and not _is_ruled_out(state, fitted):
+        missed = (after.mean() - with_it.mean()) / explained
+        if state.exact:
+            alike = missed < rules.same_loss
+        else:
+            close = missed < rules.alike_loss
+            alike = close and state.p_value(after, with_it) > state.settings.significance.level
+            alike = alike and not _is_ruled_out(state, fitted)
+        if alike and _is_plausible(state, fitted):
             found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
     return tuple(found)
 
@@ -116,7 +120,7 @@ def _sketched_sets(state: SearchState, advance: Callable[[], object]) -> list[tu
     rules, screened = state.settings.trace, state.windows.screened
     leads = screen(state.problem, (), state.catalogue, screened)
     among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
-    few_with_it, few_without = (losses(state.problem.residual(e, screened)).mean() for e in (state.fit.effects, ()))
+    few_with_it, few_without = map(state.screened_loss, (state.fit.effects, ()))
     needed = rules.rival_min_sketch * (few_without - few_with_it)
     chosen = []
     for size in range(1, rules.rival_set_size + 1):

@@ -14,6 +14,7 @@ from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.begin import begin_with
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
+from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.grow import grow
 from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.per_joint import divide_by_element
@@ -63,7 +64,10 @@ def trace_effects(
         if state.entries == before.entries and len(state.groups) == len(state.entries):
             break
         progress.stage(OTHERS)
-        grown, state = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
+        grown, simpler = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
+        state = eliminate(simpler)
+        if state is not simpler:
+            continue  # an effect was replaced by one that is not needed
         if state.exact:
             break
         state = divide_by_element(_rescaled(state), rng)

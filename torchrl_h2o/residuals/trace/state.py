@@ -28,22 +28,20 @@ class SearchWindows:
         all: windows for the final fit.
         fitted: part of them, for fits during the search.
         screened: part of ``fitted``, for screening and sketches.
-        selected_on: windows by which effects are chosen.
     """
 
     all: np.ndarray
     fitted: np.ndarray
     screened: np.ndarray
-    selected_on: np.ndarray
 
     @classmethod
     def draw(cls, problem: Problem, rng: np.random.Generator, settings: LoopSettings) -> SearchWindows:
         """Chooses the windows of a problem; the screened ones are drawn at random."""
         rules, horizon = settings.trace, problem.horizon
-        every, chosen_by = problem.measured.fitted(horizon), problem.measured.selected_on(horizon)
+        every = problem.measured.fitted(horizon)
         fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon))
         few = min(max(rules.min_screened, rules.screened_steps // horizon), len(fitted))
-        return cls(every, fitted, np.sort(rng.choice(fitted, few, replace=False)), chosen_by)
+        return cls(every, fitted, np.sort(rng.choice(fitted, few, replace=False)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,17 +103,26 @@ class SearchState:
     def refitted(
         self, entries: Sequence[CatalogueEntry], start: Sequence[Effect], rows: np.ndarray | None = None
     ) -> Fit:
-        """Joint fit of entries from given values, on the windows of the search or on others."""
+        """Joint fit of entries from given values, on the windows of the search or on others.
+
+        If some coordinates are not observed, they follow from the effects: where the fit changes the residuals through
+        them, a second fit starts with them as the first one puts them.
+        """
         rows = self.windows.fitted if rows is None else rows
         if not entries:
             return _no_effects(self.problem, rows)
         free = [free_parameters(entry) for entry in entries]
-        return fit(self.problem, start, free, rows, settings=self.settings.fit)
+        fitted = fit(self.problem.settled(start, rows), start, free, rows, settings=self.settings.fit)
+        settled = self.problem.settled(fitted.effects, rows)
+        moved = abs(float(losses(settled.residual(fitted.effects, rows)).mean()) - fitted.loss)
+        if moved <= self.settings.trace.same_fit * fitted.loss:
+            return fitted
+        return fit(settled, fitted.effects, free, rows, settings=self.settings.fit)
 
     def sketched(self, effects: Sequence[Effect], free: Sequence[Free], max_evaluations: int) -> Fit:
         """Quick fit of some parameters on the screened windows."""
         return fit(
-            self.problem,
+            self.problem.settled(effects, self.windows.screened),
             effects,
             free,
             self.windows.screened,
@@ -123,9 +130,14 @@ class SearchState:
             settings=self.settings.fit,
         )
 
+    def screened_loss(self, effects: Sequence[Effect]) -> float:
+        """Mean loss of the screened windows with effects put in, comparable with that of a sketch."""
+        screened = self.windows.screened
+        return float(losses(self.problem.settled(effects, screened).residual(effects, screened)).mean())
+
     def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
         """Robust loss of each selection window, (W), with effects put in."""
-        return losses(self.problem.residual(effects, self.windows.selected_on))
+        return self.problem.selection_losses(effects)
 
     def p_value(self, before: np.ndarray, after: np.ndarray) -> float:
         """p-value of a decrease of losses on the selection windows, (W) each."""
