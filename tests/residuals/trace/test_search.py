@@ -13,6 +13,7 @@ from torchrl_h2o.effects import (
     ActionGain,
     Armature,
     BodyInertia,
+    BodyMass,
     CatalogueEntry,
     Gravity,
     JointDamping,
@@ -34,6 +35,8 @@ INERTIA = CatalogueEntry(BodyInertia(), FACTORS)
 ARMATURE = CatalogueEntry(Armature(), ({"inertia": 0.004}, {"inertia": 0.04}))
 FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
 DAMPING = CatalogueEntry(JointDamping(), ({"damping": 0.04}, {"damping": 0.4}))
+SPRING = CatalogueEntry(JointSpring(joints="elbow"), ({"stiffness": 0.2}, {"stiffness": 1.0}))
+MASS = CatalogueEntry(BodyMass(), FACTORS)
 ALL = [GAIN, FRICTION, GRAVITY, DAMPING]
 
 
@@ -77,8 +80,7 @@ def test_three_effects_are_found_and_no_fourth():
 
 
 def test_a_spring_that_looks_like_gravity_is_not_named():
-    spring = CatalogueEntry(JointSpring(joints="elbow"), ({"stiffness": 0.2}, {"stiffness": 1.0}))
-    trace = traced(Gravity(1.3), JointFrictionLoss(0.03), catalogue=[spring, *ALL])
+    trace = traced(Gravity(1.3), JointFrictionLoss(0.03), catalogue=[SPRING, *ALL])
     assert set(names(trace.entries)) == {GRAVITY.name, FRICTION.name}
 
 
@@ -95,6 +97,24 @@ def test_effects_are_found_under_noise():
     trace = traced(Gravity(1.3), rows=2500, noise=0.01)
     assert names(trace.entries) == [GRAVITY.name]
     assert trace.fit.effects[0].scale == pytest.approx(1.3, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        (Gravity(0.7), JointDamping(0.1)),  # each alone increases the loss as long as the other one is missing
+        (BodyMass(1.3), JointFrictionLoss(0.05)),  # equals a weaker motor, less friction, and negative damping
+        (Gravity(1.2), JointSpring(0.5, joints="elbow"), ActionGain(0.8)),  # a spring of 0.74 hides most of gravity
+    ],
+    ids=lambda truth: "-".join(type(effect).__name__ for effect in truth),
+)
+def test_effects_that_imitate_each_other_are_told_apart(truth):
+    trace = traced(*truth, catalogue=[SPRING, *ALL, INERTIA, ARMATURE, MASS])
+    found = {type(effect): effect for effect in trace.fit.effects}
+    assert set(found) == {type(effect) for effect in truth}
+    for effect in truth:
+        for name, parameter in effect.parameters.items():
+            assert found[type(effect)].parameters[name].value == pytest.approx(parameter.value, rel=1e-3)
 
 
 @pytest.mark.slow
