@@ -40,8 +40,9 @@ def grow(
         found: called with the best list of effects after each round of additions.
     """
     beam, complete = [_rescale(state)], []
+    seen = {_names(state)}
     while True:
-        grown = [(one, _grown(one, rng, progress)) for one in beam]
+        grown = [(one, _grown(one, seen, rng, progress)) for one in beam]
         complete += [one for one, more in grown if not more]
         beam = [each for _, more in grown for each in more]
         if not beam:
@@ -55,8 +56,10 @@ def grow(
         beam, complete = ([one for one in lists if one in which] for which in (beam, complete))
 
 
-def _grown(state: SearchState, rng: np.random.Generator, progress: LoopBar) -> list[SearchState]:
-    """The states with one set of effects more; empty if the list is complete."""
+def _grown(
+    state: SearchState, seen: set[frozenset[str]], rng: np.random.Generator, progress: LoopBar
+) -> list[SearchState]:
+    """The states with one set of effects more, other than those seen so far; empty if the list is complete."""
     if state.exact or len(state.entries) >= state.settings.trace.max_effects:
         return []
     one_more = partial(progress.closer, SCREENING / max(1, len(state.others)))
@@ -64,21 +67,27 @@ def _grown(state: SearchState, rng: np.random.Generator, progress: LoopBar) -> l
     grown = []
     for added in additions(state, leads, rng):
         added = _remember_leads(added, leads, added.entries[len(state.entries) :])
-        grown.append(_rescale(reorder(eliminate(added))))
+        added = _rescale(reorder(eliminate(added)))
         progress.closer(ADDITION)
-        if grown[-1].exact:
+        if _names(added) not in seen:
+            seen.add(_names(added))
+            grown.append(added)
+        if added.exact:
             break
     return grown
 
 
+def _names(state: SearchState) -> frozenset[str]:
+    return frozenset(entry.name for entry in state.entries)
+
+
 def _closest(states: Sequence[SearchState]) -> list[SearchState]:
-    """The states whose loss comes close to the lowest one, in ascending order of their loss; no list of effects twice.
+    """The states whose loss comes close to the lowest one, in ascending order of their loss.
 
     The losses are compared with residuals scaled by what the best list leaves, because those with the scales of the
     first effect say little about the last one.
     """
     rules = states[0].settings.trace
-    states = list({frozenset(entry.name for entry in one.entries): one for one in reversed(states)}.values())
     means = [float(losses.mean()) for losses in _comparable_losses(states)]
     pairs = sorted(zip(means, states, strict=True), key=lambda pair: (pair[0], _size(pair[1])))
     near = [pair for pair in pairs if pair[0] <= rules.beam_loss * pairs[0][0]]

@@ -43,7 +43,8 @@ def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     state, as_good = _with_better_alternative(state, index)
     own_loss = float(state.selection_losses(state.fit.effects).mean())
     group = [Attempt(state.entries[index], state.fit, index, own_loss, 1.0), *as_good]
-    simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), surprise(a.effect), a.loss))
+    # the first of equals: the effect itself, so that a delay of the sensors and one of the motors do not take turns
+    simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), surprise(a.effect)))
     rest = tuple(attempt for attempt in group if attempt is not simplest)
     return _replaced(state, index, simplest), rest
 
