@@ -160,7 +160,7 @@ class TraceSettings:
     leads_combined: int = 60
     """Number of most promising leads from which sets are formed."""
     set_sizes: tuple[tuple[int, int], ...] = ((1, 12), (2, 4), (3, 4))
-    """Pairs (size of a set, number of sets of this size that are sketched)."""
+    """Pairs (size of a set, number of sets of this size that are sketched); larger ones only if no smaller one helps."""
     finalists: int = 3
     """Number of sketched sets of one size that are fitted on all windows of the search, at least."""
     close_sketch: float = 0.4
@@ -170,7 +170,7 @@ class TraceSettings:
     beam_loss: float = 1.25
     """Multiple of the lowest loss up to which another list is grown as well."""
     same_fit: float = 1e-3
-    """Relative difference of two losses up to which the shorter list of effects stands for the other one as well."""
+    """Relative difference up to which two losses count as equal."""
     clearly_needed: float = 1.5
     """Multiple of the loss that a sketch without an effect must exceed for the effect to be kept without a full fit."""
     sketch_evaluations: int = 6
