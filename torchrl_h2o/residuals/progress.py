@@ -29,6 +29,7 @@ class LoopBar(tqdm):
 
     def __init__(self, **options: Any) -> None:
         form = "{desc}{percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
+        options.setdefault("smoothing", 0.0)  # the time left follows from all the time passed; the last steps are tiny
         super().__init__(total=sum(STAGES.values()), bar_format=form, **options)
         self._end = 0.0
 

@@ -22,7 +22,7 @@ from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
-SCREENING, ADDITION = 0.2, 0.3  # shares by which a screening and an addition bring the bar closer to the stage's end
+SCREENING, ADDITION = 0.07, 0.1  # shares by which a screening and an addition bring the bar closer to the stage's end
 
 
 def grow(
