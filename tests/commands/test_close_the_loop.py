@@ -20,7 +20,8 @@ from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import Gravity, JointDamping, JointForce
 from torchrl_h2o.envs import WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals import Report, Simulation
-from torchrl_h2o.residuals.report.contents import DataSummary, DimensionError, ErrorSummary, FoundEffect
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
+from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary
 from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
 from torchrl_h2o.residuals.report.words import effect_units, effect_words
 from torchrl_h2o.training.environments import make_simulator

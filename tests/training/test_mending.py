@@ -19,11 +19,11 @@ from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.report.contents import (
     NOT_EXPLAINED,
     DataSummary,
-    ErrorSummary,
     FoundEffect,
     IndistinguishableGroup,
     Verdict,
 )
+from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.training import cached_search
 from torchrl_h2o.training.cached_search import BLOCK, MOST_ROWS, digest, searched_rows
 from torchrl_h2o.training.config_file import load_config, save_config

@@ -38,13 +38,9 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
 from torchrl_h2o.residuals import Measured, Simulation, residuals
-from torchrl_h2o.residuals.report.contents import (
-    DataSummary,
-    ErrorSummary,
-    FoundEffect,
-    IndistinguishableGroup,
-)
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, IndistinguishableGroup
 from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.report.errors import ErrorSummary
 
 SEED = 5
 

@@ -7,16 +7,14 @@ import numpy as np
 from torchrl_h2o.effects import ActionGain, BodyMass, Gravity, JointFrictionLoss, LinearDrag
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
-    DimensionError,
-    ErrorSummary,
     FoundEffect,
-    HorizonError,
     IndistinguishableGroup,
     Interval,
     RejectedEffect,
     TwoSample,
 )
 from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HorizonError
 from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow, WindowQuantity

@@ -27,7 +27,6 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals.report.contents import (
-    ErrorSummary,
     FoundEffect,
     IndistinguishableGroup,
     OtherExplanation,
@@ -35,6 +34,7 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
 )
 from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.words import effect_units, effect_words, interval
 
 NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])

@@ -12,14 +12,8 @@ import pytest
 from tests.residuals.report.made_up_reports import full_report, no_conclusion, nothing_missing, renamed, trace, windowed
 from torchrl_h2o.effects import Gravity, JointForce, Payload
 from torchrl_h2o.residuals.report import plots
-from torchrl_h2o.residuals.report.contents import (
-    DataSummary,
-    DimensionError,
-    ErrorSummary,
-    FoundEffect,
-    RejectedEffect,
-    TwoSample,
-)
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, RejectedEffect, TwoSample
+from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary
 from torchrl_h2o.residuals.report.page import report_page
 from torchrl_h2o.residuals.report.words import effect_units, effect_words
 

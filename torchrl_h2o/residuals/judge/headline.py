@@ -8,7 +8,7 @@ from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, thinned
-from torchrl_h2o.residuals.report.contents import HeadlineError
+from torchrl_h2o.residuals.report.errors import HeadlineError
 from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 

@@ -9,7 +9,7 @@ from torchrl_h2o.residuals.judge.headline import headline_error, headline_horizo
 from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
-from torchrl_h2o.residuals.report.contents import DimensionError, ErrorSummary, HorizonError
+from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HorizonError
 from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 

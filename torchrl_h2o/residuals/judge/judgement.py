@@ -20,7 +20,8 @@ from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outsid
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.contents import ErrorSummary, TwoSample, Verdict
+from torchrl_h2o.residuals.report.contents import TwoSample, Verdict
+from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words

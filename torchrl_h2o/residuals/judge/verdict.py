@@ -19,10 +19,10 @@ from torchrl_h2o.residuals.report.contents import (
     EXPLAINED_IN_PART,
     NOT_EXPLAINED,
     NOTHING_MISSING,
-    ErrorSummary,
     TwoSample,
     Verdict,
 )
+from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation

@@ -27,7 +27,8 @@ class Report(ReportContents):
 
     Examples:
         >>> from torchrl_h2o.effects import Gravity
-        >>> from torchrl_h2o.residuals.report.contents import DataSummary, ErrorSummary, FoundEffect
+        >>> from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
+        >>> from torchrl_h2o.residuals.report.errors import ErrorSummary
         >>> found = FoundEffect(Gravity(0.5), declared=True, ci95={"scale": (0.49, 0.51)}, error_after=0.004)
         >>> report = Report(
         ...     simulator="pendulum.xml",

@@ -14,11 +14,7 @@ from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
-    DimensionError,
-    ErrorSummary,
     FoundEffect,
-    HeadlineError,
-    HorizonError,
     IndistinguishableGroup,
     Interval,
     OtherExplanation,
@@ -27,6 +23,7 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
     Verdict,
 )
+from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HeadlineError, HorizonError
 from torchrl_h2o.residuals.report.mended_model import REMEDY, LeftOut, MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.sentence import sentence

@@ -15,7 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from torchrl_h2o.residuals.report.contents import DimensionError, HorizonError, Interval
+from torchrl_h2o.residuals.report.contents import Interval
+from torchrl_h2o.residuals.report.errors import DimensionError, HorizonError
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import ShownWindow, WindowQuantity
 from torchrl_h2o.residuals.report.words import number

@@ -6,15 +6,8 @@ import math
 from collections.abc import Sequence
 from itertools import takewhile
 
-from torchrl_h2o.residuals.report.contents import (
-    EXPLAINED_IN_PART,
-    NOT_EXPLAINED,
-    ErrorSummary,
-    FoundEffect,
-    HeadlineError,
-    ReportContents,
-    Verdict,
-)
+from torchrl_h2o.residuals.report.contents import EXPLAINED_IN_PART, NOT_EXPLAINED, FoundEffect, ReportContents, Verdict
+from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
 
 MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
+from torchrl_h2o.residuals.trace.close_comparison import is_ruled_out
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.screening import (
     Lead,
@@ -91,22 +92,10 @@ def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None)
         else:
             close = missed < rules.alike_loss
             alike = close and state.p_value(after, with_it) > state.settings.significance.level
-            alike = alike and not _is_ruled_out(state, fitted)
+            alike = alike and not is_ruled_out(state, fitted, state.fit)
         if alike and _is_plausible(state, fitted):
             found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
     return tuple(found)
-
-
-def _is_ruled_out(state: SearchState, rival: Fit) -> bool:
-    """Whether a set is worse than the effects found where either of them scales the residuals."""
-    return all(_is_worse(state.rescaled(state.posed_at(of.effects)), rival) for of in (state.fit, rival))
-
-
-def _is_worse(state: SearchState, rival: Fit) -> bool:
-    """Whether a set's loss is significantly, and by more than a small share, higher than that of the effects found."""
-    own, other = (state.selection_losses(which.effects) for which in (state.fit, rival))
-    far = other.mean() > (1.0 + state.settings.trace.alike_loss) * own.mean()
-    return bool(far and state.p_value(other, own) < state.settings.significance.level)
 
 
 def _is_plausible(state: SearchState, fitted: Fit) -> bool:

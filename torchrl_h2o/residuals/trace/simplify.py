@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
+from torchrl_h2o.residuals.trace.close_comparison import is_ruled_out, refined
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -54,14 +55,28 @@ def _with_better_alternative(state: SearchState, index: int) -> tuple[SearchStat
 
     An effect may have been chosen before other effects were found, and may no longer be the best in its place.
     """
-    level, seen = state.settings.significance.level, set()
+    seen = set()
     while True:
         seen.add(state.entries[index].name)
         state, as_good = alternatives(state, index)
-        better = [a for a in as_good if p_value_between(state, state.problem, state.fit, a.fit) < level]
+        state, as_good, better = _compared_closely(state, index, as_good)
         if not better or better[0].entry.name in seen:
             return state, as_good
         state = _replaced(state, index, better[0])
+
+
+def _compared_closely(
+    state: SearchState, index: int, as_good: Sequence[Attempt]
+) -> tuple[SearchState, tuple[Attempt, ...], list[Attempt]]:
+    """The state and the alternatives, refined; those that are not worse than the effect, and those that are better."""
+    level = state.settings.significance.level
+    better = [a for a in as_good if p_value_between(state, state.problem, state.fit, a.fit) < level]
+    if better or not as_good or state.exact:
+        return state, tuple(as_good), better
+    state = state.with_found(state.entries, refined(state, state.entries, state.fit))
+    near = [replace(a, fit=refined(state, _replaced(state, index, a).entries, a.fit)) for a in as_good]
+    better = [a for a in near if is_ruled_out(state, state.fit, a.fit)]
+    return state, tuple(a for a in near if not is_ruled_out(state, a.fit, state.fit)), better
 
 
 def _replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:

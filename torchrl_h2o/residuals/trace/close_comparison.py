@@ -1,0 +1,29 @@
+"""Compares two explanations of the data closely: with residuals scaled by what each of them leaves.
+
+Residuals that are scaled by their size without an effect hide small differences between two candidates for its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) -> Fit:
+    """The fit of an explanation, continued with residuals scaled by what it leaves."""
+    return state.rescaled(state.posed_at(fitted.effects)).refitted(entries, fitted.effects)
+
+
+def is_ruled_out(state: SearchState, one: Fit, by: Fit) -> bool:
+    """Whether an explanation is worse than another one, whichever of the two scales the residuals."""
+    return all(_is_worse(state.rescaled(state.posed_at(scaling.effects)), one, by) for scaling in (by, one))
+
+
+def _is_worse(state: SearchState, one: Fit, by: Fit) -> bool:
+    """Whether the loss of an explanation is significantly, and by more than a small share, higher than another's."""
+    own, other = (state.selection_losses(which.effects) for which in (one, by))
+    far = own.mean() > (1.0 + state.settings.trace.alike_loss) * other.mean()
+    return bool(far and state.p_value(own, other) < state.settings.significance.level)
