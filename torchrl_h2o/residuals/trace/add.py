@@ -183,5 +183,5 @@ def _matters(state: SearchState, present: _Candidate, candidate: _Candidate) -> 
     """Whether each added effect contributes its share of the whole reduction, or all of them reduce the rest much."""
     rules = state.settings.trace
     much = candidate.loss < rules.much_lower * present.loss
-    share = candidate.added * rules.min_share
+    share = candidate.added * state.min_share
     return much or matters(state.first_loss, present.first_loss, candidate.first_loss, share)

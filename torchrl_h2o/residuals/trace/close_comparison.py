@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -22,8 +24,17 @@ def is_ruled_out(state: SearchState, one: Fit, by: Fit) -> bool:
     return all(_is_worse(state.rescaled(state.posed_at(scaling.effects)), one, by) for scaling in (by, one))
 
 
+def log_losses(state: SearchState, fitted: Fit) -> np.ndarray:
+    """Cauchy loss of each window by which effects are chosen, (W), with the residuals' scales of a state.
+
+    It follows the typical residual. The robust loss of a fit follows the rare large ones as well, such as those of a
+    wheel that leaves the ground a step too late.
+    """
+    return np.log1p(state.problem.selection_residuals(fitted.effects) ** 2).mean((1, 2))
+
+
 def _is_worse(state: SearchState, one: Fit, by: Fit) -> bool:
     """Whether the loss of an explanation is significantly, and by more than a small share, higher than another's."""
-    own, other = (state.selection_losses(which.effects) for which in (one, by))
+    own, other = (log_losses(state, which) for which in (one, by))
     far = own.mean() > (1.0 + state.settings.trace.alike_loss) * other.mean()
     return bool(far and state.p_value(own, other) < state.settings.significance.level)

@@ -96,4 +96,4 @@ def _pays(state: SearchState, divided: SearchState, rng: np.random.Generator) ->
         return gain > rules.beyond_noise * explained_by_noise(state, divided.fit.effects, free, rng)
     one, each = (state.first.selection_loss(which.fit.effects) for which in (state, divided))
     added = len(divided.entries) - len(state.entries)
-    return matters(state.first_loss, one, each, added * rules.min_share)
+    return matters(state.first_loss, one, each, added * state.min_share)

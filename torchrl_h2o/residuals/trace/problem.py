@@ -119,10 +119,14 @@ class Problem:
         states[places] = measured.remembered(what, mended, lambda: start_states(mended, measured, starts)[places])
         return replace(self, states=states)
 
+    def selection_residuals(self, effects: Sequence[Effect]) -> np.ndarray:
+        """Scaled residuals of the windows by which effects are chosen, (W, H, n), with effects put in."""
+        judged = self.measured.selected_on(self.horizon)
+        return self.settled(effects, judged).residual(effects, judged)
+
     def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
         """Robust loss of each window by which effects are chosen, (W), with effects put in."""
-        judged = self.measured.selected_on(self.horizon)
-        return losses(self.settled(effects, judged).residual(effects, judged))
+        return losses(self.selection_residuals(effects))
 
     def selection_loss(self, effects: Sequence[Effect]) -> float:
         """Mean of :meth:`selection_losses`."""

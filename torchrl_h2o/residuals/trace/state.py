@@ -95,6 +95,12 @@ class SearchState:
         names = {entry.name for entry in self.entries}
         return tuple(entry for entry in self.catalogue if entry.name not in names)
 
+    @property
+    def min_share(self) -> float:
+        """Share of the whole reduction of the loss that each added effect must contribute."""
+        rules, hidden = self.settings.trace, self.problem.simulation.state_map.hidden
+        return rules.min_share_unobserved if hidden else rules.min_share
+
     def with_found(self, entries: Sequence[CatalogueEntry], fitted: Fit) -> SearchState:
         """The state with other effects found; without groups, unless the entries are the same."""
         entries = tuple(entries)
