@@ -72,7 +72,7 @@ class TraceSettings:
     min_share: float = 0.003
     """Share of the whole reduction of the loss that each added effect must contribute."""
     min_share_unobserved: float = 0.005
-    """The same share if some coordinates are unobserved: an effect may also make up for the error of their estimates."""
+    """The same share if some coordinates are unobserved: an effect may also make up for errors of their estimates."""
     much_lower: float = 0.5
     """Share of the present loss below which an addition counts, however small its part of the whole reduction is."""
     beyond_noise: float = 4.0
