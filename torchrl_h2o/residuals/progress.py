@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from tqdm import tqdm
+
+from torchrl_h2o.effects import CatalogueEntry
 
 # Stages in their order, with their usual shares of the time in per cent, rounded from four runs on HalfCheetah and on a
 # double pendulum. A run in which nothing is missing, or in which the effects explain the data exactly, is shorter.
@@ -48,6 +51,10 @@ class LoopBar(tqdm):
     def closer(self, share: float) -> None:
         """Moves the bar by a share of what is left of the stage."""
         self.update(share * max(0.0, self._end - self.n))
+
+    def show_found(self, entries: Sequence[CatalogueEntry]) -> None:
+        """Names the effects found so far beside the bar."""
+        self.set_postfix_str(", ".join(entry.name for entry in entries))
 
     def finish(self) -> None:
         """Moves the bar to the end."""

@@ -49,7 +49,7 @@ def grow(
             return _simplest_of_best(complete)
         exact = [one for one in beam if one.exact]
         lists = [min(exact, key=_size)] if exact else _closest([*complete, *beam])
-        progress.set_postfix_str(", ".join(entry.name for entry in lists[0].entries))
+        progress.show_found(lists[0].entries)
         found(lists[0])
         if exact:
             return lists[0]

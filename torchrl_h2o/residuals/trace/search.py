@@ -66,11 +66,13 @@ def trace_effects(
         progress.stage(OTHERS)
         grown, simpler = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
         state = eliminate(simpler)
+        progress.show_found(state.entries)
         if state is not simpler:
             continue  # an effect was replaced by one that is not needed
         if state.exact:
             break
         state = divide_by_element(_rescaled(state), rng)
+        progress.show_found(state.entries)
         # a further round helps only where effects have been replaced, by simpler ones or by one for each joint
         if state.entries == grown.entries:
             break
