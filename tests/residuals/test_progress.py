@@ -4,6 +4,7 @@ import io
 
 import pytest
 
+from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, REPORT, STAGES, LoopBar
 
 
@@ -35,6 +36,13 @@ def test_the_last_stage_ends_at_100_per_cent(bar):
     bar.stage(REPORT)
     bar.finish()
     assert bar.n == bar.total == 100.0
+
+
+def test_the_bar_names_the_effects_of_the_present_list(bar):
+    for effect in (ActionGain(), BodyMass(bodies="torso")):
+        bar.show_found([CatalogueEntry(effect, ({"scale": 0.8},))])
+    assert "BodyMass torso" in str(bar)
+    assert "ActionGain" not in str(bar)
 
 
 def test_a_stage_that_does_not_exist_is_refused(bar):
