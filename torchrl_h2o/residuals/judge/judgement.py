@@ -27,8 +27,7 @@ from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.outcome import Attempt
-from torchrl_h2o.residuals.trace.rival_sets import RivalSet
+from torchrl_h2o.residuals.trace.outcome import Attempt, RivalSet
 
 
 @dataclass(frozen=True, eq=False)

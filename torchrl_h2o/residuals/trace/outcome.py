@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.fit import Fit
-
-if TYPE_CHECKING:
-    from torchrl_h2o.residuals.trace.rival_sets import RivalSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +31,26 @@ class Attempt:
     def effect(self) -> Effect:
         """The entry's effect at its fitted values."""
         return self.fit.effects[self.index]
+
+
+@dataclass(frozen=True, eq=False)
+class RivalSet:
+    """A set of effects that explains the data as well as the one found.
+
+    Args:
+        entries: entries of the catalogue.
+        fit: their joint fit.
+        loss: mean loss on the windows by which effects are chosen.
+    """
+
+    entries: tuple[CatalogueEntry, ...]
+    fit: Fit
+    loss: float
+
+    @property
+    def surprise(self) -> int:
+        """How unusual its effects are, see :func:`~torchrl_h2o.effects.catalogue.plausibility.surprise`."""
+        return sum(map(surprise, self.fit.effects))
 
 
 @dataclass(frozen=True, eq=False)

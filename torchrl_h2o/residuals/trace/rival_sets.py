@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from torchrl_h2o.effects import CatalogueEntry
-from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
+from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.residuals.trace.close_comparison import is_ruled_out
 from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.outcome import RivalSet
 from torchrl_h2o.residuals.trace.screening import (
     Lead,
     are_possible_alone,
@@ -18,26 +18,6 @@ from torchrl_h2o.residuals.trace.screening import (
     screen,
 )
 from torchrl_h2o.residuals.trace.state import SearchState
-
-
-@dataclass(frozen=True, eq=False)
-class RivalSet:
-    """A set of effects that explains the data as well as the one found.
-
-    Args:
-        entries: entries of the catalogue.
-        fit: their joint fit.
-        loss: mean loss on the windows by which effects are chosen.
-    """
-
-    entries: tuple[CatalogueEntry, ...]
-    fit: Fit
-    loss: float
-
-    @property
-    def surprise(self) -> int:
-        """How unusual its effects are, see :func:`~torchrl_h2o.effects.catalogue.plausibility.surprise`."""
-        return sum(map(surprise, self.fit.effects))
 
 
 def with_most_usual_set(
