@@ -27,7 +27,7 @@ ENTRIES = (
 
 @pytest.mark.slow
 def test_a_heavier_torso_takes_the_place_of_weaker_motors():
-    """Residuals scaled by their size without the torso hide that the motors leave twice as much as the torso."""
+    """Residuals scaled by their size without the motors hide that a heavier torso leaves smaller ones."""
     reality = TransformedEnv(WheelLeggedEnv(), DynamicsGap(*OTHERS, BodyMass(1.2, bodies="torso")))
     simulation = Simulation.from_env(WheelLeggedEnv())
     measured = Measured.from_ted(record(reality, noisy_balance_controller(), 3000, seed=0), simulation)

@@ -75,7 +75,7 @@ def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generato
         sketches = _sketches(state, leads, among, size, count)
         if size == 1:
             state = _remember(state, sketches)
-        candidates = [one for one in _fitted(state, sketches, present) if _pays(state, present, one)]
+        candidates = [one for one in _fitted(state, sketches) if _pays(state, present, one)]
         added = _best(state, candidates, before.mean(), rng)
         if added:
             return added
@@ -146,8 +146,8 @@ def _sketch_loss(sketch: Sketch) -> float:
     return sketch[1].loss
 
 
-def _fitted(state: SearchState, sketches: Sequence[Sketch], present: _Candidate) -> list[_Candidate]:
-    """The sketched sets that come close to the best one, after a full fit; each added effect contributes its share."""
+def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[_Candidate]:
+    """The sketched sets that come close to the best one, after a full fit."""
     rules = state.settings.trace
     ranked = distinct(sorted(sketches, key=_sketch_loss), _sketch_loss, rules.same_fit)
     without = state.screened_loss(state.fit.effects)
@@ -161,9 +161,8 @@ def _fitted(state: SearchState, sketches: Sequence[Sketch], present: _Candidate)
         if not are_possible_alone(state.problem, fitted.effects):
             continue
         first_loss = state.first.selection_loss(fitted.effects)
-        candidate = _Candidate(entries, fitted, len(chosen), state.selection_losses(fitted.effects), first_loss)
-        if _matters(state, present, candidate):
-            candidates.append(candidate)
+        fit_losses = state.selection_losses(fitted.effects)
+        candidates.append(_Candidate(entries, fitted, len(chosen), fit_losses, first_loss))
     return candidates
 
 

@@ -125,7 +125,7 @@ def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explain
 def _p_value_of_loss_gap(state: SearchState, worse: Fit, better: Fit) -> float:
     """p-value of the loss gap, rescaled by the better fit; 0 above the reporting threshold."""
     worse_loss, better_loss = (state.first.selection_loss(fitted.effects) for fitted in (worse, better))
-    if matters(state.first_loss, worse_loss, better_loss, state.settings.trace.min_share):
+    if matters(state.first_loss, worse_loss, better_loss, state.min_share):
         return 0.0
     rescaled = replace(state.posed_at(better.effects), simulation=state.problem.simulation)
     return p_value_between(state, rescaled, worse, better)

@@ -19,12 +19,16 @@ def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) 
     return state.rescaled(state.posed_at(fitted.effects)).refitted(entries, fitted.effects)
 
 
-def is_ruled_out(state: SearchState, one: Fit, by: Fit) -> bool:
-    """Whether an explanation is worse than another one, whichever of the two scales the residuals."""
-    return all(_is_worse(state.rescaled(state.posed_at(scaling.effects)), one, by) for scaling in (by, one))
+def worse_of(state: SearchState, one: Fit, other: Fit) -> Fit | None:
+    """The worse of two explanations, whichever of the two scales the residuals; None if the data leave it open."""
+    scaled = [state.rescaled(state.posed_at(scaling.effects)) for scaling in (one, other)]
+    for worse, better in ((one, other), (other, one)):
+        if all(_is_worse(at, worse, better) for at in scaled):
+            return worse
+    return None
 
 
-def log_losses(state: SearchState, fitted: Fit) -> np.ndarray:
+def _log_losses(state: SearchState, fitted: Fit) -> np.ndarray:
     """Cauchy loss of each window by which effects are chosen, (W), with the residuals' scales of a state.
 
     It follows the typical residual. The robust loss of a fit follows the rare large ones as well, such as those of a
@@ -35,6 +39,6 @@ def log_losses(state: SearchState, fitted: Fit) -> np.ndarray:
 
 def _is_worse(state: SearchState, one: Fit, by: Fit) -> bool:
     """Whether the loss of an explanation is significantly, and by more than a small share, higher than another's."""
-    own, other = (log_losses(state, which) for which in (one, by))
+    own, other = (_log_losses(state, which) for which in (one, by))
     far = own.mean() > (1.0 + state.settings.trace.alike_loss) * other.mean()
     return bool(far and state.p_value(own, other) < state.settings.significance.level)

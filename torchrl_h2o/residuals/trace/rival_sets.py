@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
-from torchrl_h2o.residuals.trace.close_comparison import is_ruled_out
+from torchrl_h2o.residuals.trace.close_comparison import worse_of
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import RivalSet
 from torchrl_h2o.residuals.trace.screening import (
@@ -72,7 +72,7 @@ def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None)
         else:
             close = missed < rules.alike_loss
             alike = close and state.p_value(after, with_it) > state.settings.significance.level
-            alike = alike and not is_ruled_out(state, fitted, state.fit)
+            alike = alike and worse_of(state, fitted, state.fit) is not fitted
         if alike and _is_plausible(state, fitted):
             found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
     return tuple(found)

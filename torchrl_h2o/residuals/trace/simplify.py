@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
-from torchrl_h2o.residuals.trace.close_comparison import is_ruled_out, refined
+from torchrl_h2o.residuals.trace.close_comparison import refined, worse_of
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -75,8 +75,9 @@ def _compared_closely(
         return state, tuple(as_good), better
     state = state.with_found(state.entries, refined(state, state.entries, state.fit))
     near = [replace(a, fit=refined(state, _replaced(state, index, a).entries, a.fit)) for a in as_good]
-    better = [a for a in near if is_ruled_out(state, state.fit, a.fit)]
-    return state, tuple(a for a in near if not is_ruled_out(state, a.fit, state.fit)), better
+    worse = [worse_of(state, state.fit, a.fit) for a in near]
+    better = [a for a, which in zip(near, worse, strict=True) if which is state.fit]
+    return state, tuple(a for a, which in zip(near, worse, strict=True) if which is not a.fit), better
 
 
 def _replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:
