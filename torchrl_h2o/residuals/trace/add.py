@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
@@ -15,11 +16,13 @@ from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import losses, matters
 from torchrl_h2o.residuals.trace.screening import (
     Lead,
+    along,
     are_possible_alone,
     free_parameters,
     is_possible,
     promising_sets,
 )
+from torchrl_h2o.residuals.trace.settings import TraceSettings
 from torchrl_h2o.residuals.trace.state import SearchState
 
 Found = TypeVar("Found")
@@ -27,7 +30,7 @@ Sketch = tuple[tuple[Lead, ...], Fit]  # a set of leads, and a quick fit with th
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidate:
+class Addition:
     """A set of entries added to those found.
 
     Args:
@@ -50,47 +53,108 @@ class _Candidate:
         return float(self.losses.mean())
 
 
-def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> list[SearchState]:
-    """Adds the entry that lowers the held-out loss most, or another entry that comes close to it.
+@dataclass(frozen=True, eq=False)
+class Additions:
+    """Sets of entries that lower the held-out loss by enough, and significantly.
+
+    Args:
+        state: effects found so far; its attempts include the sketches of single entries.
+        leads: screened entries.
+        passed: the additions, in ascending order of their loss.
+        near: those that come close to the best one, and that noise alone does not explain.
+    """
+
+    state: SearchState
+    leads: Sequence[Lead]
+    passed: Sequence[Addition] = ()
+    near: Sequence[Addition] = ()
+
+
+def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> Additions:
+    """Finds the sets of entries that lower the held-out loss by enough, and significantly.
 
     Pairs are tried where no single entry passes the tests, and sets of three where no pair does: one of two effects may
-    increase the loss as long as the other one is missing.
+    increase the loss as long as the other one is missing. They are not tried where so little of the loss is left that
+    even a set that explains all of it would not contribute its share.
 
     Args:
         state: effects found so far.
         leads: screened entries, in descending order of their promise.
         rng: generator of synthetic noise.
-
-    Returns:
-        The state with each of these additions, in ascending order of their loss; empty if no set passes the tests.
-        Their attempts include the sketches.
     """
-    rules, effects = state.settings.trace, state.fit.effects
-    before = state.selection_losses(effects)
-    present = _Candidate(state.entries, state.fit, 0, before, state.first.selection_loss(effects))
+    rules = state.settings.trace
     among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
+    left = state.first.selection_loss(state.fit.effects)
     for size, count in rules.set_sizes:
-        if len(among) < size or len(state.entries) + size > rules.max_effects:
+        enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
+        if len(among) < size or len(state.entries) + size > rules.max_effects or not enough_left:
             break
         sketches = _sketches(state, leads, among, size, count)
         if size == 1:
             state = _remember(state, sketches)
-        candidates = [one for one in _fitted(state, sketches) if _pays(state, present, one)]
-        added = _best(state, candidates, before.mean(), rng)
-        if added:
-            return added
-    return []
+        found = _tested(state, leads, sketches, rng)
+        if found.near:
+            return found
+    return Additions(state, leads)
 
 
-def _best(
-    state: SearchState, candidates: Sequence[_Candidate], before: float, rng: np.random.Generator
-) -> list[SearchState]:
-    """The states with the candidates whose loss comes close to the lowest one and that noise alone does not explain."""
-    rules = state.settings.trace
-    ranked = sorted(candidates, key=lambda one: one.loss)
-    near = [one for one in ranked if one.loss <= rules.beam_loss * ranked[0].loss]
-    chosen = distinct(near, lambda one: one.loss, rules.same_fit)[: rules.beam_width]
-    return [state.with_found(one.entries, one.fit) for one in chosen if _exceeds_noise(state, one, before, rng)]
+def pairs_by_prediction(singles: Additions, to_beat: float, rng: np.random.Generator) -> Additions:
+    """Finds pairs of entries from the fits of single ones, also of those that alone are far from the best.
+
+    The second entry is taken to change what the first one's fit leaves as it changes the residual without it. This
+    prediction needs no simulation. The pairs that it puts first get a quick fit, and those that come close to the loss
+    to beat get a full one.
+
+    Args:
+        singles: single entries that were fitted, and the leads among which a second one is looked for.
+        to_beat: lowest loss of the screened windows that other lists leave.
+        rng: generator of synthetic noise.
+    """
+    state, screened = singles.state, singles.state.windows.screened
+    if len(state.entries) + 2 > state.settings.trace.max_effects:
+        return Additions(state, singles.leads)
+    leads = {lead.entry.name: lead for lead in singles.leads if lead.promise > 0.0}
+    predicted = []
+    for single in (one for one in singles.passed if one.added == 1):
+        effects = single.fit.effects
+        left = state.problem.settled(effects, screened).residual(effects, screened)
+        for lead in (lead for name, lead in leads.items() if name != single.entries[-1].name):
+            _, explained = along(left, lead.change.reshape(left.shape))
+            predicted.append(((1.0 - explained) * float(losses(left).mean()), single, lead))
+    ranked = distinct(sorted(predicted, key=itemgetter(0)), itemgetter(0), state.settings.trace.same_fit)
+    present = [free_parameters(entry) for entry in state.entries]
+    sketches = []
+    for _, single, lead in ranked[: dict(state.settings.trace.set_sizes)[2]]:
+        together = [*single.fit.effects, lead.effect]
+        if is_possible(state.problem, together):
+            first = leads[single.entries[-1].name]
+            free = [*present, first.free, lead.free]
+            sketches.append(((first, lead), state.sketched(together, free, state.settings.trace.sketch_evaluations)))
+    close = [one for one in sketches if _sketch_loss(one) <= state.settings.trace.beam_loss * to_beat]
+    return _tested(state, singles.leads, close, rng)
+
+
+def _tested(
+    state: SearchState, leads: Sequence[Lead], sketches: Sequence[Sketch], rng: np.random.Generator
+) -> Additions:
+    """The sketched sets that pass the tests after a full fit."""
+    before = state.selection_losses(state.fit.effects)
+    present = Addition(state.entries, state.fit, 0, before, state.first.selection_loss(state.fit.effects))
+    passed = sorted((one for one in _fitted(state, sketches) if _pays(state, present, one)), key=_loss)
+    near = [
+        one for one in _close_to_best(passed, state.settings.trace) if _exceeds_noise(state, one, before.mean(), rng)
+    ]
+    return Additions(state, leads, passed, near)
+
+
+def _close_to_best(found: Sequence[Addition], rules: TraceSettings) -> list[Addition]:
+    """The first of these sorted additions, as long as their loss comes close to the lowest one; none twice."""
+    near = [one for one in found if one.loss <= rules.beam_loss * found[0].loss]
+    return distinct(near, _loss, rules.same_fit)[: rules.beam_width]
+
+
+def _loss(addition: Addition) -> float:
+    return addition.loss
 
 
 def distinct(found: Sequence[Found], loss: Callable[[Found], float], same: float) -> list[Found]:
@@ -105,12 +169,15 @@ def distinct(found: Sequence[Found], loss: Callable[[Found], float], same: float
     return kept
 
 
-def _exceeds_noise(state: SearchState, candidate: _Candidate, before: float, rng: np.random.Generator) -> bool:
-    """Whether a candidate explains clearly more of the loss than it does in data with sensor noise alone."""
-    effects, added = state.fit.effects, candidate.entries[-candidate.added :]
+def _exceeds_noise(state: SearchState, addition: Addition, before: float, rng: np.random.Generator) -> bool:
+    """Whether an addition explains clearly more of the loss than it does in data with sensor noise alone."""
+    gain = 1.0 - addition.loss / before
+    if gain > state.settings.trace.surely_beyond_noise:
+        return True
+    effects, added = state.fit.effects, addition.entries[-addition.added :]
     free = [*(() for _ in effects), *map(free_parameters, added)]
-    by_noise = explained_by_noise(state, (*effects, *candidate.fit.effects[-candidate.added :]), free, rng)
-    return 1.0 - candidate.loss / before > state.settings.trace.beyond_noise * by_noise
+    by_noise = explained_by_noise(state, (*effects, *addition.fit.effects[-addition.added :]), free, rng)
+    return gain > state.settings.trace.beyond_noise * by_noise
 
 
 def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], size: int, count: int) -> list[Sketch]:
@@ -146,7 +213,7 @@ def _sketch_loss(sketch: Sketch) -> float:
     return sketch[1].loss
 
 
-def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[_Candidate]:
+def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[Addition]:
     """The sketched sets that come close to the best one, after a full fit."""
     rules = state.settings.trace
     ranked = distinct(sorted(sketches, key=_sketch_loss), _sketch_loss, rules.same_fit)
@@ -162,11 +229,11 @@ def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[_Candidate]:
             continue
         first_loss = state.first.selection_loss(fitted.effects)
         fit_losses = state.selection_losses(fitted.effects)
-        candidates.append(_Candidate(entries, fitted, len(chosen), fit_losses, first_loss))
+        candidates.append(Addition(entries, fitted, len(chosen), fit_losses, first_loss))
     return candidates
 
 
-def _pays(state: SearchState, present: _Candidate, candidate: _Candidate) -> bool:
+def _pays(state: SearchState, present: Addition, candidate: Addition) -> bool:
     """Whether a candidate lowers the loss by a minimum share, and significantly."""
     rules = state.settings.trace
     least = rules.min_gain if state.problem.sensor_std is None else rules.min_gain_under_noise
@@ -178,7 +245,7 @@ def _pays(state: SearchState, present: _Candidate, candidate: _Candidate) -> boo
     )
 
 
-def _matters(state: SearchState, present: _Candidate, candidate: _Candidate) -> bool:
+def _matters(state: SearchState, present: Addition, candidate: Addition) -> bool:
     """Whether each added effect contributes its share of the whole reduction, or all of them reduce the rest much."""
     rules = state.settings.trace
     much = candidate.loss < rules.much_lower * present.loss

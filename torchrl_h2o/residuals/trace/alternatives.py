@@ -91,7 +91,7 @@ def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
         sketch = state.sketched(instead, free, rules.sketch_evaluations)
         if few_without - sketch.loss >= rules.rival_min_first * gain:
             sketch = state.sketched(sketch.effects, free, rules.rival_evaluations)
-        if few_without - sketch.loss >= rules.rival_min_sketch * gain:
+        if few_without - sketch.loss >= state.rival_min_sketch * gain:
             near.append((lead, sketch))
     return near
 

@@ -7,7 +7,7 @@ of the axles look like heavier wheels until one of the two has been put in.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import itemgetter
 
@@ -15,14 +15,18 @@ import numpy as np
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.add import additions, distinct
+from torchrl_h2o.residuals.trace.add import Additions, additions, distinct, pairs_by_prediction
 from torchrl_h2o.residuals.trace.eliminate import eliminate
+from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.order import reorder
+from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SCREENING, ADDITION = 0.07, 0.1  # shares by which a screening and an addition bring the bar closer to the stage's end
+
+MUCH_FINER = 0.2  # ratio of the residuals' sizes below which a fit goes on with the new ones
 
 
 def grow(
@@ -33,48 +37,84 @@ def grow(
 ) -> SearchState:
     """Adds effects until no addition passes the tests, the limit is reached, or the residual is within rounding.
 
+    The first effect is chosen while all others are missing, so that a wrong one may look far better than a right one.
+    Beside the lists with a second effect, pairs are therefore grown whose first effect was passed over.
+
     Args:
         state: effects found so far.
         rng: generator of synthetic noise.
         progress: bar that moves with every screened entry and names the effects found.
         found: called with the best list of effects after each round of additions.
     """
-    beam, complete = [_rescale(state)], []
-    seen = {_names(state)}
-    while True:
-        grown = [(one, _grown(one, seen, rng, progress)) for one in beam]
-        complete += [one for one, more in grown if not more]
-        beam = [each for _, more in grown for each in more]
-        if not beam:
-            return _simplest_of_best(complete)
-        exact = [one for one in beam if one.exact]
-        lists = [min(exact, key=_size)] if exact else _closest([*complete, *beam])
-        progress.show_found(lists[0].entries)
-        found(lists[0])
-        if exact:
-            return lists[0]
-        beam, complete = ([one for one in lists if one in which] for which in (beam, complete))
+    return _Beam(rng, progress, found).grow(_rescale(state))
 
 
-def _grown(
-    state: SearchState, seen: set[frozenset[str]], rng: np.random.Generator, progress: LoopBar
-) -> list[SearchState]:
-    """The states with one set of effects more, other than those seen so far; empty if the list is complete."""
-    if state.exact or len(state.entries) >= state.settings.trace.max_effects:
-        return []
-    one_more = partial(progress.closer, SCREENING / max(1, len(state.others)))
-    leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
-    grown = []
-    for added in additions(state, leads, rng):
-        added = _remember_leads(added, leads, added.entries[len(state.entries) :])
-        added = _rescale(reorder(eliminate(added)))
-        progress.closer(ADDITION)
-        if _names(added) not in seen:
-            seen.add(_names(added))
-            grown.append(added)
-        if added.exact:
-            break
-    return grown
+@dataclass(eq=False)
+class _Beam:
+    """Lists of effects that grow side by side.
+
+    Args:
+        rng: generator of synthetic noise.
+        progress: bar that moves with every screened entry and names the effects found.
+        found: called with the best list of effects after each round of additions.
+        seen: names of the effects of each list so far.
+        first: what could be added to the first list.
+    """
+
+    rng: np.random.Generator
+    progress: LoopBar
+    found: Callable[[SearchState], object]
+    seen: set[frozenset[str]] = field(default_factory=set)
+    first: Additions | None = None
+
+    def grow(self, state: SearchState) -> SearchState:
+        """Grows lists from a state to the end; the simplest of the best ones."""
+        self.seen.add(_names(state))
+        beam, complete, rounds = [state], [], 0
+        while True:
+            grown = [(one, self._with_one_more(one)) for one in beam]
+            complete += [one for one, more in grown if not more]
+            beam, rounds = [each for _, more in grown for each in more], rounds + 1
+            if rounds == 2 and self.first is not None and not any(one.exact for one in beam):
+                to_beat = min(self.first.state.screened_loss(one.fit.effects) for one in [*complete, *beam])
+                beam += self._put_in(pairs_by_prediction(self.first, to_beat, self.rng))
+            if not beam:
+                return _simplest_of_best(complete)
+            exact = [one for one in beam if one.exact]
+            lists = [min(exact, key=_size)] if exact else _closest([*complete, *beam])
+            self.progress.show_found(lists[0].entries)
+            self.found(lists[0])
+            if exact:
+                return lists[0]
+            beam, complete = ([one for one in lists if one in which] for which in (beam, complete))
+
+    def _with_one_more(self, state: SearchState) -> list[SearchState]:
+        """The states with one set of effects more; empty if the list is complete."""
+        if state.exact or len(state.entries) >= state.settings.trace.max_effects:
+            return []
+        one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
+        leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
+        added = additions(state, leads, self.rng)
+        self.first = self.first or added
+        return self._put_in(added)
+
+    def _put_in(self, possible: Additions) -> list[SearchState]:
+        """The states with the additions that come close to the best one, without what they make redundant.
+
+        Lists seen so far are left out.
+        """
+        state, grown = possible.state, []
+        for addition in possible.near:
+            added = state.with_found(addition.entries, addition.fit)
+            added = _remember_leads(added, possible.leads, added.entries[len(state.entries) :])
+            added = _rescale(reorder(eliminate(added)))
+            self.progress.closer(ADDITION)
+            if _names(added) not in self.seen:
+                self.seen.add(_names(added))
+                grown.append(added)
+            if added.exact:
+                break
+        return grown
 
 
 def _names(state: SearchState) -> frozenset[str]:
@@ -95,14 +135,25 @@ def _closest(states: Sequence[SearchState]) -> list[SearchState]:
 
 
 def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
-    """Of the states whose loss is not significantly higher than the lowest one, the one with the fewest parameters."""
+    """Of the states that are as good as the one with the lowest loss, the one with the fewest parameters."""
     if len(states) == 1:
         return states[0]
     losses = _comparable_losses(states)
-    best = min(losses, key=np.mean)
-    level = states[0].settings.significance.level
-    as_good = [one for one, loss in zip(states, losses, strict=True) if states[0].p_value(loss, best) > level]
+    lowest, best = min(zip(losses, states, strict=True), key=lambda pair: pair[0].mean())
+    as_good = [one for one, loss in zip(states, losses, strict=True) if not _is_worse(one, loss, best, lowest)]
     return min(as_good, key=_size)
+
+
+def _is_worse(state: SearchState, loss: np.ndarray, best: SearchState, lowest: np.ndarray) -> bool:
+    """Whether a state's loss is significantly higher; if it has fewer parameters, by more than they must contribute."""
+    rules = state.settings.trace
+    if state.p_value(loss, lowest) > state.settings.significance.level:
+        return False
+    fewer = _size(best)[0] - _size(state)[0]
+    if fewer <= 0 or lowest.mean() < rules.much_lower * loss.mean():
+        return True
+    without, with_them = (state.first.selection_loss(one.fit.effects) for one in (state, best))
+    return matters(state.first_loss, without, with_them, fewer * state.min_share)
 
 
 def _comparable_losses(states: Sequence[SearchState]) -> list[np.ndarray]:
@@ -126,12 +177,38 @@ def _remember_leads(state: SearchState, leads: Sequence[Lead], added: Sequence) 
 
 
 def _rescale(state: SearchState) -> SearchState:
-    """Scales residuals by their present size; refits if the better simulator gives other observed start states."""
+    """Scales residuals by their present size.
+
+    Refits if the better simulator gives other observed start states, or a sharper measure of what is left: a fit ends
+    where its loss hardly changes, which may be far from the rounding of the data.
+    """
     posed = state.posed_at(state.fit.effects)
     rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
-    if state.entries and not np.array_equal(observed(state.problem.states), observed(posed.states)):
-        refitted = rescaled.with_found(state.entries, rescaled.refitted(state.entries, state.fit.effects))
-        kept = eliminate(refitted)
+    moved = not np.array_equal(observed(state.problem.states), observed(posed.states))
+    if state.entries and not posed.within_rounding and (moved or _is_sharper(posed, state.problem)):
+        kept = eliminate(rescaled.with_found(state.entries, _refitted(rescaled)))
         posed = kept.posed_at(kept.fit.effects)
         rescaled = kept.rescaled(posed)
     return without_noise(replace(rescaled, exact=posed.within_rounding))
+
+
+def _refitted(state: SearchState) -> Fit:
+    """Refits the effects found; without sensor noise a second time, with larger differences, if that gains little.
+
+    Contacts make the residual jump, and jumps within the small differences can hide where the loss falls.
+    """
+    start, rules = state.fit.effects, state.settings
+    fitted = state.refitted(state.entries, start)
+    gained = state.screened_loss(fitted.effects) < rules.trace.much_lower * state.screened_loss(start)
+    if gained or state.problem.sensor_std is not None:
+        return fitted
+    coarse = replace(rules.fit, difference_step=rules.fit.coarse_step)
+    return min(fitted, state.refitted(state.entries, start, settings=coarse), key=lambda one: one.loss)
+
+
+def _is_sharper(posed: Problem, before: Problem) -> bool:
+    """Whether the sensors turn out to have no noise, or most residuals fall to a small share of their former size."""
+    if posed.sensor_std is None and before.sensor_std is not None:
+        return True
+    new, old = (np.median(problem.scale, axis=(0, 1)) for problem in (posed, before))
+    return bool(np.median(new / old) < MUCH_FINER)

@@ -90,7 +90,7 @@ def _sketched_sets(state: SearchState, advance: Callable[[], object]) -> list[tu
     leads = screen(state.problem, (), state.catalogue, screened)
     among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
     few_with_it, few_without = map(state.screened_loss, (state.fit.effects, ()))
-    needed = rules.rival_min_sketch * (few_without - few_with_it)
+    needed = state.rival_min_sketch * (few_without - few_with_it)
     chosen = []
     for size in range(1, rules.rival_set_size + 1):
         if len(among) < size:

@@ -90,7 +90,7 @@ def _lead(
             after = problem.residual([*known, effect], starts)
         except ValueError:  # a value that the model rejects, such as negative total damping
             continue
-        share, explained = _along(before, after - before)
+        share, explained = along(before, after - before)
         reached = 1.0 - losses(after).mean() / max(loss, 1e-300)
         if reached > explained:
             share, explained = 1.0, reached
@@ -102,8 +102,13 @@ def _lead(
     return best
 
 
-def _along(before: np.ndarray, change: np.ndarray) -> tuple[float, float]:
-    """Best step along a change of the residual, between -1 and 2, and the share of the robust loss it removes."""
+def along(before: np.ndarray, change: np.ndarray) -> tuple[float, float]:
+    """Best step along a change of the residual, between -1 and 2, and the share of the robust loss it removes.
+
+    Args:
+        before: residual, of any shape.
+        change: linear change of the residual by an effect, of the same shape.
+    """
     weight = 1.0 / np.sqrt(1.0 + before**2)
     square = float((weight * change**2).sum())
     if square == 0.0:

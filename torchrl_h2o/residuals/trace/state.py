@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.trace.fit import Fit, Free, fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters
+from torchrl_h2o.residuals.trace.settings import FitSettings
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
 
@@ -101,13 +102,24 @@ class SearchState:
         rules, hidden = self.settings.trace, self.problem.simulation.state_map.hidden
         return rules.min_share_unobserved if hidden else rules.min_share
 
+    @property
+    def rival_min_sketch(self) -> float:
+        """Share of a gain that another explanation must reach in a quick fit to be fitted."""
+        rules = self.settings.trace
+        return rules.rival_min_exact if self.exact else rules.rival_min_sketch
+
     def with_found(self, entries: Sequence[CatalogueEntry], fitted: Fit) -> SearchState:
         """The state with other effects found; without groups, unless the entries are the same."""
         entries = tuple(entries)
         return replace(self, entries=entries, fit=fitted, groups=self.groups if entries == self.entries else ())
 
     def refitted(
-        self, entries: Sequence[CatalogueEntry], start: Sequence[Effect], rows: np.ndarray | None = None
+        self,
+        entries: Sequence[CatalogueEntry],
+        start: Sequence[Effect],
+        rows: np.ndarray | None = None,
+        *,
+        settings: FitSettings | None = None,
     ) -> Fit:
         """Joint fit of entries from given values, on the windows of the search or on others.
 
@@ -117,13 +129,14 @@ class SearchState:
         rows = self.windows.fitted if rows is None else rows
         if not entries:
             return _no_effects(self.problem, rows)
+        settings = settings or self.settings.fit
         free = [free_parameters(entry) for entry in entries]
-        fitted = fit(self.problem.settled(start, rows), start, free, rows, settings=self.settings.fit)
+        fitted = fit(self.problem.settled(start, rows), start, free, rows, settings=settings)
         settled = self.problem.settled(fitted.effects, rows)
         moved = abs(float(losses(settled.residual(fitted.effects, rows)).mean()) - fitted.loss)
         if moved <= self.settings.trace.same_fit * fitted.loss:
             return fitted
-        return fit(settled, fitted.effects, free, rows, settings=self.settings.fit)
+        return fit(settled, fitted.effects, free, rows, settings=settings)
 
     def sketched(self, effects: Sequence[Effect], free: Sequence[Free], max_evaluations: int) -> Fit:
         """Quick fit of some parameters on the screened windows."""
