@@ -45,6 +45,15 @@ def test_the_bar_names_the_effects_of_the_present_list(bar):
     assert "ActionGain" not in str(bar)
 
 
+def test_the_time_left_follows_from_all_the_time_passed():
+    with LoopBar(file=io.StringIO(), mininterval=0.0) as bar:
+        bar.start_t -= 60.0
+        bar.update(50.0)
+        for _ in range(100):  # the smallest steps are the last ones
+            bar.update(1e-3)
+        assert "about 01:0" in str(bar) or "about 00:5" in str(bar)
+
+
 def test_a_stage_that_does_not_exist_is_refused(bar):
     with pytest.raises(KeyError):
         bar.stage("waiting")
