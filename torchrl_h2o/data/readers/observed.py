@@ -85,7 +85,8 @@ class EstimatedVelocity:
         """
         return (
             f"{self.name} was not measured: it is estimated from {self.position}, with an error of {self.std:.2g} "
-            f"{self.unit} (standard deviation)."
+            f"{self.unit} (standard deviation). The estimate is smooth over time, so a delay of the actions may look "
+            "like a lag."
         )
 
 
