@@ -8,6 +8,7 @@ from cases import Family
 from drawn_cases import DECOY, JOINT_BY_JOINT, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
 from log_cases import log_families
 from paper_cases import PAPER, PAPER_WITH_NOISE
+from robot_cases import ROBOT
 
 FAMILIES: Mapping[str, Family] = MappingProxyType(
     {
@@ -19,6 +20,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "decoy": DECOY,
         "slow": SLOW,
         "joints": JOINT_BY_JOINT,
+        "robot": ROBOT,
     }
 )
 
