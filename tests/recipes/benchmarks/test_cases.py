@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,11 @@ import torch
 from cases import Case, draw_case
 from drawn_cases import VISIBLE, plain, visibility
 from families import FAMILIES, all_families, choose_families
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from paper_cases import GAPS, what_mends
 from results_table import table
+from robot_cases import EFFECTS
 from running import Job, run_all
 from scoring import (
     is_exact_set,
@@ -26,6 +30,7 @@ from systems import SYSTEMS, with_sensor_noise
 from torchrl.envs import GymEnv, TransformedEnv
 from undeclared_effects import CubicWind, LateForce, MovingSpring, PlaceFriction, TorqueRipple
 
+import torchrl_h2o
 from torchrl_h2o.effects import (
     ActionGain,
     BodyMass,
@@ -167,6 +172,25 @@ def test_mass_and_gain_of_the_decoy_cannot_be_told_apart():
     assert one_step_error(case) > 1e-2
     for alike in (mass, ActionGain(1.0 / mass.scale, actuators=0)):
         assert one_step_error(case, alike) < 1e-4
+
+
+def test_the_robot_has_the_effects_of_its_configuration():
+    configured = OmegaConf.load(Path(torchrl_h2o.__file__).parent / "config" / "env" / "wheel_legged.yaml").env.reality
+    assert {type(effect): values_of(effect) for effect in map(instantiate, configured)} == {
+        type(effect): values_of(effect) for effect in EFFECTS
+    }
+
+
+def values_of(effect):
+    return {name: parameter.value for name, parameter in effect.parameters.items()}
+
+
+@pytest.mark.parametrize("number", [0, FAMILIES["robot"].size - 1])
+def test_the_robot_s_last_case_is_a_control_without_effects(number):
+    case = draw_case(FAMILIES, "robot", number, 0)
+    assert case.in_reality == (() if number else EFFECTS)
+    assert case.judge(report(), case)["ok"] == bool(number)
+    assert case.judge(report(*EFFECTS), case)["ok"] == (not number)
 
 
 def test_nothing_is_a_right_simulator_and_noisy_sensors():

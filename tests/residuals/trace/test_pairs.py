@@ -1,4 +1,6 @@
-"""Additions to a list of effects, and the lists that grow side by side."""
+"""Pairs of effects whose first effect, alone, is far from the best."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,41 +9,59 @@ from torchrl.envs import TransformedEnv
 from torchrl_h2o.effects import BodyMass, ObservationBias
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.trace.add import additions, pairs_by_prediction
+from torchrl_h2o.residuals.trace.add import additions
+from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
 HEAVY, TILTED = BodyMass(2.27, bodies="torso"), ObservationBias(0.057, entries=(0,))
-TRUE = {"BodyMass torso", "ObservationBias 0"}
+TRUE = frozenset({"BodyMass torso", "ObservationBias 0"})
 OTHERS = {"Armature axle", "BodyCentreOfMass wheels", "BodyMass wheels", "JointForce axle", "GeomSize *wheel*"}
 
 
 @pytest.fixture(scope="module")
-def state():
+def singles():
+    """Single effects, fitted to data of a robot with a heavier torso and a tilted sensor."""
     simulation = Simulation.from_env(WheelLeggedEnv())
     reality = TransformedEnv(WheelLeggedEnv(max_episode_steps=500), DynamicsGap(HEAVY, TILTED))
     measured = Measured.from_ted(record(reality, noisy_balance_controller(), 2000, seed=0), simulation)
     catalogue = [entry for entry in simulation.catalogue() if entry.name in TRUE | OTHERS]
-    return SearchState.begin(Problem.pose(simulation, measured), catalogue, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    state = SearchState.begin(Problem.pose(simulation, measured), catalogue, rng)
+    return additions(state, screen(state.problem, (), catalogue, state.windows.screened), rng)
 
 
-def names(entries):
-    return {entry.name for entry in entries}
+@pytest.fixture
+def to_beat(singles):
+    return singles.state.screened_loss(singles.near[0].fit.effects)
 
 
-def test_a_pair_is_found_whose_first_effect_alone_is_far_from_the_best(state):
+def found(singles, seen, to_beat):
+    return pairs_by_prediction(singles, seen, to_beat, np.random.default_rng(0)).near
+
+
+def names(addition):
+    return frozenset(entry.name for entry in addition.entries)
+
+
+def test_a_pair_is_found_whose_first_effect_was_passed_over(singles, to_beat):
     """Alone, a heavier torso explains less than moved wheels do. With a tilted sensor it explains everything."""
-    rng = np.random.default_rng(0)
-    leads = screen(state.problem, (), state.catalogue, state.windows.screened)
-    singles = additions(state, leads, rng)
     assert "BodyMass torso" not in {one.entries[0].name for one in singles.near}
-    pairs = pairs_by_prediction(singles, singles.near[0].loss, rng)
-    assert names(pairs.near[0].entries) == TRUE
-    assert pairs.near[0].loss < 0.1 * singles.near[0].loss
+    (best, *_) = found(singles, (), to_beat)
+    assert names(best) == TRUE
+    assert best.loss < 0.1 * singles.near[0].loss
 
 
-def test_pairs_that_do_not_come_close_to_other_lists_are_left_out(state):
-    rng = np.random.default_rng(0)
-    leads = screen(state.problem, (), state.catalogue, state.windows.screened)
-    assert not pairs_by_prediction(additions(state, leads, rng), 1e-6, rng).passed
+def test_pairs_that_were_seen_are_left_out(singles, to_beat):
+    assert TRUE not in map(names, found(singles, {TRUE}, to_beat))
+
+
+def test_pairs_that_do_not_come_close_to_other_lists_are_left_out(singles, to_beat):
+    assert not found(singles, (), 1e-4 * to_beat)
+
+
+def test_no_pair_is_tried_where_the_limit_leaves_room_for_one_effect(singles, to_beat):
+    settings = singles.state.settings
+    limited = replace(settings, trace=replace(settings.trace, max_effects=1))
+    assert not found(replace(singles, state=replace(singles.state, settings=limited)), (), to_beat)

@@ -1,5 +1,7 @@
 """The state of the search."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from torchrl.envs import TransformedEnv
@@ -31,3 +33,9 @@ def test_an_effect_must_contribute_more_where_coordinates_are_not_observed(data,
     simulation, measured = data()
     state = SearchState.begin(Problem.pose(simulation, measured), (), np.random.default_rng(0))
     assert state.min_share == share
+
+
+def test_other_explanations_of_exact_effects_must_reach_more_in_a_quick_fit():
+    simulation, measured = pendulum_data()
+    state = SearchState.begin(Problem.pose(simulation, measured), (), np.random.default_rng(0))
+    assert state.rival_min_sketch < replace(state, exact=True).rival_min_sketch < 1.0

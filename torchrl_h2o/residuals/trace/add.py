@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import losses, matters
 from torchrl_h2o.residuals.trace.screening import (
     Lead,
-    along,
     are_possible_alone,
     free_parameters,
     is_possible,
@@ -75,12 +73,15 @@ def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generato
 
     Pairs are tried where no single entry passes the tests, and sets of three where no pair does: one of two effects may
     increase the loss as long as the other one is missing. They are not tried where so little of the loss is left that
-    even a set that explains all of it would not contribute its share.
+    even a set that explains all of it would not contribute its share; a single entry may halve what is left instead.
 
     Args:
         state: effects found so far.
         leads: screened entries, in descending order of their promise.
         rng: generator of synthetic noise.
+
+    Returns:
+        The additions of the smallest size of which one passes, or none.
     """
     rules = state.settings.trace
     among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
@@ -92,52 +93,23 @@ def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generato
         sketches = _sketches(state, leads, among, size, count)
         if size == 1:
             state = _remember(state, sketches)
-        found = _tested(state, leads, sketches, rng)
+        found = tested(state, leads, sketches, rng)
         if found.near:
             return found
     return Additions(state, leads)
 
 
-def pairs_by_prediction(singles: Additions, to_beat: float, rng: np.random.Generator) -> Additions:
-    """Finds pairs of entries from the fits of single ones, also of those that alone are far from the best.
-
-    The second entry is taken to change what the first one's fit leaves as it changes the residual without it. This
-    prediction needs no simulation. The pairs that it puts first get a quick fit, and those that come close to the loss
-    to beat get a full one.
-
-    Args:
-        singles: single entries that were fitted, and the leads among which a second one is looked for.
-        to_beat: lowest loss of the screened windows that other lists leave.
-        rng: generator of synthetic noise.
-    """
-    state, screened = singles.state, singles.state.windows.screened
-    if len(state.entries) + 2 > state.settings.trace.max_effects:
-        return Additions(state, singles.leads)
-    leads = {lead.entry.name: lead for lead in singles.leads if lead.promise > 0.0}
-    predicted = []
-    for single in (one for one in singles.passed if one.added == 1):
-        effects = single.fit.effects
-        left = state.problem.settled(effects, screened).residual(effects, screened)
-        for lead in (lead for name, lead in leads.items() if name != single.entries[-1].name):
-            _, explained = along(left, lead.change.reshape(left.shape))
-            predicted.append(((1.0 - explained) * float(losses(left).mean()), single, lead))
-    ranked = distinct(sorted(predicted, key=itemgetter(0)), itemgetter(0), state.settings.trace.same_fit)
-    present = [free_parameters(entry) for entry in state.entries]
-    sketches = []
-    for _, single, lead in ranked[: dict(state.settings.trace.set_sizes)[2]]:
-        together = [*single.fit.effects, lead.effect]
-        if is_possible(state.problem, together):
-            first = leads[single.entries[-1].name]
-            free = [*present, first.free, lead.free]
-            sketches.append(((first, lead), state.sketched(together, free, state.settings.trace.sketch_evaluations)))
-    close = [one for one in sketches if _sketch_loss(one) <= state.settings.trace.beam_loss * to_beat]
-    return _tested(state, singles.leads, close, rng)
-
-
-def _tested(
+def tested(
     state: SearchState, leads: Sequence[Lead], sketches: Sequence[Sketch], rng: np.random.Generator
 ) -> Additions:
-    """The sketched sets that pass the tests after a full fit."""
+    """The sketched sets that pass the tests after a full fit.
+
+    Args:
+        state: effects found so far.
+        leads: screened entries.
+        sketches: sets of leads, each with a quick fit.
+        rng: generator of synthetic noise.
+    """
     before = state.selection_losses(state.fit.effects)
     present = Addition(state.entries, state.fit, 0, before, state.first.selection_loss(state.fit.effects))
     passed = sorted((one for one in _fitted(state, sketches) if _pays(state, present, one)), key=_loss)
@@ -186,14 +158,26 @@ def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], 
     sets = [(lead,) for lead in leads[:count]]
     if size > 1:
         sets = promising_sets(state.problem, effects, among, size, state.windows.screened, count)
-    present = [free_parameters(entry) for entry in state.entries]  # they made up for what is missing
     sketches = []
     for chosen in sets:
-        together = [*effects, *(lead.effect for lead in chosen)]
-        if is_possible(state.problem, together):
-            free = [*present, *(lead.free for lead in chosen)]
-            sketches.append((chosen, state.sketched(together, free, state.settings.trace.sketch_evaluations)))
+        sketch = sketched_set(state, [*effects, *(lead.effect for lead in chosen)], chosen)
+        if sketch is not None:
+            sketches.append((chosen, sketch))
     return sketches
+
+
+def sketched_set(state: SearchState, start: Sequence[Effect], added: Sequence[Lead]) -> Fit | None:
+    """Quick fit of the effects found and of added leads; None if the model rejects the values at the start.
+
+    Args:
+        state: effects found so far; their parameters move as well, because they made up for what is missing.
+        start: the effects found and the added ones, with the values from which the fit starts.
+        added: leads of the added effects.
+    """
+    if not is_possible(state.problem, start):
+        return None
+    free = [*map(free_parameters, state.entries), *(lead.free for lead in added)]
+    return state.sketched(start, free, state.settings.trace.sketch_evaluations)
 
 
 def _remember(state: SearchState, sketches: Sequence[Sketch]) -> SearchState:

@@ -15,18 +15,17 @@ import numpy as np
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.add import Additions, additions, distinct, pairs_by_prediction
+from torchrl_h2o.residuals.trace.add import Additions, additions, distinct
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.order import reorder
+from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SCREENING, ADDITION = 0.07, 0.1  # shares by which a screening and an addition bring the bar closer to the stage's end
-
-MUCH_FINER = 0.2  # ratio of the residuals' sizes below which a fit goes on with the new ones
 
 
 def grow(
@@ -38,7 +37,7 @@ def grow(
     """Adds effects until no addition passes the tests, the limit is reached, or the residual is within rounding.
 
     The first effect is chosen while all others are missing, so that a wrong one may look far better than a right one.
-    Beside the lists with a second effect, pairs are therefore grown whose first effect was passed over.
+    After the second round, pairs are therefore grown as well whose first effect was not among the best single ones.
 
     Args:
         state: effects found so far.
@@ -68,7 +67,7 @@ class _Beam:
     first: Additions | None = None
 
     def grow(self, state: SearchState) -> SearchState:
-        """Grows lists from a state to the end; the simplest of the best ones."""
+        """Adds effects to a list until none of the lists grows further; returns the simplest of the best ones."""
         self.seen.add(_names(state))
         beam, complete, rounds = [state], [], 0
         while True:
@@ -77,7 +76,7 @@ class _Beam:
             beam, rounds = [each for _, more in grown for each in more], rounds + 1
             if rounds == 2 and self.first is not None and not any(one.exact for one in beam):
                 to_beat = min(self.first.state.screened_loss(one.fit.effects) for one in [*complete, *beam])
-                beam += self._put_in(pairs_by_prediction(self.first, to_beat, self.rng))
+                beam += self._put_in(pairs_by_prediction(self.first, self.seen, to_beat, self.rng))
             if not beam:
                 return _simplest_of_best(complete)
             exact = [one for one in beam if one.exact]
@@ -140,20 +139,20 @@ def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
         return states[0]
     losses = _comparable_losses(states)
     lowest, best = min(zip(losses, states, strict=True), key=lambda pair: pair[0].mean())
-    as_good = [one for one, loss in zip(states, losses, strict=True) if not _is_worse(one, loss, best, lowest)]
+    as_good = [one for one, loss in zip(states, losses, strict=True) if not _is_beaten(one, loss, best, lowest)]
     return min(as_good, key=_size)
 
 
-def _is_worse(state: SearchState, loss: np.ndarray, best: SearchState, lowest: np.ndarray) -> bool:
-    """Whether a state's loss is significantly higher; if it has fewer parameters, by more than they must contribute."""
-    rules = state.settings.trace
+def _is_beaten(state: SearchState, loss: np.ndarray, best: SearchState, lowest: np.ndarray) -> bool:
+    """Whether a list's loss is significantly higher than that of the best one.
+
+    If the best list has more parameters, each of them must also contribute the share that an added effect must.
+    """
     if state.p_value(loss, lowest) > state.settings.significance.level:
         return False
-    fewer = _size(best)[0] - _size(state)[0]
-    if fewer <= 0 or lowest.mean() < rules.much_lower * loss.mean():
-        return True
+    more = _size(best)[0] - _size(state)[0]
     without, with_them = (state.first.selection_loss(one.fit.effects) for one in (state, best))
-    return matters(state.first_loss, without, with_them, fewer * state.min_share)
+    return more <= 0 or matters(state.first_loss, without, with_them, more * state.min_share)
 
 
 def _comparable_losses(states: Sequence[SearchState]) -> list[np.ndarray]:
@@ -179,36 +178,42 @@ def _remember_leads(state: SearchState, leads: Sequence[Lead], added: Sequence) 
 def _rescale(state: SearchState) -> SearchState:
     """Scales residuals by their present size.
 
-    Refits if the better simulator gives other observed start states, or a sharper measure of what is left: a fit ends
-    where its loss hardly changes, which may be far from the rounding of the data.
+    Refits once if the better simulator gives other observed start states, or a sharper measure of what is left: a fit
+    ends where its loss hardly changes, which may be far from the rounding of the data.
     """
     posed = state.posed_at(state.fit.effects)
     rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
+    within_rounding = posed.within_rounding
     moved = not np.array_equal(observed(state.problem.states), observed(posed.states))
-    if state.entries and not posed.within_rounding and (moved or _is_sharper(posed, state.problem)):
-        kept = eliminate(rescaled.with_found(state.entries, _refitted(rescaled)))
+    sharper = _is_sharper(posed, state.problem, state.settings.trace.much_finer)
+    if state.entries and not within_rounding and (moved or sharper):
+        kept = eliminate(rescaled.with_found(state.entries, _refitted(rescaled, again=sharper)))
         posed = kept.posed_at(kept.fit.effects)
-        rescaled = kept.rescaled(posed)
-    return without_noise(replace(rescaled, exact=posed.within_rounding))
+        rescaled, within_rounding = kept.rescaled(posed), posed.within_rounding
+    return without_noise(replace(rescaled, exact=within_rounding))
 
 
-def _refitted(state: SearchState) -> Fit:
-    """Refits the effects found; without sensor noise a second time, with larger differences, if that gains little.
+def _refitted(state: SearchState, *, again: bool) -> Fit:
+    """Refits the effects found.
 
     Contacts make the residual jump, and jumps within the small differences can hide where the loss falls.
+
+    Args:
+        state: effects found.
+        again: whether a first fit that gains little without sensor noise is repeated with larger differences.
     """
-    start, rules = state.fit.effects, state.settings
+    start, settings = state.fit.effects, state.settings
     fitted = state.refitted(state.entries, start)
-    gained = state.screened_loss(fitted.effects) < rules.trace.much_lower * state.screened_loss(start)
-    if gained or state.problem.sensor_std is not None:
+    gained = state.screened_loss(fitted.effects) < settings.trace.much_lower * state.screened_loss(start)
+    if gained or not again or state.problem.sensor_std is not None:
         return fitted
-    coarse = replace(rules.fit, difference_step=rules.fit.coarse_step)
+    coarse = replace(settings.fit, difference_step=settings.fit.coarse_step)
     return min(fitted, state.refitted(state.entries, start, settings=coarse), key=lambda one: one.loss)
 
 
-def _is_sharper(posed: Problem, before: Problem) -> bool:
-    """Whether the sensors turn out to have no noise, or most residuals fall to a small share of their former size."""
+def _is_sharper(posed: Problem, before: Problem, much_finer: float) -> bool:
+    """Whether the sensors turn out to have no noise, or the residuals' scale falls much in the median dimension."""
     if posed.sensor_std is None and before.sensor_std is not None:
         return True
     new, old = (np.median(problem.scale, axis=(0, 1)) for problem in (posed, before))
-    return bool(np.median(new / old) < MUCH_FINER)
+    return bool(np.median(new / old) < much_finer)

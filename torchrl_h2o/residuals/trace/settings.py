@@ -33,7 +33,7 @@ class FitSettings:
     difference_step: float = 1e-5
     """Relative step of the finite differences: 1e-4 of a parameter's typical size."""
     coarse_step: float = 1e-3
-    """Relative step of a second fit where the first one gained little."""
+    """Relative step in a second fit, where the first one gained little: 1e-2 of a parameter's typical size."""
     loss_tolerance: float = 1e-5
     """Relative change of the loss at which the optimiser stops."""
     variable_tolerance: float = 1e-7
@@ -77,10 +77,12 @@ class TraceSettings:
     """The same share if some coordinates are unobserved: an effect may also make up for errors of their estimates."""
     much_lower: float = 0.5
     """Share of the present loss below which an addition counts, however small its part of the whole reduction is."""
+    much_finer: float = 0.2
+    """Ratio of the residuals' scales, after and before an addition, below which the effects are fitted once more."""
     beyond_noise: float = 4.0
     """Required multiple of the gain of the same addition in synthetic data with sensor noise only."""
     surely_beyond_noise: float = 0.5
-    """Share of the held-out loss; an addition that explains more of it passes without such data being simulated."""
+    """Share of the held-out loss; an addition that explains more passes without a test against synthetic noise."""
     max_effects: int = 6
     """Largest number of effects in one explanation."""
     rounds: int = 3
@@ -126,7 +128,7 @@ class TraceSettings:
     rival_min_sketch: float = 0.5
     """Share of an effect's gain that an alternative must reach in its sketch to be fitted."""
     rival_min_exact: float = 0.9
-    """The same share if the effects found explain the data up to rounding."""
+    """Value in the place of ``rival_min_sketch`` if the effects found explain the data up to rounding."""
     rival_set_size: int = 3
     """Largest number of effects in another set that may explain the data as well."""
     rival_sets: int = 8

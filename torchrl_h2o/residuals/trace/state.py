@@ -125,6 +125,12 @@ class SearchState:
 
         If some coordinates are not observed, they follow from the effects: where the fit changes the residuals through
         them, a second fit starts with them as the first one puts them.
+
+        Args:
+            entries: the entries to fit.
+            start: their effects, with the values from which the fit starts.
+            rows: first rows of the windows; by default those of the search.
+            settings: of the fit; by default those of the search.
         """
         rows = self.windows.fitted if rows is None else rows
         if not entries:

@@ -1,0 +1,66 @@
+"""Finds pairs of entries from the fits of single ones, so that a pair is found whose first effect was passed over."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from operator import itemgetter
+
+import numpy as np
+
+from torchrl_h2o.residuals.trace.add import Addition, Additions, distinct, sketched_set, tested
+from torchrl_h2o.residuals.trace.problem import losses
+from torchrl_h2o.residuals.trace.screening import Lead, along
+from torchrl_h2o.residuals.trace.state import SearchState
+
+PAIR = 2
+
+
+def pairs_by_prediction(
+    singles: Additions, seen: Collection[frozenset[str]], to_beat: float, rng: np.random.Generator
+) -> Additions:
+    """Finds pairs whose first entry was fitted alone, however far it is from the best single one.
+
+    The residual of a pair is predicted without simulation: what the first entry's fit leaves, plus the change by the
+    second entry that the screening found. The pairs with the lowest predicted loss get a quick fit, and those that come
+    close to the loss to beat get a full one.
+
+    Args:
+        singles: single entries that were fitted, and the leads of their screening.
+        seen: names of the effects of each list so far; such pairs are left out.
+        to_beat: lowest loss of the screened windows that other lists leave.
+        rng: generator of synthetic noise.
+
+    Returns:
+        The pairs that pass the tests of an addition.
+    """
+    state, rules = singles.state, singles.state.settings.trace
+    count = dict(rules.set_sizes).get(PAIR, 0) if len(state.entries) + PAIR <= rules.max_effects else 0
+    sketches = []
+    for single, leads in _predicted(singles, seen):
+        sketch = sketched_set(state, [*single.fit.effects, leads[-1].effect], leads)
+        if sketch is not None and len(sketches) < count:
+            sketches.append((leads, sketch))
+        if len(sketches) >= count:
+            break
+    close = [(leads, sketch) for leads, sketch in sketches if sketch.loss <= rules.beam_loss * to_beat]
+    return tested(state, singles.leads, close, rng)
+
+
+def _predicted(singles: Additions, seen: Collection[frozenset[str]]) -> list[tuple[Addition, tuple[Lead, Lead]]]:
+    """Each new pair once, with the fit of its first entry, in ascending order of the predicted loss."""
+    state: SearchState = singles.state
+    screened = state.windows.screened
+    by_name = {lead.entry.name: lead for lead in singles.leads}
+    predicted = []
+    for single in (one for one in singles.passed if one.added == 1):
+        effects, first = single.fit.effects, by_name[single.entries[-1].name]
+        left = state.problem.settled(effects, screened).residual(effects, screened)
+        names = {entry.name for entry in single.entries}
+        for second in singles.leads:
+            new = second.entry.name not in names and frozenset({*names, second.entry.name}) not in seen
+            if new and second.promise > 0.0:
+                _, explained = along(left, second.change.reshape(left.shape))
+                predicted.append(((1.0 - explained) * float(losses(left).mean()), single, (first, second)))
+    ranked = distinct(sorted(predicted, key=itemgetter(0)), itemgetter(0), state.settings.trace.same_fit)
+    pairs = {frozenset(lead.entry.name for lead in leads): (single, leads) for _, single, leads in reversed(ranked)}
+    return list(reversed(pairs.values()))
