@@ -1,9 +1,12 @@
 """Autocorrelation of the remaining residual: about zero where only noise remains."""
 
 import numpy as np
+from torchrl.envs import TransformedEnv
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import ActionNoise, Gravity
+from torchrl_h2o.effects import ActionNoise, BodyMass, Gravity
+from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
+from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 
 SIMULATION = pendulum()
@@ -29,3 +32,18 @@ def test_rounding_is_no_residual():
 
 def test_without_neighbours_there_is_none():
     assert np.isnan(autocorrelation(SIMULATION, recorded(SIMULATION.with_effects(Gravity(1.5)), 4))).all()
+
+
+def robot(*effects):
+    """Autocorrelation of the residuals of a robot's simulator in data of the same robot with effects."""
+    simulation = Simulation.from_env(WheelLeggedEnv())
+    reality = TransformedEnv(WheelLeggedEnv(), DynamicsGap(*effects))
+    return autocorrelation(
+        simulation, Measured.from_ted(record(reality, noisy_balance_controller(), 500, seed=0), simulation)
+    )
+
+
+def test_an_unobserved_coordinate_is_no_residual():
+    """The estimated height of the robot is wrong by a little, and for several steps."""
+    assert np.isnan(robot()).all()
+    assert np.isfinite(robot(BodyMass(1.05, bodies="torso"))).all()

@@ -34,6 +34,8 @@ class JudgeSettings:
     """Largest number of rejected effects in the report."""
     rounding: float = 1e-5
     """Residual, in spreads of the one-step change, below which no autocorrelation is computed."""
+    rounding_unobserved: float = 1e-3
+    """The same if some coordinates are unobserved, because the errors of their estimates last for several steps."""
     classifier_updates: int = 600
     """Updates of the discriminators in the two-sample test."""
     classifier_batch: int = 256

@@ -28,7 +28,8 @@ def autocorrelation(simulation: Simulation, measured: Measured, settings: JudgeS
     rows = measured.windows(2, split=Split.REPORT)
     first, second = (residuals(simulation, measured, rows + later)[:, 0] for later in (0, 1))
     change = (measured.following - measured.observation)[measured.usable & (measured.split == Split.FIT)]
-    least = settings.rounding * np.maximum(change.std(0), 1e-12)
+    rounding = settings.rounding_unobserved if simulation.state_map.hidden else settings.rounding
+    least = rounding * np.maximum(change.std(0), 1e-12)
     left = np.abs(first).mean(0) > least if len(rows) > 1 else np.zeros(first.shape[1], bool)
     return np.array(
         [
