@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import islice
 from operator import itemgetter
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy as np
 from torchrl_h2o.residuals.trace.add import Addition, Additions, distinct, sketched_set, tested
 from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import Lead, along
-from torchrl_h2o.residuals.trace.state import SearchState
 
 PAIR = 2
 
@@ -34,22 +34,21 @@ def pairs_by_prediction(
         The pairs that pass the tests of an addition.
     """
     state, rules = singles.state, singles.state.settings.trace
-    count = dict(rules.set_sizes).get(PAIR, 0) if len(state.entries) + PAIR <= rules.max_effects else 0
-    sketches = []
-    for single, leads in _predicted(singles, seen):
-        sketch = sketched_set(state, [*single.fit.effects, leads[-1].effect], leads)
-        if sketch is not None and len(sketches) < count:
-            sketches.append((leads, sketch))
-        if len(sketches) >= count:
-            break
+    if len(state.entries) + PAIR > rules.max_effects:
+        return Additions(state, singles.leads)
+    quick = (
+        (leads, sketched_set(state, [*single.fit.effects, leads[-1].effect], leads))
+        for single, leads in _predicted(singles, seen)
+    )
+    possible = ((leads, sketch) for leads, sketch in quick if sketch is not None)
+    sketches = islice(possible, dict(rules.set_sizes).get(PAIR, 0))
     close = [(leads, sketch) for leads, sketch in sketches if sketch.loss <= rules.beam_loss * to_beat]
     return tested(state, singles.leads, close, rng)
 
 
 def _predicted(singles: Additions, seen: Collection[frozenset[str]]) -> list[tuple[Addition, tuple[Lead, Lead]]]:
     """Each new pair once, with the fit of its first entry, in ascending order of the predicted loss."""
-    state: SearchState = singles.state
-    screened = state.windows.screened
+    state, screened = singles.state, singles.state.windows.screened
     by_name = {lead.entry.name: lead for lead in singles.leads}
     predicted = []
     for single in (one for one in singles.passed if one.added == 1):
@@ -62,5 +61,7 @@ def _predicted(singles: Additions, seen: Collection[frozenset[str]]) -> list[tup
                 _, explained = along(left, second.change.reshape(left.shape))
                 predicted.append(((1.0 - explained) * float(losses(left).mean()), single, (first, second)))
     ranked = distinct(sorted(predicted, key=itemgetter(0)), itemgetter(0), state.settings.trace.same_fit)
-    pairs = {frozenset(lead.entry.name for lead in leads): (single, leads) for _, single, leads in reversed(ranked)}
-    return list(reversed(pairs.values()))
+    pairs: dict[frozenset[str], tuple[Addition, tuple[Lead, Lead]]] = {}
+    for _, single, leads in ranked:
+        pairs.setdefault(frozenset(lead.entry.name for lead in leads), (single, leads))
+    return list(pairs.values())
