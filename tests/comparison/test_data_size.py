@@ -61,6 +61,13 @@ def test_runs_with_settings_that_the_figure_does_not_show_are_not_averaged():
     assert points_of([row("sac", 0, 1, "10", mend="posterior"), row("darc", 0, 1, "10")]) == {}
 
 
+def test_draws_from_the_posterior_are_a_line_of_their_own():
+    mended, drawn = (row("h2o_plus", 0, 1000, "10", mend=mend) for mend in ("true", "posterior"))
+    points = points_of([mended, drawn])
+    assert points[STANDING].keys() == {"h2o_plus_mended", "h2o_plus_posterior"}
+    assert "| H2O+, posterior | 1,000; 20.0 s (1) |" in markdown(points)
+
+
 def test_a_cell_has_return_seconds_speed_and_number_of_seeds():
     text = markdown(points_of(some_rows()))
     assert "| IQL | 18,500 ± 707; 20.0 s (2) |  |  | 170,500 ± 707; 20.0 s (2) |" in text

@@ -154,13 +154,14 @@ def test_the_data_size_figure_has_every_method_at_every_size_and_sac_once(tmp_pa
     log.touch()
     grid = chosen_grid(paper("figure=data_size", f"log={log}"))
     runs = list(grid.runs((0, 1)))
-    assert len(runs) == 2 * (4 * 6 + 2 * 6 + 6 + 6 + 2)
+    assert len(runs) == 2 * (4 * 7 + 2 * 7 + 7 + 7 + 2)
     assert len({tuple(run) for run in runs}) == len(runs)
-    assert runs[50:] == [[*run[:-1], "seed=1"] for run in runs[:50]]  # all of one seed, then the next
-    assert chosen(runs[:50], "env") == {"wheel_legged": 25 + 6, "wheel_legged_forward": 13, "wheel_legged_poor": 6}
-    assert chosen(runs[:50], "data_seconds") == {"2.5": 12, "10": 6, "30": 6 + 6}
-    assert chosen(runs[:50], "data") == {str(log): 6}
-    plain = [run for run in runs[:50] if "method=sac" in run and "mend=true" not in run]
+    assert runs[58:] == [[*run[:-1], "seed=1"] for run in runs[:58]]  # all of one seed, then the next
+    assert chosen(runs[:58], "env") == {"wheel_legged": 29 + 7, "wheel_legged_forward": 15, "wheel_legged_poor": 7}
+    assert chosen(runs[:58], "data_seconds") == {"2.5": 14, "10": 7, "30": 7 + 7}
+    assert chosen(runs[:58], "data") == {str(log): 7}
+    assert chosen(runs[:58], "mend") == {"true": 16, "posterior": 8}
+    plain = [run for run in runs[:58] if "method=sac" in run and "mend=true" not in run]
     assert plain == [["method=sac", f"env={env}", "seed=0"] for env in ("wheel_legged", "wheel_legged_forward")]
 
 
@@ -200,10 +201,10 @@ def test_runs_that_differ_in_their_data_or_in_mending_have_different_identities(
     for run in FIGURES["data_size"].runs((0,)):
         cfg = paper(*(override for override in run if not override.startswith("mend=")))
         with open_dict(cfg):
-            cfg.mend = True if "mend=true" in run else None
+            cfg.mend = {"mend=true": True, "mend=posterior": "posterior"}.get(run[-2])
             cfg.overrides = run
         found[tuple(run)] = identity(cfg)
-    assert len({tuple(who.values()) for who in found.values()}) == len(found) == 44
+    assert len({tuple(who.values()) for who in found.values()}) == len(found) == 51
     assert {who["others"] for who in found.values()} == {""}
     assert Counter((who["data_seconds"], who["mend"]) for who in found.values()) == {
         ("2.5", ""): 8,
@@ -214,6 +215,10 @@ def test_runs_that_differ_in_their_data_or_in_mending_have_different_identities(
         ("30", "true"): 2 + 2,
         ("", ""): 5 + 5,
         ("", "true"): 2 + 2,
+        ("2.5", "posterior"): 2,
+        ("10", "posterior"): 1,
+        ("30", "posterior"): 2,
+        ("", "posterior"): 2,
     }
 
 

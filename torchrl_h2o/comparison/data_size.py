@@ -5,7 +5,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from torchrl_h2o.comparison.data_size_grid import METHODS, SIZES, WHOLE
+from torchrl_h2o.comparison.data_size_grid import MEND, METHODS, SIZES, WHOLE, split_suffix
 from torchrl_h2o.comparison.scores import MixedRunsError, Row
 from torchrl_h2o.training.methods import METHODS as ALL_METHODS
 
@@ -16,11 +16,17 @@ FAULTLESS = {STANDING: 180_000.0, FORWARD: 90_000.0, POOR: 180_000.0, REAL_LOG: 
 _OF_ENV = {"wheel_legged/standing_still": STANDING, "wheel_legged/moving_forward": FORWARD}
 _OF_ENV |= {"wheel_legged_poor/standing_still": POOR}
 
-TITLES = {
-    name: ALL_METHODS[name.removesuffix("_mended")].title.removesuffix(" in the simulator")
-    + ", mended simulator" * name.endswith("_mended")
-    for name in METHODS
-}
+_SIMULATOR = {"true": ", mended simulator", "posterior": ", posterior", "": ""}  # by the option mend
+SUFFIXES = {value: suffix for suffix, value in MEND.items()}
+
+
+def title_of(name: str) -> str:
+    """Return the name in tables and figures of one in the grid's METHODS."""
+    method, suffix = split_suffix(name)
+    return ALL_METHODS[method].title.removesuffix(" in the simulator") + _SIMULATOR[MEND[suffix]]
+
+
+TITLES = {name: title_of(name) for name in METHODS}
 NOTES = (
     "A cell: return in reality, mean ± standard deviation over seeds; seconds balanced of 30 s; when moving forward, "
     "mean speed (target 0.2 m/s); number of seeds.",
@@ -29,6 +35,8 @@ NOTES = (
     "SAC uses no real data except for the normalisation of its observations. It is run once per task and seed, with "
     "the normalisation of the whole recording, and stands in every column.",
     "Mended simulator: the effects that close_the_loop found in the same real data are added to it before training.",
+    "Posterior: the same, in ten worlds; in each of them, the effects are drawn from the report's intervals and "
+    "alternatives.",
 )
 
 
@@ -56,9 +64,9 @@ def points_of(rows: Iterable[Row]) -> Points:
     """
     points: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in rows:
-        method = row["method"] + "_mended" * (row["mend"] == "true")
+        method = row["method"] + SUFFIXES[row["mend"]]
         panel = _OF_ENV.get(row["env"])
-        if method not in METHODS or panel is None or row["mend"] not in ("", "true"):
+        if method not in METHODS or panel is None:
             continue
         run = Run(int(row["seed"]), float(row["return_mean"]), float(row["seconds"]), _speed(row))
         for where, size in _places(row, method, panel):

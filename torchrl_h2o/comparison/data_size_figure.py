@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 
 from torchrl_h2o.comparison.aggregates import Interval, mean_of_runs
 from torchrl_h2o.comparison.data_size import FAULTLESS, FORWARD, POOR, REAL_LOG, STANDING, TITLES, Points, Run
-from torchrl_h2o.comparison.data_size_grid import METHODS, SIZES
+from torchrl_h2o.comparison.data_size_grid import MENDED, METHODS, POSTERIOR, SIZES, split_suffix
 from torchrl_h2o.training.learning_curve import COLOURS
 from torchrl_h2o.training.methods import METHODS as ALL_METHODS
 from torchrl_h2o.whole_file import whole_file
@@ -93,10 +93,12 @@ def _draw_lines(axis: Axes, methods: Mapping[str, Mapping[float, Sequence[Run]]]
 
 
 def _style(method: str) -> dict[str, Any]:
-    """Line of a method: its colour; open squares and dashes in the mended simulator; SAC without markers."""
-    colour = COLOURS.get(ALL_METHODS[method.removesuffix("_mended")].title)
-    if method.endswith("_mended"):
-        return {"color": colour, "ls": "--", "marker": "s", "ms": 5, "mfc": "white", "lw": 1.6}
+    """Line of a method: its colour; dashes and open markers in the mended simulator; SAC without markers."""
+    name, suffix = split_suffix(method)
+    colour = COLOURS.get(ALL_METHODS[name].title)
+    if suffix:
+        line, marker = {MENDED: ("--", "s"), POSTERIOR: ("-.", "D")}[suffix]
+        return {"color": colour, "ls": line, "marker": marker, "ms": 5, "mfc": "white", "lw": 1.6}
     if method == "sac":
         return {"color": colour, "ls": ":", "lw": 2.0}
     return {"color": colour, "ls": "-", "marker": "o", "ms": 4.5, "lw": 1.6}
@@ -147,7 +149,7 @@ def _draw_dots(axis: Axes, methods: Mapping[str, Mapping[float, Sequence[Run]]],
     for height, method in enumerate(present):
         (runs,) = methods[method].values()
         interval = mean_of_runs([_share(run, panel) for run in runs], reps)
-        style: dict[str, Any] = {**_style(method), "ls": "-", "marker": "s" if method.endswith("_mended") else "o"}
+        style: dict[str, Any] = {"marker": "o", **_style(method), "ls": "-"}
         axis.plot(np.clip(_ends(interval), LOWEST, None), [height] * 2, color=style["color"], lw=1.6, alpha=0.6)
         axis.plot(max(interval.value, LOWEST), height, **style)
         axis.text(113, height, f"{np.mean([run.seconds for run in runs]):.1f} s", fontsize=8, va="center")

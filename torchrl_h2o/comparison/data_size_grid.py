@@ -18,8 +18,21 @@ TASKS = {
     "wheel_legged_poor": (30.0,),
     LOG: (WHOLE,),
 }
-MENDED = "_mended"  # suffix of a method that is trained in the simulator mended from the same data, mend=true
-METHODS = ("iql", "cql", "sac", "h2o", "h2o_plus", f"sac{MENDED}", f"h2o_plus{MENDED}")
+MENDED = "_mended"  # suffix of a method that is trained in the simulator mended from the same data
+POSTERIOR = "_posterior"  # the same, with values drawn from the report's intervals and alternatives in each world
+MEND = {"": "", MENDED: "true", POSTERIOR: "posterior"}  # value of the option ``mend`` for each suffix
+METHODS = ("iql", "cql", "sac", "h2o", "h2o_plus", f"sac{MENDED}", f"h2o_plus{MENDED}", f"h2o_plus{POSTERIOR}")
+
+
+def split_suffix(name: str) -> tuple[str, str]:
+    """Split a name in :data:`METHODS` into the method and its suffix in :data:`MEND`.
+
+    Example:
+        >>> split_suffix("h2o_plus_mended"), split_suffix("iql")
+        (('h2o_plus', '_mended'), ('iql', ''))
+    """
+    suffix = next((suffix for suffix in (MENDED, POSTERIOR) if name.endswith(suffix)), "")
+    return name.removesuffix(suffix), suffix
 
 
 @dataclass(frozen=True)
@@ -66,8 +79,8 @@ class DataSizeGrid:
                             yield list(run)
 
     def _run(self, task: str, size: float, method: str, seed: int) -> list[str]:
-        name, mended = method.removesuffix(MENDED), method.endswith(MENDED)
-        if name == "sac" and not mended:
+        name, suffix = split_suffix(method)
+        if name == "sac" and not suffix:
             env = "wheel_legged_forward" if task == "wheel_legged_forward" else "wheel_legged"
             return [f"method={name}", f"env={env}", f"seed={seed}"]
         chosen = [f"method={name}", f"env={'wheel_legged' if task == LOG else task}"]
@@ -75,8 +88,8 @@ class DataSizeGrid:
             chosen.append(f"data={self.log}")
         if size != WHOLE:
             chosen.append(f"data_seconds={size:g}")
-        if mended:
-            chosen.append("mend=true")
+        if suffix:
+            chosen.append(f"mend={MEND[suffix]}")
         return [*chosen, f"seed={seed}"]
 
 
