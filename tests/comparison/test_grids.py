@@ -29,8 +29,10 @@ from torchrl_h2o.comparison.results_file import (
     repeating_command,
 )
 from torchrl_h2o.data import write_ted
+from torchrl_h2o.data.transition_checks import UnstableSimulatorError
 from torchrl_h2o.options import check_options
 from torchrl_h2o.training.config_file import load_config
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
 
@@ -288,30 +290,65 @@ def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
     assert len(recorded[0]) == 2
 
 
-def test_a_run_that_died_once_is_done_by_the_second_try(tmp_path, monkeypatch):
+@pytest.fixture
+def grid_of(tmp_path, monkeypatch):
+    """Builds a grid whose runs a given launcher carries out."""
+
+    def build(launch):
+        launcher = SimpleNamespace(launch=lambda jobs, initial_job_idx: launch(jobs))
+        monkeypatch.setattr(GridLauncher, "identity", lambda self, run: identity_of(run))
+        monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **kwargs: launcher)
+        config = hydra.compose("paper", ["figure=wheel_legged"], return_hydra_config=True)
+        return GridLauncher(config, tmp_path / "results.csv", shared=[], task=lambda cfg: None)
+
+    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
+        yield build
+
+
+def identity_of(run):
+    return dict.fromkeys(IDENTITY, "") | {"method": run[0].partition("=")[2]}
+
+
+def test_a_run_that_died_once_is_done_by_the_second_try(grid_of):
     """The launcher fails as a whole, as it does when one worker is killed."""
     launched = []
 
-    class Launcher:
-        def launch(self, jobs, initial_job_idx):
-            launched.append(len(jobs))
-            if len(launched) == 1:
-                raise RuntimeError("a worker was killed")
-            for number, _ in enumerate(jobs):
-                who = identity_of([f"method={number}"])
-                append_rows(grid.results, (*IDENTITY, *RESULT), [dict.fromkeys(RESULT, "1") | who], who)
-            return [SimpleNamespace(return_value=None) for _ in jobs]
+    def launch(jobs):
+        launched.append(len(jobs))
+        if len(launched) == 1:
+            raise RuntimeError("a worker was killed")
+        for number, _ in enumerate(jobs):
+            who = identity_of([f"method={number}"])
+            append_rows(grid.results, (*IDENTITY, *RESULT), [dict.fromkeys(RESULT, "1") | who], who)
+        return [SimpleNamespace(return_value=None) for _ in jobs]
 
-    def identity_of(run):
-        return dict.fromkeys(IDENTITY, "") | {"method": run[0].partition("=")[2]}
-
-    monkeypatch.setattr(GridLauncher, "identity", lambda self, run: identity_of(run))
-    monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **kwargs: Launcher())
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        config = hydra.compose("paper", ["figure=wheel_legged"], return_hydra_config=True)
-        grid = GridLauncher(config, tmp_path / "results.csv", shared=[], task=lambda cfg: None)
-        assert grid.run([["method=0"], ["method=1"]], retries=1) == []
+    grid = grid_of(launch)
+    assert grid.run([["method=0"], ["method=1"]], retries=1) == []
     assert launched == [2, 2]
+
+
+@pytest.mark.parametrize(
+    "error", [UnstableSimulatorError("the simulator diverged"), DivergenceError("loss_pi", "", None)]
+)
+def test_a_run_that_would_diverge_again_is_not_retried(grid_of, error):
+    class Failed:
+        def __init__(self, error):
+            self.error = error
+
+        @property
+        def return_value(self):
+            raise self.error
+
+    launched = []
+
+    def launch(jobs):
+        launched.append([override for override in jobs[0] if "method" in override])
+        return [Failed(error if job[0] == "method=0" else OSError("the disk is full")) for job in jobs]
+
+    first, second = grid_of(launch).run([["method=0"], ["method=1"]], retries=1)
+    assert launched == [["method=0"], ["method=1"]]
+    assert f"method=0: {type(error).__name__}: {error}" in first
+    assert "method=1: OSError: the disk is full" in second
 
 
 def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path):

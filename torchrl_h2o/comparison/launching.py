@@ -14,9 +14,12 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from torchrl_h2o.comparison.results_file import GRID, adopt_runs, identity, recorded
+from torchrl_h2o.data.transition_checks import UnstableSimulatorError
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.run_folder import resolve_paths
 
 Run = list[str]  # overrides of train.py that distinguish this run from the others of its grid
+REPEATABLE = (DivergenceError, UnstableSimulatorError)  # errors that a second attempt would end with as well
 
 
 def shared_overrides(overrides: Iterable[str]) -> list[str]:
@@ -51,6 +54,8 @@ class GridLauncher:
     def run(self, runs: Sequence[Run], retries: int) -> list[str]:
         """Launch the runs that are not in the results file, until all are finished or the retries are used up.
 
+        A run that diverged, or whose simulator did, is not retried: it would do so again.
+
         Args:
             runs: individual overrides of each run.
             retries: number of further attempts after the first.
@@ -61,10 +66,11 @@ class GridLauncher:
         adopt_runs(self.results, [self.identity(run) for run in runs])
         remaining = self.remaining(runs)
         print(f"{len(runs)} runs, {len(runs) - len(remaining)} of them done; results go to {self.results}")
-        errors: dict[str, str] = {}
+        errors: dict[str, Exception] = {}
         for _ in range(1 + retries):
-            if remaining:
-                errors = self._launch(remaining)
+            again = [run for run in remaining if not isinstance(errors.get(self._folder(run)), REPEATABLE)]
+            if again:
+                errors |= self._launch(again)
                 remaining = self.remaining(runs)
         return [self._failure(run, errors) for run in remaining]
 
@@ -90,7 +96,7 @@ class GridLauncher:
             self._composed[env] = load(self.config, [env, *self.shared])
         return self._composed[env]
 
-    def _launch(self, runs: Sequence[Run]) -> dict[str, str]:
+    def _launch(self, runs: Sequence[Run]) -> dict[str, Exception]:
         """Launch runs and return the errors of those that fail, by folder."""
         loader = GlobalHydra.instance().config_loader()
         launcher = Plugins.instance().instantiate_launcher(
@@ -106,7 +112,7 @@ class GridLauncher:
         try:
             returns = launcher.launch(jobs, initial_job_idx=0)
         except Exception as error:  # a killed worker ends all jobs of joblib's pool
-            return dict.fromkeys(folders, repr(error))
+            return dict.fromkeys(folders, error)
         errors = {folder: _error_of(job) for folder, job in zip(folders, returns, strict=True)}
         return {folder: error for folder, error in errors.items() if error is not None}
 
@@ -119,15 +125,16 @@ class GridLauncher:
             names.append(sha256(others.encode()).hexdigest()[:8])
         return f"{self.results.stem}/{'__'.join(names).replace('/', '-')}"
 
-    def _failure(self, run: Run, errors: dict[str, str]) -> str:
+    def _failure(self, run: Run, errors: dict[str, Exception]) -> str:
         folder = self._folder(run)
-        overrides = " ".join([*run, *self.shared])
-        return f"  {overrides}: {errors.get(folder, 'no error was recorded')} ({self.config.hydra.sweep.dir}/{folder})"
+        overrides, error = " ".join([*run, *self.shared]), errors.get(folder)
+        told = "no error was recorded" if error is None else f"{type(error).__name__}: {error}"
+        return f"  {overrides}: {told} ({self.config.hydra.sweep.dir}/{folder})"
 
 
-def _error_of(job: JobReturn) -> str | None:
+def _error_of(job: JobReturn) -> Exception | None:
     try:
         _ = job.return_value
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        return error
     return None
