@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.typical_residual import log_losses
 
 
 def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) -> Fit:
@@ -28,17 +27,8 @@ def worse_of(state: SearchState, one: Fit, other: Fit) -> Fit | None:
     return None
 
 
-def _log_losses(state: SearchState, fitted: Fit) -> np.ndarray:
-    """Cauchy loss of each window by which effects are chosen, (W), with the residuals' scales of a state.
-
-    It follows the typical residual. The robust loss of a fit follows the rare large ones as well, such as those of a
-    wheel that leaves the ground a step too late.
-    """
-    return np.log1p(state.problem.selection_residuals(fitted.effects) ** 2).mean((1, 2))
-
-
 def _is_worse(state: SearchState, one: Fit, by: Fit) -> bool:
     """Whether the loss of an explanation is significantly, and by more than a small share, higher than another's."""
-    own, other = (_log_losses(state, which) for which in (one, by))
+    own, other = (log_losses(state.problem, which) for which in (one, by))
     far = own.mean() > (1.0 + state.settings.trace.alike_loss) * other.mean()
     return bool(far and state.p_value(own, other) < state.settings.significance.level)

@@ -6,6 +6,7 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.typical_residual import leaves_much_finer
 
 
 def eliminate(state: SearchState) -> SearchState:
@@ -38,8 +39,9 @@ def _without_one(state: SearchState) -> SearchState | None:
         # an effect that has become neutral is not needed, however a fit without it ends
         fits = (state.refitted(entries, kept), state.fit.without(index))
         after, fitted = min(((state.selection_losses(one.effects), one) for one in fits), key=lambda one: one[0].mean())
-        needed = after.mean() > most and state.p_value(after, before) < state.settings.significance.level
-        if not needed or not _is_beyond_rounding(state, fitted):
+        level = state.settings.significance.level
+        worse = after.mean() > most and state.p_value(after, before) < level and _is_beyond_rounding(state, fitted)
+        if not worse and not leaves_much_finer(state, state.fit, fitted, level):
             return state.with_found(entries, fitted)
     return None
 

@@ -24,6 +24,7 @@ from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.typical_residual import is_finer, leaves_much_finer
 
 SCREENING, ADDITION = 0.07, 0.1  # shares by which a screening and an addition bring the bar closer to the stage's end
 
@@ -148,7 +149,10 @@ def _is_beaten(state: SearchState, loss: np.ndarray, best: SearchState, lowest: 
 
     If the best list has more parameters, each of them must also contribute the share that an added effect must.
     """
-    if state.p_value(loss, lowest) > state.settings.significance.level:
+    level = state.settings.significance.level
+    if leaves_much_finer(best, best.fit, state.fit, level):
+        return True
+    if state.p_value(loss, lowest) > level:
         return False
     more = _size(best)[0] - _size(state)[0]
     without, with_them = (state.first.selection_loss(one.fit.effects) for one in (state, best))
@@ -215,5 +219,4 @@ def _is_sharper(posed: Problem, before: Problem, much_finer: float) -> bool:
     """Whether the sensors turn out to have no noise, or the residuals' scale falls much in the median dimension."""
     if posed.sensor_std is None and before.sensor_std is not None:
         return True
-    new, old = (np.median(problem.scale, axis=(0, 1)) for problem in (posed, before))
-    return bool(np.median(new / old) < much_finer)
+    return is_finer(posed, before, much_finer)
