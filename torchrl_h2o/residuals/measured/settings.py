@@ -22,8 +22,12 @@ class MeasuredSettings:
     """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
     max_diverged: float = 0.1
     """Largest share of transitions at which the simulator may diverge in one step, for example at falls."""
-    settling_steps: int = 12
-    """Control steps after which the observed coordinates determine the unobserved ones."""
+    settling_steps: int = 48
+    """Control steps that are simulated before a row to settle its unobserved coordinates."""
+    settled_rows: int = 100
+    """Largest number of successive rows that are settled in one simulation; more simulations run side by side."""
+    without_history: int = 12
+    """First control steps of a run in which unobserved coordinates and earlier actions count as unknown."""
     state_nudge: float = 1e-3
     """Step of the finite differences by the observation, in spreads."""
     noise_rows: int = 2000
