@@ -54,7 +54,7 @@ def settled_coordinates(
 
 
 def _chains(rows: np.ndarray, begins: np.ndarray, settings: MeasuredSettings) -> tuple[np.ndarray, np.ndarray]:
-    """First and last row of each simulation, (C), for sorted rows: of one run, close to each other, and not too many."""
+    """First and last row, (C), of each simulation for sorted rows: few successive rows of one run."""
     far = np.diff(rows) > settings.settling_steps
     opens = np.concatenate([[True], far | (begins[rows[1:]] != begins[rows[:-1]])])[: len(rows)]
     since = rows - rows[np.maximum.accumulate(np.where(opens, np.arange(len(rows)), 0))]
