@@ -1,0 +1,60 @@
+"""Growing lists of effects: which of several lists is kept, and when a list is fitted once more."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import CatalogueEntry, Gravity, JointFrictionLoss
+from torchrl_h2o.residuals.settings import DEFAULTS
+from torchrl_h2o.residuals.trace.grow import _is_sharper, _simplest_of_best
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.state import SearchState
+
+SIMULATION = pendulum()
+GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
+FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
+MUCH_FINER = DEFAULTS.trace.much_finer
+
+
+def lists(friction):
+    """Searches in data with gravity × 1.3 and dry friction, in N·m: that found gravity alone, and that found both."""
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(friction)), 600)
+    begun = SearchState.begin(Problem.pose(SIMULATION, measured), [GRAVITY, FRICTION], np.random.default_rng(0))
+    gravity = begun.with_found([GRAVITY], begun.refitted([GRAVITY], [Gravity(1.3)]))
+    both = begun.refitted([GRAVITY, FRICTION], [Gravity(1.3), JointFrictionLoss(friction)])
+    return gravity, begun.with_found([GRAVITY, FRICTION], both)
+
+
+def found(state):
+    return [entry.name for entry in state.entries]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_several_lists_the_one_with_a_clearly_lower_loss_is_kept(order):
+    gravity, both = lists(friction=0.2)
+    assert found(_simplest_of_best([gravity, both][::order])) == found(both)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_further_effect_must_contribute_its_share_however_significant_it_is(order):
+    gravity, both = lists(friction=5e-4)
+    losses = [both.selection_losses(state.fit.effects) for state in (gravity, both)]
+    assert both.p_value(*losses) < both.settings.significance.level
+    assert found(_simplest_of_best([gravity, both][::order])) == found(gravity)
+
+
+def test_a_list_is_fitted_again_where_its_residuals_are_much_finer_than_those_of_the_fit():
+    gravity, both = lists(friction=0.2)
+    finer = both.posed_at(both.fit.effects)
+    assert _is_sharper(finer, gravity.problem, MUCH_FINER)
+    assert not _is_sharper(gravity.problem, gravity.problem, MUCH_FINER)
+    assert not _is_sharper(gravity.problem, finer, MUCH_FINER)
+
+
+def test_a_list_is_fitted_again_where_what_looked_like_sensor_noise_was_its_error():
+    gravity, _ = lists(friction=0.2)
+    noisy = replace(gravity.problem, sensor_std=np.full(2, 0.01))
+    assert _is_sharper(gravity.problem, noisy, MUCH_FINER)
+    assert not _is_sharper(noisy, noisy, MUCH_FINER)
