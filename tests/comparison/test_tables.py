@@ -67,6 +67,13 @@ def test_runs_with_other_settings_are_not_averaged():
     assert sorted(c["sac"].returns[0] for c in table.values()) == [1.0, 9.0]
 
 
+def test_runs_that_differ_in_how_often_they_were_evaluated_stand_in_one_row():
+    often, rarely = (row(name, 0, 1, others=others) for name, others in (("sac", "eval_every=5"), ("h2o_plus", "")))
+    assert len(cells(placed([often, rarely], variants=False))) == 1
+    best = row("h2o_plus", 1, 1, others="eval_every=5 keep=best_in_simulator")  # the evaluations choose the policy
+    assert len(cells(placed([often, best], variants=False))) == 2
+
+
 def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
     table = cells(placed(fixture(), variants=False))
     task = sorted(table)[1]

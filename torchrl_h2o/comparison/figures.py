@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from matplotlib.figure import Figure
 
 from torchrl_h2o.comparison.aggregates import Interval
@@ -36,12 +37,16 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
         figsize=(4.2 * columns, 3.2 * math.ceil(len(tasks) / columns)),
         layout="constrained",
         squeeze=False,
+        sharey=len({task[0] for task in tasks}) == 1,  # returns of different environments have different scales
     )
     for axis, task in zip(axes.flat, tasks, strict=False):
         for name in titles:
             if (task, name) in curves:
                 _draw_band(axis, curves[task, name], titles[name])
-        axis.set_title(" ".join(part for part in task if part), fontsize=8)
+        env, data, *variant = task
+        axis.set_title("\n".join(filter(None, [f"{env} {data}".strip(), " ".join(filter(None, variant))])), fontsize=8)
+        axis.xaxis.set_major_locator(MaxNLocator(4))
+        axis.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     for axis in axes.flat[len(tasks) :]:

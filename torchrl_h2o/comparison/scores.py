@@ -56,15 +56,24 @@ class Cell:
 
 #: columns in which the variants of H2O+ differ in the ablations, and their labels in tables
 VARIANTS = {"backbone": "", "mixing": "λ", "ratio": "ratio"}
+#: overrides that change how often a policy is evaluated during training, and nothing in the last policy
+EVALUATION = ("eval_every=", "eval_episodes=")
 
 
 def task_of(row: Row) -> Task:
     """Return the task of a row: environment, data, gap, variant and other overrides. Methods are compared per task."""
     variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
     gap = f"{row['gap']} {float(row['strength']):g}" if row["gap"] else ""
-    others = [row["others"]] if row.get("others") else []
+    others = [_without_evaluation(row.get("others", ""))]
     others += [f"{name}={row[name]}" for name in ("data_seconds", "mend") if row.get(name)]
-    return (row["env"], row["data"], gap, *variant, *others)
+    return (row["env"], row["data"], gap, *variant, *filter(None, others))
+
+
+def _without_evaluation(others: str) -> str:
+    """Leave out overrides that have no effect on the policy of a run that keeps its last one."""
+    if "keep=" in others:
+        return others
+    return " ".join(override for override in others.split() if not override.startswith(EVALUATION))
 
 
 def placed(rows: Iterable[Row], variants: bool) -> list[Row]:
