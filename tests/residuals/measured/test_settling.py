@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.measured.residual import start_states
 from torchrl_h2o.residuals.measured.settling import _chains
 from torchrl_h2o.residuals.settings import DEFAULTS
 
-SETTINGS = DEFAULTS.measured
+LONG = replace(DEFAULTS.measured, settling_steps=48, settled_rows=100)  # successive rows share simulations
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,8 @@ def simulation():
 def measured(simulation):
     """Three runs of 200 rows."""
     env = WheelLeggedEnv(max_episode_steps=200)
-    return Measured.from_ted(record(env, noisy_balance_controller(), 600, seed=0), simulation)
+    recorded = record(env, noisy_balance_controller(), 600, seed=0)
+    return Measured.from_ted(recorded, simulation, settings=LONG)
 
 
 def settled(simulation, measured, rows, **settings):
@@ -49,9 +50,7 @@ def test_rows_may_come_in_any_order_and_more_than_once(simulation, measured):
 
 def test_more_steps_before_a_row_make_its_residual_smaller(simulation, measured):
     rows = np.arange(60, 190)
-    few, many = (
-        replace(measured, settings=replace(SETTINGS, settled_rows=1, settling_steps=steps)) for steps in (3, 48)
-    )
+    few, many = (replace(measured, settings=replace(LONG, settled_rows=1, settling_steps=steps)) for steps in (3, 48))
     small, large = (np.median(np.abs(residuals(simulation, data, rows)), axis=(0, 1)) for data in (many, few))
     assert (small < 0.2 * large).all()
 
@@ -68,9 +67,9 @@ def test_after_a_divergence_later_rows_settle_anew(simulation, measured):
 
 def test_a_simulation_is_for_near_rows_of_one_run_and_not_for_many():
     begins = np.repeat([0, 200, 400], 200)
-    steps, most = SETTINGS.settling_steps, SETTINGS.settled_rows
+    steps, most = LONG.settling_steps, LONG.settled_rows
     rows = np.array([0, 1, 1 + steps, 100, 199, 200, 210, 210 + steps + 1, *range(400, 400 + 2 * most)])
-    first, last = _chains(rows, begins, SETTINGS)
+    first, last = _chains(rows, begins, LONG)
     assert first.tolist() == [0, 100, 199, 200, 210 + steps + 1, 400, 400 + most]
     assert last.tolist() == [1 + steps, 100, 199, 210, 210 + steps + 1, 399 + most, 399 + 2 * most]
 
