@@ -64,7 +64,7 @@ def points_of(rows: Iterable[Row]) -> Points:
     """
     points: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in rows:
-        method = row["method"] + SUFFIXES[row["mend"]]
+        method = row["method"] + SUFFIXES.get(row["mend"], "?")
         panel = _OF_ENV.get(row["env"])
         if method not in METHODS or panel is None:
             continue

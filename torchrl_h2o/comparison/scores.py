@@ -64,7 +64,7 @@ def task_of(row: Row) -> Task:
     """Return the task of a row: environment, data, gap, variant and other overrides. Methods are compared per task."""
     variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
     gap = f"{row['gap']} {float(row['strength']):g}" if row["gap"] else ""
-    others = [_without_evaluation(row.get("others", ""))]
+    others = [_without_evaluation(row.get("others") or "")]
     others += [f"{name}={row[name]}" for name in ("data_seconds", "mend") if row.get(name)]
     return (row["env"], row["data"], gap, *variant, *filter(None, others))
 
