@@ -64,9 +64,8 @@ def points_of(rows: Iterable[Row]) -> Points:
     """
     points: dict = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in rows:
-        method = row["method"] + SUFFIXES.get(row["mend"], "?")
-        panel = _OF_ENV.get(row["env"])
-        if method not in METHODS or panel is None:
+        method, panel = row["method"] + SUFFIXES.get(row["mend"], ""), _OF_ENV.get(row["env"])
+        if method not in METHODS or panel is None or row["mend"] not in SUFFIXES:
             continue
         run = Run(int(row["seed"]), float(row["return_mean"]), float(row["seconds"]), _speed(row))
         for where, size in _places(row, method, panel):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.settling import settled_coordinates
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -55,12 +54,28 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
     states = state_map.states(true)
     if state_map.hidden:
         rows = np.arange(len(measured)) if rows is None else rows
-        begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])
-        actions, settings = executed_actions(simulation, measured), measured.settings
-        states[np.ix_(rows, np.asarray(state_map.hidden))] = settled_coordinates(
-            simulation, states, actions, rows, begins, time=measured.time, settings=settings
-        )
+        states[np.ix_(rows, np.asarray(state_map.hidden))] = _settled(simulation, measured, states, rows)
     return states
+
+
+def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Unobserved coordinates in some rows, (W, hidden).
+
+    They are simulated from ``settling_steps`` rows before, with the observed coordinates reset to the measured values
+    at every step.
+    """
+    hidden = list(simulation.state_map.hidden)
+    actions = executed_actions(simulation, measured)
+    first = rows - measured.settings.settling_steps
+    # before the start of a run, its first row is repeated
+    begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])[rows]
+    carried = states[np.ix_(rows, np.asarray(hidden))]
+    for step in range(measured.settings.settling_steps):
+        row = np.maximum(first + step, begins)
+        now = states[row]
+        now[:, hidden] = carried
+        carried = simulation.rollout(now, actions[row][:, None], time=measured.time[row])[:, 0, hidden]
+    return carried
 
 
 def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:

@@ -23,12 +23,7 @@ class MeasuredSettings:
     max_diverged: float = 0.1
     """Largest share of transitions at which the simulator may diverge in one step, for example at falls."""
     settling_steps: int = 12
-    """Control steps that are simulated before a row to settle its unobserved coordinates. With 48, the robot's typical
-    residual is half as large, but a fit, which begins with settled states, then stays near its start."""
-    settled_rows: int = 1
-    """Largest number of successive rows that share a simulation, which is faster; with 1, each has its own."""
-    without_history: int = 12
-    """First control steps of a run in which unobserved coordinates and earlier actions count as unknown."""
+    """Control steps after which the observed coordinates determine the unobserved ones."""
     state_nudge: float = 1e-3
     """Step of the finite differences by the observation, in spreads."""
     noise_rows: int = 2000

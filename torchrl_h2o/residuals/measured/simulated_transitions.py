@@ -74,5 +74,5 @@ def _without_history(simulation: Simulation, measured: Measured) -> np.ndarray:
         simulation.pipeline.of_kind(kind) for kind in (ActionEffect, ObservationDelay)
     ):
         for run in measured.runs:
-            rows[run.start : run.start + DEFAULTS.measured.without_history] = True
+            rows[run.start : run.start + DEFAULTS.measured.settling_steps] = True
     return rows
