@@ -1,40 +1,19 @@
-"""The paper's grids: their runs, and that no result is lost when a grid is killed or a run fails."""
+"""The paper's grids, and those of our own: which runs they have."""
 
-import csv
-import shlex
-import signal
-import subprocess
 from collections import Counter
-from importlib.util import find_spec
-from types import SimpleNamespace
 
 import hydra
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import open_dict
-from torchrl.checkpoint import CheckpointRotation
 
-from tests.small_runs import ROBOT, ROOT, SMALL, trained
+from tests.small_runs import ROOT
 from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
-from torchrl_h2o.comparison.launching import GridLauncher
 from torchrl_h2o.comparison.options import PaperOptions
 from torchrl_h2o.comparison.results_file import (
-    CURVE,
-    IDENTITY,
-    RESULT,
-    adopt_runs,
-    append_rows,
     identity,
-    read_rows,
-    repeating_command,
 )
-from torchrl_h2o.data import write_ted
-from torchrl_h2o.data.transition_checks import UnstableSimulatorError
 from torchrl_h2o.options import check_options
-from torchrl_h2o.training.config_file import load_config
-from torchrl_h2o.training.divergence import DivergenceError
-from torchrl_h2o.training.loop import train
-from torchrl_h2o.training.methods import METHODS
 
 
 def chosen(runs, key):
@@ -222,196 +201,3 @@ def test_runs_that_differ_in_their_data_or_in_mending_have_different_identities(
         ("30", "posterior"): 2,
         ("", "posterior"): 2,
     }
-
-
-GRID = ["figure=wheel_legged", "tasks=[wheel_legged]", "seeds=[0]", *SMALL, *ROBOT, "results=results.csv"]
-
-
-@pytest.mark.slow
-def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_killed(command, compose, tmp_path):
-    asked = command(*GRID, "methods=[iql,cql]", "updates=200", script="paper.py")
-    process = subprocess.Popen(**asked, text=True)
-    while not (second := checkpoint_of(tmp_path, "cql")):
-        assert process.poll() is None, process.communicate()[0]
-    process.send_signal(signal.SIGSTOP)  # a stopped process keeps its lock on the run folder
-    beside = subprocess.run(**command(*GRID, "methods=[cql]", "updates=200", "retries=0", script="paper.py"), text=True)
-    assert beside.returncode != 0
-    assert "RuntimeError: another process is at work in outputs/paper/results/cql__" in beside.stdout
-
-    process.kill()
-    process.communicate()
-    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
-
-    done = subprocess.run(**asked, text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    assert "2 runs, 1 of them done" in done.stdout
-    assert done.stdout.count("run folder:") == 1
-    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql", "cql"]
-
-    cfg, real = compose("updates=200", "method=cql", config="train")
-    train(METHODS["cql"], cfg, real, tmp_path / "unbroken")
-    assert trained(second, "cql") == trained(tmp_path / "unbroken", "cql")
-
-    one = load_config(second)
-    assert one.seeds is None  # otherwise h2o_plus.py would resume it as a population
-    moved = [*GRID[:-1], "results=elsewhere/results.csv", "methods=[cql]", "updates=200"]
-    done = subprocess.run(**command(*moved, script="paper.py"), text=True, check=False)
-    assert done.returncode == 0, done.stdout
-    assert [row["method"] for row in read_rows(tmp_path / "elsewhere" / "results.csv")] == ["cql"]
-
-
-@pytest.mark.slow
-def test_an_interrupted_grid_says_how_it_goes_on(command, tmp_path):
-    asked = command(*GRID, "methods=[cql,iql]", "updates=20000", script="paper.py")
-    process = subprocess.Popen(**asked, text=True)
-    while not checkpoint_of(tmp_path, "cql"):
-        assert process.poll() is None, process.communicate()[0]
-    process.send_signal(signal.SIGINT)
-    printed, _ = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert printed.strip().endswith("interrupted with 2 runs to go; the same command continues with them")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(find_spec("hydra_plugins.hydra_joblib_launcher") is None, reason="an extra: .[launchers]")
-def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
-    _, real = compose()
-    write_ted(real, tmp_path / "recording")
-    launchers = {"in_turn": [], "at_once": ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]}
-    recorded = []
-    for name, overrides in launchers.items():
-        folder = [f"results={name}.csv", f"hydra.sweep.dir=outputs/{name}", *overrides]
-        small = [*GRID[:-1], "methods=[iql,sac]", "updates=20", "data=recording", *folder]
-        done = subprocess.run(**command(*small, script="paper.py"), text=True, check=False)
-        assert done.returncode == 0, done.stdout
-        rows = sorted(read_rows(tmp_path / f"{name}.csv"), key=lambda row: row["method"])
-        recorded.append([(row["method"], row["return_mean"], row["return_std"]) for row in rows])
-    assert recorded[0] == recorded[1]
-    assert len(recorded[0]) == 2
-
-
-@pytest.fixture
-def grid_of(tmp_path, monkeypatch):
-    """Builds a grid whose runs a given launcher carries out."""
-
-    def build(launch):
-        launcher = SimpleNamespace(launch=lambda jobs, initial_job_idx: launch(jobs))
-        monkeypatch.setattr(GridLauncher, "identity", lambda self, run: identity_of(run))
-        monkeypatch.setattr("hydra.core.plugins.Plugins.instantiate_launcher", lambda self, **kwargs: launcher)
-        config = hydra.compose("paper", ["figure=wheel_legged"], return_hydra_config=True)
-        return GridLauncher(config, tmp_path / "results.csv", shared=[], task=lambda cfg: None)
-
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        yield build
-
-
-def identity_of(run):
-    return dict.fromkeys(IDENTITY, "") | {"method": run[0].partition("=")[2]}
-
-
-def test_a_run_that_died_once_is_done_by_the_second_try(grid_of):
-    """The launcher fails as a whole, as it does when one worker is killed."""
-    launched = []
-
-    def launch(jobs):
-        launched.append(len(jobs))
-        if len(launched) == 1:
-            raise RuntimeError("a worker was killed")
-        for number, _ in enumerate(jobs):
-            who = identity_of([f"method={number}"])
-            append_rows(grid.results, (*IDENTITY, *RESULT), [dict.fromkeys(RESULT, "1") | who], who)
-        return [SimpleNamespace(return_value=None) for _ in jobs]
-
-    grid = grid_of(launch)
-    assert grid.run([["method=0"], ["method=1"]], retries=1) == []
-    assert launched == [2, 2]
-
-
-@pytest.mark.parametrize(
-    "error", [UnstableSimulatorError("the simulator diverged"), DivergenceError("loss_pi", "", None)]
-)
-def test_a_run_that_would_diverge_again_is_not_retried(grid_of, error):
-    class Failed:
-        def __init__(self, error):
-            self.error = error
-
-        @property
-        def return_value(self):
-            raise self.error
-
-    launched = []
-
-    def launch(jobs):
-        launched.append([override for override in jobs[0] if "method" in override])
-        return [Failed(error if job[0] == "method=0" else OSError("the disk is full")) for job in jobs]
-
-    first, second = grid_of(launch).run([["method=0"], ["method=1"]], retries=1)
-    assert launched == [["method=0"], ["method=1"]]
-    assert f"method=0: {type(error).__name__}: {error}" in first
-    assert "method=1: OSError: the disk is full" in second
-
-
-def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path):
-    who = dict.fromkeys(IDENTITY, "x")
-    for name, columns in (("a.csv", (*IDENTITY, *RESULT)), ("a_curves.csv", (*IDENTITY, *CURVE))):
-        rows = [dict.fromkeys(columns, "1") | whose for whose in (who, who | {"seed": "y"})]
-        for row in rows:
-            append_rows(tmp_path / name, columns, [row], row)
-    (tmp_path / "notes.csv").write_bytes(b"anybody's\xff, x\n")
-    (tmp_path / "empty.csv").touch()
-    for _ in range(2):
-        adopt_runs(tmp_path / "b.csv", [who, who | {"seed": "z"}])
-    assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]
-    assert [row["seed"] for row in read_rows(tmp_path / "b_curves.csv")] == ["x"]
-
-
-def test_results_of_an_earlier_version_without_some_columns_are_kept(tmp_path):
-    columns = [column for column in (*IDENTITY, *RESULT) if column not in ("data_seconds", "mend", "mean_v")]
-    old = dict.fromkeys(columns, "1")
-    with open(tmp_path / "a.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerow(old)
-    new = dict.fromkeys((*IDENTITY, *RESULT), "1") | {"mend": "", "data_seconds": "2.5"}
-    same = dict.fromkeys((*IDENTITY, *RESULT), "1") | {"mend": "", "data_seconds": ""}
-    for row in (new, same):
-        append_rows(tmp_path / "a.csv", (*IDENTITY, *RESULT), [row], row)
-    assert read_rows(tmp_path / "a.csv") == [old | {"data_seconds": "", "mend": "", "mean_v": ""}, new]
-    adopt_runs(tmp_path / "b.csv", [same])
-    assert read_rows(tmp_path / "b.csv") == [old | {"data_seconds": "", "mend": "", "mean_v": ""}]
-    with pytest.raises(ValueError, match="has the columns"):
-        append_rows(tmp_path / "a.csv", IDENTITY, [new], new | {"seed": "2"})
-    assert len(read_rows(tmp_path / "a.csv")) == 2
-
-
-def checkpoint_of(folder, method):
-    """Returns the folder of a method's run if it has a checkpoint, otherwise a false value."""
-    found = list(folder.glob(f"outputs/paper/results/{method}__*"))
-    return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
-
-
-@pytest.mark.slow
-def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(command, tmp_path):
-    grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "sim_capacity=1e12", script="paper.py")
-    done = subprocess.run(**grid, text=True, check=False)
-    assert done.returncode != 0
-    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
-    assert "these runs failed:\n  method=h2o_plus" in done.stdout
-    assert "allocate memory" in done.stdout  # for the simulated buffer, which IQL does not fill
-    assert done.stdout.count("run folder:") == 3  # IQL once, H2O+ twice, because it is tried again once
-
-
-@pytest.mark.parametrize(
-    ("override", "shown"),
-    [
-        ("data=/home/me/logs/a.txt", "data=logs/a.txt"),
-        ("data=[/home/me/logs/a.txt,/home/me/logs/b.txt]", "data=[logs/a.txt,logs/b.txt]"),
-        ("gap_fix='/home/me/outputs/report.json'", "gap_fix='outputs/report.json'"),
-        ("data=halfcheetah/medium-v0", "data=halfcheetah/medium-v0"),
-    ],
-)
-def test_results_name_no_folder_of_the_machine(compose, override, shown):
-    cfg, _ = compose("method=iql", config="train")
-    cfg.overrides = ["method=iql", override]
-    assert shlex.split(repeating_command(cfg))[-1] == shown
-    assert "/home" not in identity(cfg)["others"]

@@ -1,0 +1,66 @@
+"""The results file: rows that are taken over, kept from earlier versions, and free of the machine's folders."""
+
+import csv
+import shlex
+
+import pytest
+
+from torchrl_h2o.comparison.results_file import (
+    CURVE,
+    IDENTITY,
+    RESULT,
+    adopt_runs,
+    append_rows,
+    identity,
+    read_rows,
+    repeating_command,
+)
+
+
+def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path):
+    who = dict.fromkeys(IDENTITY, "x")
+    for name, columns in (("a.csv", (*IDENTITY, *RESULT)), ("a_curves.csv", (*IDENTITY, *CURVE))):
+        rows = [dict.fromkeys(columns, "1") | whose for whose in (who, who | {"seed": "y"})]
+        for row in rows:
+            append_rows(tmp_path / name, columns, [row], row)
+    (tmp_path / "notes.csv").write_bytes(b"anybody's\xff, x\n")
+    (tmp_path / "empty.csv").touch()
+    for _ in range(2):
+        adopt_runs(tmp_path / "b.csv", [who, who | {"seed": "z"}])
+    assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]
+    assert [row["seed"] for row in read_rows(tmp_path / "b_curves.csv")] == ["x"]
+
+
+def test_results_of_an_earlier_version_without_some_columns_are_kept(tmp_path):
+    columns = [column for column in (*IDENTITY, *RESULT) if column not in ("data_seconds", "mend", "mean_v")]
+    old = dict.fromkeys(columns, "1")
+    with open(tmp_path / "a.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerow(old)
+    new = dict.fromkeys((*IDENTITY, *RESULT), "1") | {"mend": "", "data_seconds": "2.5"}
+    same = dict.fromkeys((*IDENTITY, *RESULT), "1") | {"mend": "", "data_seconds": ""}
+    for row in (new, same):
+        append_rows(tmp_path / "a.csv", (*IDENTITY, *RESULT), [row], row)
+    assert read_rows(tmp_path / "a.csv") == [old | {"data_seconds": "", "mend": "", "mean_v": ""}, new]
+    adopt_runs(tmp_path / "b.csv", [same])
+    assert read_rows(tmp_path / "b.csv") == [old | {"data_seconds": "", "mend": "", "mean_v": ""}]
+    with pytest.raises(ValueError, match="has the columns"):
+        append_rows(tmp_path / "a.csv", IDENTITY, [new], new | {"seed": "2"})
+    assert len(read_rows(tmp_path / "a.csv")) == 2
+
+
+@pytest.mark.parametrize(
+    ("override", "shown"),
+    [
+        ("data=/home/me/logs/a.txt", "data=logs/a.txt"),
+        ("data=[/home/me/logs/a.txt,/home/me/logs/b.txt]", "data=[logs/a.txt,logs/b.txt]"),
+        ("gap_fix='/home/me/outputs/report.json'", "gap_fix='outputs/report.json'"),
+        ("data=halfcheetah/medium-v0", "data=halfcheetah/medium-v0"),
+    ],
+)
+def test_results_name_no_folder_of_the_machine(compose, override, shown):
+    cfg, _ = compose("method=iql", config="train")
+    cfg.overrides = ["method=iql", override]
+    assert shlex.split(repeating_command(cfg))[-1] == shown
+    assert "/home" not in identity(cfg)["others"]
