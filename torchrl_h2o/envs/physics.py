@@ -54,8 +54,7 @@ def roll_out(
         if applied is not None:
             control, spec = np.concatenate([actions, applied], -1), _CTRL_AND_FORCE
         control = np.repeat(control, physics_steps, axis=1)
-        reached, _ = pool.rollout(models, data, states, control, control_spec=spec)
-        return reached[:, physics_steps - 1 :: physics_steps]
+        return _rolled_out(pool, models, data, states, control, spec)[:, physics_steps - 1 :: physics_steps]
     model = cast("mujoco.MjModel", models if isinstance(models, mujoco.MjModel) else models[0])
     reached = []
     for step in range(actions.shape[1]):
@@ -65,10 +64,33 @@ def roll_out(
             for force in forces:
                 total += force(*positions_and_velocities(model, states), ctrl, states[:, 0])
             control = np.concatenate([ctrl, total], -1)[:, None]
-            after, _ = pool.rollout(models, data, states, control, control_spec=_CTRL_AND_FORCE)
-            states = after[:, 0]
+            states = _rolled_out(pool, models, data, states, control, _CTRL_AND_FORCE)[:, 0]
         reached.append(states)
     return np.stack(reached, axis=1)
+
+
+def _rolled_out(
+    pool: Rollout,
+    models: mujoco.MjModel | Sequence[mujoco.MjModel],
+    data: Sequence[mujoco.MjData],
+    states: np.ndarray,
+    control: np.ndarray,
+    spec: int,
+) -> np.ndarray:
+    """States (B, H, size) after each physics step, without the checks of shapes, which take longer than a few steps."""
+    batch, steps, _ = control.shape
+    reached = np.empty((batch, steps, states.shape[1]))
+    pool.rollout(
+        [models] * batch if isinstance(models, mujoco.MjModel) else list(models),
+        list(data),
+        np.ascontiguousarray(states, np.float64),
+        np.ascontiguousarray(control, np.float64),
+        control_spec=spec,
+        skip_checks=True,
+        nstep=steps,
+        state=reached,
+    )
+    return reached
 
 
 def positions_and_velocities(model: mujoco.MjModel, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -116,7 +116,7 @@ class WheelLeggedMujocoEnv(MujocoEnv, utils.EzPickle):
         "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"],
         "render_fps": 200,
     }
-    #: unobserved velocities as linear functions of observed ones, for wheels that roll without slip
+    #: usual values of unobserved velocities as linear functions of observed ones: wheels that roll without slip
     hidden_state: Mapping[str, Mapping[str, float]] = MappingProxyType(
         {"axle_velocity": {"x_velocity": 1.0 / WHEEL_RADIUS, "pitch_velocity": -1.0}}
     )

@@ -74,7 +74,7 @@ def _real_and_simulated(
     noise = np.zeros((2, *measured.observation.shape))
     if sensor_std is not None:
         noise = sensor_std * rng.standard_normal(noise.shape)
-        states = states + noise[0] @ simulation.state_map.restore.T
+        states = states + noise[0] @ simulation.state_map.restore_observed.T
     missed = residuals(simulation, measured, rows, states=states, rng=rng)[:, 0] - noise[1][rows]
     whole = np.isfinite(missed).all(1)
     rows, missed = rows[whole], missed[whole]

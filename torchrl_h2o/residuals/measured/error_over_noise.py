@@ -35,7 +35,7 @@ def errors_and_noise(
     """
     states = start_states(simulation, measured, starts)
     noise = sensor_std * rng.standard_normal((2, *measured.observation.shape))
-    disturbed = states + noise[0] @ simulation.state_map.restore.T
+    disturbed = states + noise[0] @ simulation.state_map.restore_observed.T
     error = residuals(simulation, measured, starts, horizon, states=states)[:, -1]
     with_noise = residuals(simulation, measured, starts, horizon, states=disturbed, rng=rng)[:, -1]
     by_noise = with_noise - error + noise[1][starts + horizon - 1]

@@ -61,7 +61,7 @@ class Linearised:
         Rows without a finite estimate keep their measured state.
         """
         correction = np.nan_to_num(estimate - self.observed) * self.spread
-        return self.states + correction @ state_map.restore.T
+        return self.states + correction @ state_map.restore_observed.T
 
 
 def one_step(
@@ -80,7 +80,7 @@ def one_step(
         Observations (B, n) and their derivatives by the previous observations (B, n, n); NaN where the simulation
         diverges.
     """
-    steps = nudge * simulation.state_map.restore
+    steps = nudge * simulation.state_map.restore_observed
     begun = np.concatenate([states, *(states + step for step in steps.T)])
     copies = 1 + len(nudge)
     reached = simulation.rollout(begun, np.tile(actions, (copies, 1))[:, None], time=np.tile(time, copies))[:, 0]

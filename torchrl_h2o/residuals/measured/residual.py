@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_h2o.residuals.measured.settling import settle
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -49,33 +50,11 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
         measured: the data.
         rows: (W), rows in which unobserved coordinates are needed; all by default.
     """
-    state_map = simulation.state_map
     true = np.concatenate([simulation.true_observations(measured.observation[run]) for run in measured.runs])
-    states = state_map.states(true)
-    if state_map.hidden:
-        rows = np.arange(len(measured)) if rows is None else rows
-        states[np.ix_(rows, np.asarray(state_map.hidden))] = _settled(simulation, measured, states, rows)
-    return states
-
-
-def _settled(simulation: Simulation, measured: Measured, states: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Unobserved coordinates in some rows, (W, hidden).
-
-    They are simulated from ``settling_steps`` rows before, with the observed coordinates reset to the measured values
-    at every step.
-    """
-    hidden = list(simulation.state_map.hidden)
-    actions = executed_actions(simulation, measured)
-    first = rows - measured.settings.settling_steps
-    # before the start of a run, its first row is repeated
-    begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])[rows]
-    carried = states[np.ix_(rows, np.asarray(hidden))]
-    for step in range(measured.settings.settling_steps):
-        row = np.maximum(first + step, begins)
-        now = states[row]
-        now[:, hidden] = carried
-        carried = simulation.rollout(now, actions[row][:, None], time=measured.time[row])[:, 0, hidden]
-    return carried
+    rows = np.arange(len(measured)) if rows is None else rows
+    return settle(
+        simulation, measured, simulation.state_map.states(true), executed_actions(simulation, measured), rows
+    )
 
 
 def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:

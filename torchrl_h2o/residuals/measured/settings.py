@@ -22,8 +22,14 @@ class MeasuredSettings:
     """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
     max_diverged: float = 0.1
     """Largest share of transitions at which the simulator may diverge in one step, for example at falls."""
-    settling_steps: int = 12
+    settling_steps: int = 64
     """Control steps after which the observed coordinates determine the unobserved ones."""
+    settled_rows: int = 50
+    """Largest number of successive rows that share a simulation of the unobserved coordinates."""
+    windows_in_block: int = 25
+    """Neighbouring windows that are kept together where there are unobserved coordinates, to share a simulation."""
+    action_memory: int = 12
+    """First control steps of a run in which earlier actions count as unknown."""
     state_nudge: float = 1e-3
     """Step of the finite differences by the observation, in spreads."""
     noise_rows: int = 2000

@@ -68,11 +68,9 @@ def simulate_transitions(simulation: Simulation, real: TensorDictBase, *, seed: 
 
 
 def _without_history(simulation: Simulation, measured: Measured) -> np.ndarray:
-    """Mask, (T), of the first rows of each run if the simulator depends on earlier actions or states."""
+    """Mask, (T), of the first rows of each run if the simulator depends on earlier actions."""
     rows = np.zeros(len(measured), bool)
-    if simulation.state_map.hidden or any(
-        simulation.pipeline.of_kind(kind) for kind in (ActionEffect, ObservationDelay)
-    ):
+    if any(simulation.pipeline.of_kind(kind) for kind in (ActionEffect, ObservationDelay)):
         for run in measured.runs:
-            rows[run.start : run.start + DEFAULTS.measured.settling_steps] = True
+            rows[run.start : run.start + DEFAULTS.measured.action_memory] = True
     return rows

@@ -51,6 +51,7 @@ class Measured:
         settings: sampling of windows, noise estimation and state estimation.
         estimated_std: (n), standard deviation of the errors of columns that were estimated from others, such as
             velocities from positions, and 0 for measured ones; None if all were measured.
+        block: neighbouring windows that are kept or left out together.
     """
 
     observation: np.ndarray
@@ -64,6 +65,7 @@ class Measured:
     source: str
     settings: MeasuredSettings = DEFAULTS.measured
     estimated_std: np.ndarray | None = None
+    block: int = 1
     _results: OrderedDict[tuple[Hashable, Simulation], Any] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @classmethod
@@ -105,7 +107,7 @@ class Measured:
         clipped = simulation.state_map.clipped(observation) | simulation.state_map.clipped(following)
         logs = cast("torch.Tensor", data["log"]).flatten().numpy() if "log" in data.keys() else np.zeros(len(run), int)
         step = np.arange(len(run)) * simulation.control_step
-        return cls(
+        measured = cls(
             observation,
             action,
             following,
@@ -117,7 +119,11 @@ class Measured:
             str(source),
             settings,
             _rms(_float64(data["observation_std"])) if "observation_std" in data.keys() else None,
+            settings.windows_in_block if simulation.state_map.hidden else 1,
         )
+        if not simulation.state_map.hidden:
+            return measured
+        return measured.without(measured.run_beginnings(), "unobserved coordinates are not known yet")
 
     def __len__(self) -> int:
         return len(self.observation)
@@ -133,6 +139,13 @@ class Measured:
         edges = np.flatnonzero(np.diff(self.run)) + 1
         starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(self)]
         return [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
+
+    def run_beginnings(self) -> np.ndarray:
+        """Mask, (T), of the first ``settings.settling_steps`` rows of each run, at most a quarter of the run."""
+        rows = np.zeros(len(self), bool)
+        for run in self.runs:
+            rows[run.start : run.start + min(self.settings.settling_steps, (run.stop - run.start) // 4)] = True
+        return rows
 
     def windows(self, horizon: int, stride: int = 1, *, split: Split | None = None) -> np.ndarray:
         """First rows, (W), of all windows that consist of usable transitions of a single run.
@@ -163,7 +176,7 @@ class Measured:
         return self._thinned(Split.REPORT, horizon)
 
     def _thinned(self, split: Split, horizon: int) -> np.ndarray:
-        return thinned(self.windows(horizon, horizon, split=split), self.settings.max_windows)
+        return thinned(self.windows(horizon, horizon, split=split), self.settings.max_windows, self.block)
 
     def part(self, rows: slice) -> Measured:
         """A contiguous piece of the transitions."""
@@ -263,9 +276,24 @@ def _border(run: np.ndarray, share: float, settings: MeasuredSettings) -> int:
     return nearest if abs(nearest - wanted) <= settings.border_moves * len(run) else wanted
 
 
-def thinned(starts: np.ndarray, most: int) -> np.ndarray:
-    """At most ``most`` of the windows, evenly spread."""
-    return starts[np.unique(np.linspace(0, len(starts) - 1, min(most, len(starts))).round().astype(int))]
+def thinned(starts: np.ndarray, most: int, block: int = 1) -> np.ndarray:
+    """At most about ``most`` of the windows, evenly spread.
+
+    Args:
+        starts: (W), first rows of the windows.
+        most: number of windows, rounded up to whole blocks.
+        block: successive windows that are kept or left out together.
+    """
+    if len(starts) <= most:
+        return starts
+    blocks = evenly(-(-len(starts) // block), -(-most // block))
+    chosen = (block * blocks[:, None] + np.arange(block)).ravel()
+    return starts[chosen[chosen < len(starts)]]
+
+
+def evenly(count: int, most: int) -> np.ndarray:
+    """At most ``most`` of the indices below ``count``, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def _float64(tensor) -> np.ndarray:

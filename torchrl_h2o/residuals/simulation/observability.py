@@ -27,7 +27,7 @@ def hidden_coordinates(
         rollout: steps states (B, nq + nv) under actions (B, H, nu) to states (B, H, nq + nv).
         settings: the size of the displacements and the threshold of the response.
     """
-    unobserved = np.flatnonzero(~state_map.restore.any(1))
+    unobserved = np.flatnonzero(~state_map.observe.any(0))
     size = (settings.num_nudged, len(state_map.offset))
     states = state_map.offset + settings.probe_spread * np.random.default_rng(0).standard_normal(size)
     still = np.zeros((len(states), 1, num_actuators))

@@ -18,6 +18,7 @@ from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
+from torchrl_h2o.effects.effect import BatchedForce
 from torchrl_h2o.envs.physics import FULL_PHYSICS, roll_out
 from torchrl_h2o.residuals.simulation.from_env import source_of_env
 from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
@@ -195,36 +196,70 @@ class Simulation:
             The states after each control step, (B, H, nq + nv); NaN from the step on at which the simulation diverges.
         """
         batch, horizon, _ = actions.shape
-        size = mujoco.mj_stateSize(self.model, FULL_PHYSICS)
-        full = np.zeros((batch, size))
-        full[:, 0] = 0.0 if time is None else time
-        full[:, 1 : 1 + states.shape[1]] = states
+        full = self._full(states, np.zeros(batch) if time is None else time)
         forces = self.pipeline.batched_forces(self.model)
-        chunk = max(1, self.settings.rollout_numbers // (horizon * self.frame_skip * size))
+        chunk = max(1, self.settings.rollout_numbers // (horizon * self.frame_skip * full.shape[-1]))
         parts = []
         with _no_warnings():
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
                 own = None if applied is None else applied[rows]
-                parts.append(
-                    roll_out(
-                        self._pool,
-                        self.model,
-                        self._data,
-                        full[rows],
-                        actions[rows],
-                        self.frame_skip,
-                        forces=forces,
-                        applied=own,
-                    )
-                )
-        reached = np.concatenate(parts) if parts else np.zeros((0, horizon, size))
-        # MuJoCo resets a simulation and its clock if the state is not finite or too large
-        expected = full[:, :1] + self.control_step * np.arange(1, horizon + 1)
-        allowed = self.settings.clock_jump * self.control_step
-        diverged = np.maximum.accumulate(np.abs(reached[:, :, 0] - expected) > allowed, axis=1)
-        reached = reached[:, :, 1 : 1 + states.shape[1]].copy()
-        reached[diverged] = np.nan
+                parts.append(self._stepped(full[rows], actions[rows], forces, own))
+        return np.concatenate(parts) if parts else np.zeros((0, horizon, states.shape[1]))
+
+    def follow(self, states: np.ndarray, actions: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Simulates the hidden coordinates of many recordings side by side.
+
+        At each step the observed coordinates begin at the recorded values, and the hidden ones where the step before
+        has brought them. Where a simulation diverges, they begin anew.
+
+        Args:
+            states: recorded states, (L, B, nq + nv); their hidden coordinates are those to begin with.
+            actions: executed actions, (L, B, nu).
+            time: time of the states in s, (L, B).
+
+        Returns:
+            The hidden coordinates after each step, (L, B, hidden).
+        """
+        hidden = np.asarray(self.state_map.hidden, int)
+        full, places = self._full(states, time), 1 + hidden
+        forces = self.pipeline.batched_forces(self.model)
+        reached = np.empty((*states.shape[:2], len(hidden)))
+        carried = states[0][:, hidden]
+        with _no_warnings():
+            for step, now in enumerate(full):
+                now[:, places] = carried
+                carried = self._stepped(now, actions[step][:, None], forces)[:, 0, hidden]
+                if not np.isfinite(carried).all():
+                    carried = np.where(np.isfinite(carried), carried, states[step][:, hidden])
+                reached[step] = carried
         return reached
+
+    def _full(self, states: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Full physics states, (..., size), of states (..., nq + nv) at times (...)."""
+        full = np.zeros((*states.shape[:-1], mujoco.mj_stateSize(self.model, FULL_PHYSICS)))
+        full[..., 0] = time
+        full[..., 1 : 1 + states.shape[-1]] = states
+        return full
+
+    def _stepped(
+        self,
+        full: np.ndarray,
+        actions: np.ndarray,
+        forces: Sequence[BatchedForce],
+        applied: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """States (B, H, nq + nv) after each control step from full physics states (B, size); NaN where it diverges."""
+        reached = roll_out(
+            self._pool, self.model, self._data, full, actions, self.frame_skip, forces=forces, applied=applied
+        )
+        # MuJoCo resets a simulation and its clock if the state is not finite or too large
+        control_step = self.control_step
+        expected = full[:, :1] + control_step * np.arange(1, actions.shape[1] + 1)
+        jumps = np.abs(reached[:, :, 0] - expected) > self.settings.clock_jump * control_step
+        states = reached[:, :, 1 : 1 + self.model.nq + self.model.nv].copy()
+        if jumps.any():
+            states[np.maximum.accumulate(jumps, axis=1)] = np.nan
+        return states
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -23,7 +24,8 @@ class StateMap:
         names: names of the observations, (n,).
         units: units of the observations, (n,).
         observe: matrix (n, nq + nv); the observation is ``observe @ state``, clipped to ``clip``.
-        restore: matrix (nq + nv, n); the state is ``offset + restore @ observation``.
+        restore: matrix (nq + nv, n); the state is ``offset + restore @ observation``. For hidden coordinates this is
+            the value from which a simulation begins.
         offset: values of the unobserved coordinates, (nq + nv,); zero for observed ones.
         clip: smallest and largest reported value of each observation, (n, 2).
         hidden: indices of the unobserved coordinates that affect later observations. They are estimated by simulating
@@ -61,6 +63,13 @@ class StateMap:
         observe[np.arange(len(names)), indices] = 1.0
         clip = np.tile([-np.inf, np.inf], (len(names), 1))
         return cls(tuple(names), tuple(units), observe, observe.T.copy(), np.zeros(num_states), clip)
+
+    @cached_property
+    def restore_observed(self) -> np.ndarray:
+        """The matrix ``restore`` with zeros for hidden coordinates, which a single reading does not change."""
+        restore = self.restore.copy()
+        restore[list(self.hidden)] = 0.0
+        return restore
 
     def states(self, observations: np.ndarray) -> np.ndarray:
         """Returns the states (..., nq + nv) of observations (..., n)."""
@@ -108,8 +117,8 @@ def probe_gymnasium(
 ) -> StateMap:
     """Determines the state map of a Gymnasium MuJoCo task from its observations in random states.
 
-    A task may define an attribute ``hidden_state``, which gives unobserved velocities as linear functions of observed
-    coordinates: ``{joint: {observed coordinate: factor}}``.
+    A task may define an attribute ``hidden_state``, which gives usual values of unobserved velocities as linear functions
+    of observed coordinates: ``{joint: {observed coordinate: factor}}``.
 
     Args:
         task: the task; its state is restored afterwards.

@@ -185,10 +185,9 @@ def _remember(state: SearchState, sketches: Sequence[Sketch]) -> SearchState:
     """Records what single entries explain in addition to the effects found, for the report."""
     problem, present, attempts = state.problem, state.fit.effects, dict(state.attempts)
     judged = problem.measured.selected_on(problem.horizon)
-    settled = problem.settled(present, judged)
-    before = losses(settled.residual(present, judged))
+    before = losses(problem.residual(present, judged))
     for (lead,), sketch in sketches:
-        after = losses(settled.residual(sketch.effects, judged))
+        after = losses(problem.residual(sketch.effects, judged))
         p = state.p_value(before, after)
         attempts[lead.entry.name] = Attempt(lead.entry, sketch, len(present), float(after.mean()), p)
     return replace(state, attempts=attempts)

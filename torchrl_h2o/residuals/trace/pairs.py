@@ -53,7 +53,7 @@ def _predicted(singles: Additions, seen: Collection[frozenset[str]]) -> list[tup
     predicted = []
     for single in (one for one in singles.passed if one.added == 1):
         effects, first = single.fit.effects, by_name[single.entries[-1].name]
-        left = state.problem.settled(effects, screened).residual(effects, screened)
+        left = state.problem.residual(effects, screened)
         names = {entry.name for entry in single.entries}
         for second in singles.leads:
             new = second.entry.name not in names and frozenset({*names, second.entry.name}) not in seen

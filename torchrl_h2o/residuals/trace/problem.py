@@ -10,8 +10,9 @@ import numpy as np
 
 from torchrl_h2o.effects import Effect, ObservationEffect
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
-from torchrl_h2o.residuals.measured.residual import residuals, start_states
+from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
+from torchrl_h2o.residuals.measured.settling import settle
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, ResidualSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -101,28 +102,13 @@ class Problem:
         """Expected size of the windows' residuals, (W, H, n) or (1, 1, n), in units of the observations."""
         return self.scale[starts] if len(self.scale) > 1 else self.scale
 
-    def settled(self, effects: Sequence[Effect], starts: np.ndarray) -> Problem:
-        """The problem with unobserved start coordinates as they follow from effects; itself if all are observed.
-
-        A larger wheel carries the body higher. With the start states of one list of effects, no other list can win.
-
-        Args:
-            effects: the effects that the preceding steps are simulated with.
-            starts: (W), first rows of the windows in which the coordinates are needed.
-        """
-        hidden = self.simulation.state_map.hidden
-        if not hidden:
-            return self
-        places, states = np.ix_(starts, np.asarray(hidden)), self.states.copy()
-        mended, measured = self.simulation.with_effects(*effects), self.measured
-        what = ("unobserved coordinates", starts.tobytes())
-        states[places] = measured.remembered(what, mended, lambda: start_states(mended, measured, starts)[places])
-        return replace(self, states=states)
-
     def selection_residuals(self, effects: Sequence[Effect]) -> np.ndarray:
         """Scaled residuals of the windows by which effects are chosen, (W, H, n), with effects put in."""
         judged = self.measured.selected_on(self.horizon)
-        return self.settled(effects, judged).residual(effects, judged)
+        if not self.simulation.state_map.hidden:
+            return self.residual(effects, judged)
+        mended = self.simulation.with_effects(*effects)
+        return self.measured.remembered(("selection", self), mended, lambda: self.residual(effects, judged))
 
     def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
         """Robust loss of each window by which effects are chosen, (W), with effects put in."""
@@ -141,16 +127,17 @@ class Problem:
 
     def _missed(self, effects: Sequence[Effect], starts: np.ndarray) -> np.ndarray:
         """Residuals in units of the observations, (W, H, n); NaN where the simulation diverges."""
-        simulation, states = self.simulation.with_effects(*effects), self.states
+        simulation, states, measured = self.simulation.with_effects(*effects), self.states, self.measured
         if _sensors(simulation) != _sensors(self.observer):
             # with other observation effects, the same readings correspond to other states
-            run_by_run = [self.measured.observation[run] for run in self.measured.runs]
+            run_by_run = [measured.observation[run] for run in measured.runs]
             before, after = (
                 np.concatenate([which.true_observations(run) for run in run_by_run])
                 for which in (self.observer, simulation)
             )
-            states = states + (after - before) @ self.simulation.state_map.restore.T
-        return residuals(simulation, self.measured, starts, self.horizon, states=states)
+            states = states + (after - before) @ simulation.state_map.restore_observed.T
+        states = settle(simulation, measured, states, executed_actions(simulation, measured), starts)
+        return residuals(simulation, measured, starts, self.horizon, states=states)
 
     def _bounded(self, residual: np.ndarray) -> np.ndarray:
         worst = self.settings.worst
@@ -158,7 +145,7 @@ class Problem:
 
     def _moved(self, observation: np.ndarray, starts: np.ndarray) -> np.ndarray:
         """Change of the residuals, (W, H, n), when the start observations change by ``observation``, (T, n)."""
-        moved = replace(self, states=self.states + observation @ self.simulation.state_map.restore.T)
+        moved = replace(self, states=self.states + observation @ self.simulation.state_map.restore_observed.T)
         return moved._missed((), starts) - self._missed((), starts)
 
     def _made_by_noise(self) -> np.ndarray:

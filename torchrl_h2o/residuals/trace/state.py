@@ -40,9 +40,12 @@ class SearchWindows:
         """Chooses the windows of a problem; the screened ones are drawn at random."""
         rules, horizon = settings.trace, problem.horizon
         every = problem.measured.fitted(horizon)
-        fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon))
+        block = problem.measured.block
+        fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon), block)
         few = min(max(rules.min_screened, rules.screened_steps // horizon), len(fitted))
-        return cls(every, fitted, np.sort(rng.choice(fitted, few, replace=False)))
+        blocks = [fitted[first : first + block] for first in range(0, len(fitted), block)]
+        chosen = rng.choice(len(blocks), min(-(-few // block), len(blocks)), replace=False)
+        return cls(every, fitted, np.concatenate([blocks[index] for index in np.sort(chosen)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +126,6 @@ class SearchState:
     ) -> Fit:
         """Joint fit of entries from given values, on the windows of the search or on others.
 
-        If some coordinates are not observed, they follow from the effects: where the fit changes the residuals through
-        them, a second fit starts with them as the first one puts them.
-
         Args:
             entries: the entries to fit.
             start: their effects, with the values from which the fit starts.
@@ -137,17 +137,12 @@ class SearchState:
             return _no_effects(self.problem, rows)
         settings = settings or self.settings.fit
         free = [free_parameters(entry) for entry in entries]
-        fitted = fit(self.problem.settled(start, rows), start, free, rows, settings=settings)
-        settled = self.problem.settled(fitted.effects, rows)
-        moved = abs(float(losses(settled.residual(fitted.effects, rows)).mean()) - fitted.loss)
-        if moved <= self.settings.trace.same_fit * fitted.loss:
-            return fitted
-        return fit(settled, fitted.effects, free, rows, settings=settings)
+        return fit(self.problem, start, free, rows, settings=settings)
 
     def sketched(self, effects: Sequence[Effect], free: Sequence[Free], max_evaluations: int) -> Fit:
         """Quick fit of some parameters on the screened windows."""
         return fit(
-            self.problem.settled(effects, self.windows.screened),
+            self.problem,
             effects,
             free,
             self.windows.screened,
@@ -158,7 +153,7 @@ class SearchState:
     def screened_loss(self, effects: Sequence[Effect]) -> float:
         """Mean loss of the screened windows with effects put in, comparable with that of a sketch."""
         screened = self.windows.screened
-        return float(losses(self.problem.settled(effects, screened).residual(effects, screened)).mean())
+        return float(losses(self.problem.residual(effects, screened)).mean())
 
     def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
         """Robust loss of each selection window, (W), with effects put in."""

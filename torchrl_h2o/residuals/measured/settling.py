@@ -1,0 +1,57 @@
+"""Simulates unobserved coordinates along the data, with the observed ones reset to the measured values at every step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+
+def settle(
+    simulation: Simulation, measured: Measured, states: np.ndarray, actions: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """Replaces the unobserved coordinates in some rows by those that a simulation along the data reaches.
+
+    A simulation begins ``settling_steps`` rows before the first row that it is for, and goes on to the rows after it.
+    All simulations run side by side. Before the start of a run, its first row is repeated.
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        states: (T, nq + nv), the observed coordinates, and values from which the unobserved ones begin.
+        actions: (T, nu), executed actions.
+        rows: (W), rows in which unobserved coordinates are needed.
+
+    Returns:
+        The states, (T, nq + nv); ``states`` itself if the simulator has no such coordinates.
+    """
+    hidden, settings = np.asarray(simulation.state_map.hidden, int), measured.settings
+    if not len(hidden) or not len(rows):
+        return states
+    begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])
+    first, last = _chains(np.unique(rows), begins, settings.settling_steps, settings.settled_rows)
+    steps = np.arange(-settings.settling_steps, (last - first).max())[:, None]
+    path = np.clip(first + steps, begins[first], last)
+    after = simulation.follow(states[path], actions[path], measured.time[path])
+    reached = (steps >= -1) & (first + steps < last)
+    found = states.copy()
+    found[(first + steps + 1)[reached][:, None], hidden] = after[reached]
+    return found
+
+
+def _chains(rows: np.ndarray, begins: np.ndarray, far: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """First and last row, (C), of each simulation for sorted rows: few successive rows of one run.
+
+    Args:
+        rows: (W), sorted rows.
+        begins: (T), first row of each row's run.
+        far: distance of two rows beyond which they do not share a simulation.
+        most: largest number of rows from the first to the last one.
+    """
+    opens = np.ones(len(rows), bool)
+    opens[1:] = (np.diff(rows) > far) | (begins[rows[1:]] != begins[rows[:-1]])
+    since = rows - rows[np.maximum.accumulate(np.where(opens, np.arange(len(rows)), 0))]
+    opens[1:] |= np.diff(since // most) != 0
+    closes = np.append(opens[1:], True)
+    return rows[opens], rows[closes]
