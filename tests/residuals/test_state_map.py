@@ -103,7 +103,7 @@ def test_axle_follows_from_velocity_and_pitch_rate():
 
 def test_hidden_coordinates_are_those_that_matter():
     """Hidden are z and its velocity, the depth of the wheels in the floor; the rolled distance is not."""
-    assert Simulation.from_env(WheelLeggedEnv()).state_map.hidden == (1, 5)
+    assert Simulation.from_env(WheelLeggedEnv()).state_map.hidden == (1, 5, 7)
 
 
 @pytest.mark.parametrize("task", ["HalfCheetah-v5", "Walker2d-v5", "Swimmer-v5"])

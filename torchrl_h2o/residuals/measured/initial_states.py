@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.residuals.measured.linearised import Linearised
+from torchrl_h2o.residuals.measured.residual import executed_actions
+from torchrl_h2o.residuals.measured.settling import settle
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -69,7 +71,7 @@ def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
 def _estimated_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None) -> np.ndarray:
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
-    return linearised.states_at(_filter(linearised, noise, measured.settings).mean, simulation.state_map)
+    return _states(simulation, measured, linearised, _filter(linearised, noise, measured.settings).mean)
 
 
 def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None = None) -> np.ndarray:
@@ -80,9 +82,15 @@ def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
     """
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
-    return linearised.states_at(
-        _smooth(linearised, _filter(linearised, noise, measured.settings)), simulation.state_map
+    return _states(
+        simulation, measured, linearised, _smooth(linearised, _filter(linearised, noise, measured.settings))
     )
+
+
+def _states(simulation: Simulation, measured: Measured, linearised: Linearised, estimate: np.ndarray) -> np.ndarray:
+    """States, (T, nq + nv), for estimated observations; unobserved coordinates follow from these."""
+    states = linearised.states_at(estimate, simulation.state_map)
+    return settle(simulation, measured, states, executed_actions(simulation, measured), np.arange(len(measured)))
 
 
 def noise_levels(simulation: Simulation, measured: Measured) -> NoiseLevels:

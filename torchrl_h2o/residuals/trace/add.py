@@ -19,6 +19,7 @@ from torchrl_h2o.residuals.trace.screening import (
     free_parameters,
     is_possible,
     promising_sets,
+    unlike,
 )
 from torchrl_h2o.residuals.trace.settings import TraceSettings
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -156,7 +157,7 @@ def _exceeds_noise(state: SearchState, addition: Addition, before: float, rng: n
 def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], size: int, count: int) -> list[Sketch]:
     """Quick fits of the most promising sets of one size."""
     effects = state.fit.effects
-    sets = [(lead,) for lead in leads[:count]]
+    sets = [(lead,) for lead in unlike(leads, state.settings.trace.same_change)[:count]]
     if size > 1:
         sets = promising_sets(state.problem, effects, among, size, state.windows.screened, count)
     sketches = []

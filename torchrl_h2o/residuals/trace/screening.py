@@ -118,6 +118,24 @@ def along(before: np.ndarray, change: np.ndarray) -> tuple[float, float]:
     return share, 1.0 - float(losses(before + share * change).mean() / max(loss, 1e-300))
 
 
+def unlike(leads: Sequence[Lead], same: float) -> list[Lead]:
+    """The leads without those that change the residual as an earlier one does, up to a factor.
+
+    In a planar robot, a larger left wheel does what a larger right wheel does. The others are tried as alternatives.
+
+    Args:
+        leads: leads in descending order of their promise.
+        same: cosine of the angle between two changes beyond which they count as the same.
+    """
+    kept, directions = [], []
+    for lead in leads:
+        size = float(np.linalg.norm(lead.change))
+        if size > 0.0 and all(abs(float(lead.change @ other)) < same * size for other in directions):
+            kept.append(lead)
+            directions.append(lead.change / size)
+    return kept
+
+
 def is_possible(problem: Problem, effects: Sequence[Effect]) -> bool:
     """Whether the model accepts the effects; it rejects, for example, negative total damping."""
     try:

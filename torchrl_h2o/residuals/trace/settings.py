@@ -102,7 +102,7 @@ class TraceSettings:
     """Largest number of such fits, each with residuals scaled anew, that may leave only rounding."""
     leads_combined: int = 60
     """Number of most promising leads from which sets are formed."""
-    set_sizes: tuple[tuple[int, int], ...] = ((1, 12), (2, 4), (3, 4))
+    set_sizes: tuple[tuple[int, int], ...] = ((1, 16), (2, 4), (3, 4))
     """Pairs (size of a set, number of sets of this size that are sketched); larger sets if no smaller one helps."""
     finalists: int = 3
     """Number of sketched sets of one size that are fitted on all windows of the search, at least."""
@@ -112,6 +112,8 @@ class TraceSettings:
     """Largest number of lists of effects that the search grows side by side."""
     beam_loss: float = 1.25
     """Multiple of the lowest loss up to which another list is grown as well."""
+    same_change: float = 0.999
+    """Cosine of the angle between two entries' changes of the residual beyond which only the first one is sketched."""
     same_fit: float = 1e-3
     """Relative difference up to which two losses count as equal."""
     clearly_needed: float = 1.5
