@@ -23,7 +23,6 @@ from torchrl_h2o.residuals.trace.screening import (
 )
 from torchrl_h2o.residuals.trace.settings import TraceSettings
 from torchrl_h2o.residuals.trace.state import SearchState
-from torchrl_h2o.residuals.trace.typical_residual import leaves_much_finer
 
 Found = TypeVar("Found")
 Sketch = tuple[tuple[Lead, ...], Fit]  # a set of leads, and a quick fit with them
@@ -219,16 +218,15 @@ def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[Addition]:
 
 
 def _pays(state: SearchState, present: Addition, candidate: Addition) -> bool:
-    """Whether a candidate lowers the loss by a minimum share, and significantly, or the typical residual by much."""
+    """Whether a candidate lowers the loss by a minimum share, and significantly."""
     rules = state.settings.trace
     least = rules.min_gain if state.problem.sensor_std is None else rules.min_gain_under_noise
     level = state.settings.significance.level / len(state.catalogue)
-    lowers_the_loss = (
+    return (
         candidate.loss < (1.0 - least) * present.loss
         and state.p_value(present.losses, candidate.losses) < level
         and _matters(state, present, candidate)
     )
-    return lowers_the_loss or leaves_much_finer(state, candidate.fit, present.fit, level)
 
 
 def _matters(state: SearchState, present: Addition, candidate: Addition) -> bool:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
-from torchrl_h2o.residuals.trace.typical_residual import log_losses
 
 
 def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) -> Fit:
@@ -29,6 +31,11 @@ def worse_of(state: SearchState, one: Fit, other: Fit) -> Fit | None:
 
 def _is_worse(state: SearchState, one: Fit, by: Fit) -> bool:
     """Whether the loss of an explanation is significantly, and by more than a small share, higher than another's."""
-    own, other = (log_losses(state.problem, which) for which in (one, by))
+    own, other = (_log_losses(state.problem, which) for which in (one, by))
     far = own.mean() > (1.0 + state.settings.trace.alike_loss) * other.mean()
     return bool(far and state.p_value(own, other) < state.settings.significance.level)
+
+
+def _log_losses(problem: Problem, fitted: Fit) -> np.ndarray:
+    """Cauchy loss of each window by which effects are chosen, (W), which single large residuals hardly change."""
+    return np.log1p(problem.selection_residuals(fitted.effects) ** 2).mean((1, 2))

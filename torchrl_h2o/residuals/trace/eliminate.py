@@ -6,7 +6,6 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
-from torchrl_h2o.residuals.trace.typical_residual import leaves_much_finer
 
 
 def eliminate(state: SearchState) -> SearchState:
@@ -41,7 +40,7 @@ def _without_one(state: SearchState) -> SearchState | None:
         after, fitted = min(((state.selection_losses(one.effects), one) for one in fits), key=lambda one: one[0].mean())
         level = state.settings.significance.level
         worse = after.mean() > most and state.p_value(after, before) < level and _is_beyond_rounding(state, fitted)
-        if not worse and not leaves_much_finer(state, state.fit, fitted, level):
+        if not worse:
             return state.with_found(entries, fitted)
     return None
 

@@ -24,7 +24,6 @@ from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
-from torchrl_h2o.residuals.trace.typical_residual import is_finer, leaves_much_finer
 
 SCREENING, ADDITION = 0.07, 0.1  # shares by which a screening and an addition bring the bar closer to the stage's end
 
@@ -150,8 +149,6 @@ def _is_beaten(state: SearchState, loss: np.ndarray, best: SearchState, lowest: 
     If the best list has more parameters, each of them must also contribute the share that an added effect must.
     """
     level = state.settings.significance.level
-    if leaves_much_finer(best, best.fit, state.fit, level):
-        return True
     if state.p_value(loss, lowest) > level:
         return False
     more = _size(best)[0] - _size(state)[0]
@@ -219,4 +216,5 @@ def _is_sharper(posed: Problem, before: Problem, much_finer: float) -> bool:
     """Whether the sensors turn out to have no noise, or the residuals' scale falls much in the median dimension."""
     if posed.sensor_std is None and before.sensor_std is not None:
         return True
-    return is_finer(posed, before, much_finer)
+    new, old = (np.median(one.scale, axis=(0, 1)) for one in (posed, before))
+    return bool(np.median(new / old) < much_finer)

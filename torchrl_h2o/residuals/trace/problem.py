@@ -120,10 +120,14 @@ class Problem:
 
     @property
     def within_rounding(self) -> bool:
-        """Whether the residual is within the rounding of single-precision data."""
-        fitted = self.measured.fitted(self.horizon)
+        """Whether the residual is within the rounding of single-precision data, or of the unobserved coordinates."""
+        measured, fitted = self.measured, self.measured.fitted(self.horizon)
         missed = np.nanmean(np.abs(self._missed((), fitted)), axis=(0, 1))
-        return bool((missed < 3.0 * self._rounding(fitted)).all())
+        rounding = 3.0 * self._rounding(fitted)
+        if self.simulation.state_map.hidden:
+            change = (measured.following - measured.observation)[fitted].std(0)
+            rounding = np.maximum(rounding, self.settings.rounding_unobserved * change)
+        return bool((missed < rounding).all())
 
     def _missed(self, effects: Sequence[Effect], starts: np.ndarray) -> np.ndarray:
         """Residuals in units of the observations, (W, H, n); NaN where the simulation diverges."""

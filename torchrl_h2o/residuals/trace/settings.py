@@ -78,8 +78,7 @@ class TraceSettings:
     much_lower: float = 0.5
     """Share of the present loss below which an addition counts, however small its part of the whole reduction is."""
     much_finer: float = 0.2
-    """Ratio of the residuals' scales, after and before an addition, below which the effects are fitted once more; where
-    some coordinates are unobserved, the addition then counts even if large residuals hide it in the loss."""
+    """Ratio of the residuals' scales, after and before an addition, below which the effects are fitted once more."""
     beyond_noise: float = 4.0
     """Required multiple of the gain of the same addition in synthetic data with sensor noise only."""
     surely_beyond_noise: float = 0.5
