@@ -7,8 +7,9 @@ from torchrl.envs import TransformedEnv
 from torchrl_h2o.effects import ActionDelay, ActionNoise, BodyMass, ObservationDelay, ObservationNoise
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Simulation, simulate_transitions
+from torchrl_h2o.residuals.settings import DEFAULTS
 
-ROWS, SETTLING = 300, 12
+ROWS, SETTLING = 300, DEFAULTS.measured.settling_steps
 
 
 def robot(*effects):
@@ -24,7 +25,7 @@ def error_of(real_effects, sim_effects, seed=0):
 def test_equal_dynamics_with_a_delay_give_the_measured_next_observation():
     delay = ActionDelay(0.0125)
     same, without = error_of([delay], [delay]), error_of([delay], [])
-    assert same[:SETTLING].isnan().all()  # the delayed actions of the first rows are not known
+    assert same[:SETTLING].isnan().all()  # the wheels' speed in the first rows is not known
     assert same[SETTLING:].abs().max() < 1e-3
     assert without[SETTLING:].abs().max() > 0.1
 

@@ -30,7 +30,7 @@ def simulate_transitions(simulation: Simulation, real: TensorDictBase, *, seed: 
 
     Returns:
         Next observations, ``[T, n]``; NaN for rows that cannot be simulated: the simulation diverges, an observation is
-        clipped, or the row is at the start of a run and the simulator depends on actions before it.
+        clipped, or the row is at the start of a run, where unobserved coordinates or earlier actions are not known.
 
     Raises:
         ValueError: if single sensors of the simulator are delayed.
