@@ -82,9 +82,7 @@ def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
     """
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
-    return _states(
-        simulation, measured, linearised, _smooth(linearised, _filter(linearised, noise, measured.settings))
-    )
+    return _states(simulation, measured, linearised, _smooth(linearised, _filter(linearised, noise, measured.settings)))
 
 
 def _states(simulation: Simulation, measured: Measured, linearised: Linearised, estimate: np.ndarray) -> np.ndarray:

@@ -52,9 +52,7 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
     """
     true = np.concatenate([simulation.true_observations(measured.observation[run]) for run in measured.runs])
     rows = np.arange(len(measured)) if rows is None else rows
-    return settle(
-        simulation, measured, simulation.state_map.states(true), executed_actions(simulation, measured), rows
-    )
+    return settle(simulation, measured, simulation.state_map.states(true), executed_actions(simulation, measured), rows)
 
 
 def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:

@@ -60,8 +60,8 @@ def trace_effects(
     state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
     found(_outcome(state))
     for _ in range(settings.trace.rounds):
-        before, state = state, grow(state, rng, progress, lambda grown: found(_outcome(grown)))
-        if state.entries == before.entries and len(state.groups) == len(state.entries):
+        state = grow(state, rng, progress, lambda grown: found(_outcome(grown)))
+        if not state.entries:
             break
         progress.stage(OTHERS)
         grown, simpler = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
@@ -73,7 +73,8 @@ def trace_effects(
             break
         state = divide_by_element(_rescaled(state), rng)
         progress.show_found(state.entries)
-        # a further round helps only where effects have been replaced, by simpler ones or by one for each joint
+        # a further round helps where effects have been replaced, by simpler ones or by one for each joint: what could be in
+        # the place of an effect depends on the others
         if state.entries == grown.entries:
             break
     state, others = with_most_usual_set(state, lambda: progress.closer(SET_FITTED))
