@@ -77,7 +77,7 @@ class ResidualSettings:
     rounding: float = 2e-7
     """Relative rounding error of the data, which are single precision."""
     rounding_unobserved: float = 1e-4
-    """Residual where coordinates are unobserved, in spreads of the change in a step, up to which it counts as zero: MuJoCo
-    solves contacts up to a tolerance, from the solution of the step before, which is not known."""
+    """Residual where coordinates are unobserved, in spreads of the change in a step, up to which it counts as zero.
+    MuJoCo solves contacts up to a tolerance, and begins with the solution of the step before, which is not known."""
     noise_draws: int = 4
     """Number of draws of sensor noise for the estimate of its effect on each window."""

@@ -1,4 +1,4 @@
-"""Simulates unobserved coordinates along the data, with the observed ones reset to the measured values at every step."""
+"""Simulates unobserved coordinates along the data, with the observed ones reset at every step."""
 
 from __future__ import annotations
 

@@ -117,8 +117,8 @@ def probe_gymnasium(
 ) -> StateMap:
     """Determines the state map of a Gymnasium MuJoCo task from its observations in random states.
 
-    A task may define an attribute ``hidden_state``, which gives usual values of unobserved velocities as linear functions
-    of observed coordinates: ``{joint: {observed coordinate: factor}}``.
+    A task may define an attribute ``hidden_state``, which gives usual values of unobserved velocities as linear
+    functions of observed coordinates: ``{joint: {observed coordinate: factor}}``.
 
     Args:
         task: the task; its state is restored afterwards.

@@ -73,8 +73,8 @@ def trace_effects(
             break
         state = divide_by_element(_rescaled(state), rng)
         progress.show_found(state.entries)
-        # a further round helps where effects have been replaced, by simpler ones or by one for each joint: what could be in
-        # the place of an effect depends on the others
+        # a further round helps where effects have been replaced, by simpler ones or by one for each joint, because the
+        # alternatives of an effect depend on the other effects
         if state.entries == grown.entries:
             break
     state, others = with_most_usual_set(state, lambda: progress.closer(SET_FITTED))
