@@ -15,7 +15,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.residuals import Split
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.screening import free_parameters, screen
+from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen, unlike
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -93,3 +93,11 @@ def test_screening_changes_no_data():
     before = measured.observation.copy()
     screen(Problem.pose(SIMULATION, measured), (), [GRAVITY], measured.windows(1))
     np.testing.assert_array_equal(measured.observation, before)
+
+
+def test_an_entry_that_changes_the_residual_as_an_earlier_one_does_is_left_out():
+    def lead(promise, change):
+        return Lead(GRAVITY, Gravity(1.1), promise, {}, np.array(change, np.float32))
+
+    leads = [lead(0.9, [1.0, 0.0]), lead(0.8, [-2.0, 0.001]), lead(0.7, [1.0, 1.0]), lead(0.6, [0.0, 0.0])]
+    assert unlike(leads, same=0.999) == [leads[0], leads[2]]

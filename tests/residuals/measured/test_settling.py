@@ -1,0 +1,64 @@
+"""The robot's height and the speed of its wheels are not observed; a simulation along the data reaches them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from torchrl.envs import TransformedEnv
+
+from torchrl_h2o.effects import RollingResistance
+from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
+from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals.measured.residual import residuals, start_states
+from torchrl_h2o.residuals.measured.transitions import thinned
+
+ROWS = 600
+HOPS = RollingResistance(0.003, geoms="*_wheel")  # its wheels lift off and land again
+
+
+@pytest.fixture(scope="module")
+def hopping():
+    """A recorded robot whose wheels hop, and its simulation."""
+    env = TransformedEnv(WheelLeggedEnv(max_episode_steps=ROWS), DynamicsGap(HOPS))
+    simulation = Simulation.from_env(env)
+    return simulation, Measured.from_ted(record(env, noisy_balance_controller(), ROWS, seed=0), simulation)
+
+
+def error(simulation, measured, states):
+    rows = measured.fitted()
+    change = (measured.following - measured.observation)[rows].std(0)
+    return np.abs(residuals(simulation, measured, rows, states=states)[:, 0]).mean(0) / change
+
+
+def test_hops_are_simulated_as_they_were_measured(hopping):
+    simulation, measured = hopping
+    settled = start_states(simulation, measured, measured.fitted())
+    rolling = settled.copy()
+    rolling[:, 7] = simulation.state_map.states(measured.observation)[:, 7]
+    assert error(simulation, measured, settled).max() < 1e-4
+    assert error(simulation, measured, rolling).max() > 5e-3
+
+
+def test_a_row_settles_alike_alone_and_among_others(hopping):
+    simulation, measured = hopping
+    hidden, row = list(simulation.state_map.hidden), 300
+    alone, among = (
+        start_states(simulation, measured, rows)[row, hidden] for rows in (np.array([row]), np.arange(ROWS))
+    )
+    np.testing.assert_allclose(alone, among, atol=1e-4)
+
+
+def test_the_first_rows_of_a_run_are_left_out_at_most_a_quarter(hopping):
+    _, measured = hopping
+    steps = measured.settings.settling_steps
+    assert not measured.usable[measured.run == 0][:steps].any()
+    short = replace(measured, run=np.arange(ROWS) // 40)
+    assert short.run_beginnings().sum() == 10 * len(short.runs)
+
+
+def test_windows_are_thinned_in_blocks_of_neighbours():
+    kept = thinned(np.arange(1000), 100, block=25)
+    assert len(kept) == 100
+    assert (np.diff(kept) == 1).sum() == 4 * 24
+    assert kept[0] == 0
+    assert kept[-1] == 999
