@@ -35,8 +35,16 @@ class CountingSimulation(Simulation):
         return cls(**{part.name: getattr(simulation, part.name) for part in dataclasses.fields(simulation)})
 
     def rollout(self, states: np.ndarray, actions: np.ndarray, **options: np.ndarray) -> np.ndarray:
+        return self._counted(super().rollout, states, actions, **options)
+
+    def follow(self, states: np.ndarray, actions: np.ndarray, time: np.ndarray) -> np.ndarray:
+        return self._counted(super().follow, states, actions, time)
+
+    def _counted(
+        self, simulate: Callable[..., np.ndarray], states: np.ndarray, actions: np.ndarray, *args: np.ndarray, **options
+    ) -> np.ndarray:
         start = time.perf_counter()
-        reached = super().rollout(states, actions, **options)
+        reached = simulate(states, actions, *args, **options)
         self.count.steps += actions.shape[0] * actions.shape[1]
         self.count.seconds += time.perf_counter() - start
         return reached
