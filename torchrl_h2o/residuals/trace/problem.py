@@ -75,7 +75,8 @@ class Problem:
         states = start_states(simulation, measured, np.concatenate([fitted, measured.selected_on(horizon)]))
         one = np.ones((1, 1, measured.observation.shape[1]))
         problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std, settings)
-        found, rounding = problem._missed((), fitted), problem._rounding(fitted)
+        found = problem._missed((), fitted)
+        rounding = problem._rounding(fitted, found)
         size = np.maximum(np.nanmedian(np.abs(found), axis=(0, 1)), rounding)
         if sensor_std is None:
             return replace(problem, scale=one * size)
@@ -105,10 +106,7 @@ class Problem:
     def selection_residuals(self, effects: Sequence[Effect]) -> np.ndarray:
         """Scaled residuals of the windows by which effects are chosen, (W, H, n), with effects put in."""
         judged = self.measured.selected_on(self.horizon)
-        if not self.simulation.state_map.hidden:
-            return self.residual(effects, judged)
-        mended = self.simulation.with_effects(*effects)
-        return self.measured.remembered(("selection", self), mended, lambda: self.residual(effects, judged))
+        return self.residual(effects, judged)
 
     def selection_losses(self, effects: Sequence[Effect]) -> np.ndarray:
         """Robust loss of each window by which effects are chosen, (W), with effects put in."""
@@ -122,12 +120,12 @@ class Problem:
     def within_rounding(self) -> bool:
         """Whether the residual is within the rounding of single-precision data, or of the unobserved coordinates."""
         measured, fitted = self.measured, self.measured.fitted(self.horizon)
-        missed = np.nanmean(np.abs(self._missed((), fitted)), axis=(0, 1))
-        rounding = 3.0 * self._rounding(fitted)
+        left = self._missed((), fitted)
+        rounding = 3.0 * self._rounding(fitted, left)
         if self.simulation.state_map.hidden:
             change = (measured.following - measured.observation)[fitted].std(0)
             rounding = np.maximum(rounding, self.settings.rounding_unobserved * change)
-        return bool((missed < rounding).all())
+        return bool((np.nanmean(np.abs(left), axis=(0, 1)) < rounding).all())
 
     def _missed(self, effects: Sequence[Effect], starts: np.ndarray) -> np.ndarray:
         """Residuals in units of the observations, (W, H, n); NaN where the simulation diverges."""
@@ -147,29 +145,30 @@ class Problem:
         worst = self.settings.worst
         return np.nan_to_num(np.clip(residual, -worst, worst), nan=worst)
 
-    def _moved(self, observation: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        """Change of the residuals, (W, H, n), when the start observations change by ``observation``, (T, n)."""
+    def _moved(self, observation: np.ndarray, starts: np.ndarray, still: np.ndarray) -> np.ndarray:
+        """Change, (W, H, n), of the residuals ``still`` when ``observation``, (T, n), is added to the start states."""
         moved = replace(self, states=self.states + observation @ self.simulation.state_map.restore_observed.T)
-        return moved._missed((), starts) - self._missed((), starts)
+        return moved._missed((), starts) - still
 
     def _made_by_noise(self) -> np.ndarray:
         """Mean square of the residual that sensor noise causes in each window, (T, H, n)."""
         measured, rng = self.measured, np.random.default_rng(0)
         sensor_std = cast("np.ndarray", self.sensor_std)  # called only with noisy sensors
         starts = np.concatenate([measured.fitted(self.horizon), measured.selected_on(self.horizon)])
+        still = self._missed((), starts)
         squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
         for _ in range(self.settings.noise_draws):
             noise = sensor_std * rng.standard_normal(measured.observation.shape)
-            moved = np.nan_to_num(self._moved(noise, starts) ** 2, nan=self.settings.worst**2)
+            moved = np.nan_to_num(self._moved(noise, starts, still) ** 2, nan=self.settings.worst**2)
             squares[starts] += moved / self.settings.noise_draws
         return squares + sensor_std**2
 
-    def _rounding(self, starts: np.ndarray) -> np.ndarray:
-        """Mean residual, (n), that single-precision rounding of the start states causes."""
+    def _rounding(self, starts: np.ndarray, still: np.ndarray) -> np.ndarray:
+        """Mean change, (n), of the residuals ``still`` by single-precision rounding of the start states."""
         observation, rng = self.measured.observation, np.random.default_rng(0)
         rounding = self.settings.rounding
         rounded_by = rounding * rng.uniform(-1.0, 1.0, observation.shape) * observation
-        made = np.nanmean(np.abs(self._moved(rounded_by, starts)), axis=(0, 1))
+        made = np.nanmean(np.abs(self._moved(rounded_by, starts, still)), axis=(0, 1))
         return made + rounding * np.abs(observation).max(0) + 1e-12
 
 
