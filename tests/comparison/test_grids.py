@@ -10,9 +10,7 @@ from omegaconf import open_dict
 from tests.small_runs import ROOT
 from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
 from torchrl_h2o.comparison.options import PaperOptions
-from torchrl_h2o.comparison.results_file import (
-    identity,
-)
+from torchrl_h2o.comparison.results_file import identity
 from torchrl_h2o.options import check_options
 
 

@@ -102,7 +102,10 @@ def test_axle_follows_from_velocity_and_pitch_rate():
 
 
 def test_hidden_coordinates_are_those_that_matter():
-    """Hidden are z and its velocity, the depth of the wheels in the floor; the rolled distance is not."""
+    """Hidden are z and its velocity, the depth of the wheels in the floor, and the speed of the wheels.
+
+    The rolled distance is not: no later observation depends on it.
+    """
     assert Simulation.from_env(WheelLeggedEnv()).state_map.hidden == (1, 5, 7)
 
 

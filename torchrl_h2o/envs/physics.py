@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import mujoco
 import numpy as np
@@ -49,14 +48,30 @@ def roll_out(
     """
     if len(states) * (1 if forces else actions.shape[1] * physics_steps) <= _FEW:
         pool, data = _ALONE, data[:1]
+    one_each = list(models) if isinstance(models, Sequence) else [models] * len(states)
+
+    def reached_by(states: np.ndarray, control: np.ndarray, spec: int) -> np.ndarray:
+        """States after each physics step, without checks of shapes, which take longer than a few steps."""
+        reached = np.empty((*control.shape[:2], states.shape[1]))
+        pool.rollout(
+            one_each,
+            list(data),
+            np.ascontiguousarray(states, np.float64),
+            np.ascontiguousarray(control, np.float64),
+            control_spec=spec,
+            skip_checks=True,
+            nstep=control.shape[1],
+            state=reached,
+        )
+        return reached
+
     if not forces:
         control, spec = actions, _CTRL
         if applied is not None:
             control, spec = np.concatenate([actions, applied], -1), _CTRL_AND_FORCE
         control = np.repeat(control, physics_steps, axis=1)
-        return _rolled_out(pool, models, data, states, control, spec)[:, physics_steps - 1 :: physics_steps]
-    model = cast("mujoco.MjModel", models if isinstance(models, mujoco.MjModel) else models[0])
-    reached = []
+        return reached_by(states, control, spec)[:, physics_steps - 1 :: physics_steps]
+    model, after_each = one_each[0], []
     for step in range(actions.shape[1]):
         ctrl = actions[:, step]
         for _ in range(physics_steps):
@@ -64,33 +79,9 @@ def roll_out(
             for force in forces:
                 total += force(*positions_and_velocities(model, states), ctrl, states[:, 0])
             control = np.concatenate([ctrl, total], -1)[:, None]
-            states = _rolled_out(pool, models, data, states, control, _CTRL_AND_FORCE)[:, 0]
-        reached.append(states)
-    return np.stack(reached, axis=1)
-
-
-def _rolled_out(
-    pool: Rollout,
-    models: mujoco.MjModel | Sequence[mujoco.MjModel],
-    data: Sequence[mujoco.MjData],
-    states: np.ndarray,
-    control: np.ndarray,
-    spec: int,
-) -> np.ndarray:
-    """States (B, H, size) after each physics step, without the checks of shapes, which take longer than a few steps."""
-    batch, steps, _ = control.shape
-    reached = np.empty((batch, steps, states.shape[1]))
-    pool.rollout(
-        [models] * batch if isinstance(models, mujoco.MjModel) else list(models),
-        list(data),
-        np.ascontiguousarray(states, np.float64),
-        np.ascontiguousarray(control, np.float64),
-        control_spec=spec,
-        skip_checks=True,
-        nstep=steps,
-        state=reached,
-    )
-    return reached
+            states = reached_by(states, control, _CTRL_AND_FORCE)[:, 0]
+        after_each.append(states)
+    return np.stack(after_each, axis=1)
 
 
 def positions_and_velocities(model: mujoco.MjModel, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

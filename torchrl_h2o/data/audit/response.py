@@ -273,17 +273,11 @@ def _settled(
     log: Log, simulation: AuditedSimulation, states: np.ndarray, actions: np.ndarray, starts: np.ndarray, steps: int
 ) -> np.ndarray:
     """States of some rows; unobserved coordinates are simulated from some steps before, with the others measured."""
-    hidden = list(simulation.state_map.hidden)
-    if not hidden:
-        return states[starts]
-    carried = states[starts - steps][:, hidden]
-    for step in range(steps):
-        row = starts - steps + step
-        now = states[row]
-        now[:, hidden] = carried
-        carried = simulation.rollout(now, actions[row][:, None])[:, 0, hidden]
     chosen = states[starts]
-    chosen[:, hidden] = carried
+    if steps:
+        before = starts + np.arange(-steps, 0)[:, None]
+        time = simulation.control_step * before if log.time is None else log.time[before]
+        chosen[:, list(simulation.state_map.hidden)] = simulation.follow(states[before], actions[before], time)[-1]
     return chosen
 
 

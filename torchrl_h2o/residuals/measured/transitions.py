@@ -286,14 +286,10 @@ def thinned(starts: np.ndarray, most: int, block: int = 1) -> np.ndarray:
     """
     if len(starts) <= most:
         return starts
-    blocks = evenly(-(-len(starts) // block), -(-most // block))
+    count, kept = -(-len(starts) // block), -(-most // block)
+    blocks = np.unique(np.linspace(0, count - 1, min(kept, count)).round().astype(int))
     chosen = (block * blocks[:, None] + np.arange(block)).ravel()
     return starts[chosen[chosen < len(starts)]]
-
-
-def evenly(count: int, most: int) -> np.ndarray:
-    """At most ``most`` of the indices below ``count``, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
 def _float64(tensor) -> np.ndarray:
