@@ -28,6 +28,7 @@ from torchrl_h2o.options import RunOptions
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import sim_capacity_of
+from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run
 from torchrl_h2o.training.mending import find_missing_effects
@@ -38,7 +39,7 @@ from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 from torchrl_h2o.training.real_data import behaviour_of, is_cut
-from torchrl_h2o.training.returns import BestPolicy, evaluate
+from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
 from torchrl_h2o.training.task import Task
 
@@ -84,12 +85,12 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Environments: to collect, to evaluate during training, and for the evaluation at the end
     simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
-    reality = task.make_reality(cfg.eval_episodes, preprocessing)
+    evaluator = evaluator_of(cfg, task, preprocessing)  # in reality; with overlap=true, beside the next updates
     trials = task.make_simulator(cfg.eval_episodes, preprocessing) if keeps_best(cfg) else None
     final_reality = task.make_reality(cfg.final_episodes, preprocessing)
     final_simulator = task.make_simulator(1, preprocessing)
-    observation_dim = reality.observation_spec["observation"].shape[-1]
-    action_spec = reality.action_spec_unbatched
+    observation_dim = final_reality.observation_spec["observation"].shape[-1]
+    action_spec = final_reality.action_spec_unbatched
     action_dim = action_spec.shape[-1]
 
     # Networks
@@ -159,16 +160,15 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
         # Evaluate
         if evaluating:
-            in_reality = evaluate(reality, actor, cfg.eval_episodes)
-            training.log(
+            training.evaluate(
+                evaluator,
+                actor,
                 epoch,
                 **({} if best is None else best.consider(actor, training.rows)),
-                return_real=in_reality.mean,
-                return_real_std=in_reality.std,
-                length_real=in_reality.mean_length,
                 ratio_of_sim=float(ratio_loss.estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
                 **{name: term.item() for name, term in losses.items()},
             )
+    evaluator.close()
     collector.shutdown()
 
     # Results

@@ -56,11 +56,11 @@ def rows(directory):
         return list(csv.DictReader(file))
 
 
-def interrupt_at(epoch, log):
-    def interrupted(self, current, **metrics):
+def interrupt_at(epoch, evaluate):
+    def interrupted(self, evaluator, policy, current, **metrics):
         if current == epoch:
             raise KeyboardInterrupt
-        log(self, current, **metrics)
+        evaluate(self, evaluator, policy, current, **metrics)
 
     return interrupted
 
@@ -68,7 +68,7 @@ def interrupt_at(epoch, log):
 def assert_resumed_equals_whole(method, cfg, real, directory, monkeypatch):
     """Trains in one go and with an interruption, compares the checkpoints; returns policy and training in one go."""
     policy, training = train(method, cfg, real, directory / "whole")
-    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", interrupt_at(epoch=1, log=Training.log))
+    monkeypatch.setattr(Training, "evaluate", interrupt_at(epoch=1, evaluate=Training.evaluate))
     with pytest.raises(KeyboardInterrupt):
         train(method, cfg, real, directory / "parts")
     monkeypatch.undo()

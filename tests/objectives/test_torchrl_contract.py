@@ -264,14 +264,14 @@ def test_actions_fill_the_bounds_of_their_spec_and_no_more():
     actor = make_actor(OBSERVATION_DIM, Bounded(-3, 3, (ACTION_DIM,)), CELLS)
     with torch.no_grad():
         actor.module[0].module[0][-1].weight.mul_(1e6)
-        _, _, action, _ = actor(observation=torch.randn(1000, OBSERVATION_DIM))
+        _, _, action = actor(observation=torch.randn(1000, OBSERVATION_DIM))
     assert 2.99 < action.abs().max() <= 3
 
 
 def test_the_policy_starts_as_the_authors_and_stays_finite():
     torch.manual_seed(0)
     actor = make_actor(OBSERVATION_DIM, Bounded(-1, 1, (ACTION_DIM,)))
-    loc, scale, _, _ = actor(observation=torch.randn(100, OBSERVATION_DIM))
+    loc, scale, _ = actor(observation=torch.randn(100, OBSERVATION_DIM))
     assert loc.abs().max() < 0.1
     torch.testing.assert_close(scale, torch.full_like(scale, -1.0).exp(), rtol=0.1, atol=0.0)
     with torch.no_grad():

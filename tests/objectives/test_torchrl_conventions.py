@@ -191,7 +191,7 @@ def test_the_authors_trained_scale_of_the_log_std_starts_as_ours():
     torch.manual_seed(0)
     spec = Parts().actor.spec["action"]
     theirs = make_actor(OBSERVATION_DIM, spec, trainable_log_std=True)
-    _, scale, _, _ = theirs(observation=torch.randn(100, OBSERVATION_DIM))
+    _, scale, _ = theirs(observation=torch.randn(100, OBSERVATION_DIM))
     torch.testing.assert_close(scale, torch.full_like(scale, -1.0).exp(), rtol=0.1, atol=0.0)
     assert {"multiplier", "offset"} <= {name.rsplit(".", 1)[-1] for name, _ in theirs.named_parameters()}
     parts = Parts(dtype=torch.float32)

@@ -40,15 +40,15 @@ def open_collector(cfg, actor):
 @pytest.mark.parametrize("kind", WORKERS)
 def test_training_on_with_workers_is_training_in_one_go(compose, tmp_path, kind, monkeypatch):
     cfg, real = compose(f"collector={kind}", "gap=joint_noise")
-    log, workers, threads = Training.log, [], torch.get_num_threads()
+    evaluate, workers, threads = Training.evaluate, [], torch.get_num_threads()
 
-    def stop_and_go_on(self, epoch, **metrics):
+    def stop_and_go_on(self, evaluator, policy, epoch, **metrics):
         workers.append(len(multiprocessing.active_children()))
         if epoch == 1:  # the files on disk are those that an interruption would leave
             shutil.copytree(self.directory, tmp_path / "parts")
-        log(self, epoch, **metrics)
+        evaluate(self, evaluator, policy, epoch, **metrics)
 
-    monkeypatch.setattr("torchrl_h2o.training.progress.Training.log", stop_and_go_on)
+    monkeypatch.setattr(Training, "evaluate", stop_and_go_on)
     _, whole = train(H2O_PLUS, cfg, real, tmp_path / "whole")
     monkeypatch.undo()
     _, parts = train(H2O_PLUS, cfg, real, tmp_path / "parts")

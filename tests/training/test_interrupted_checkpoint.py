@@ -118,18 +118,18 @@ def test_a_full_disk_refuses_a_recording_instead_of_ending_the_process(tmp_path)
 @pytest.mark.slow
 def test_a_run_on_a_full_disk_reaches_the_same_numbers_once_there_is_room(compose, tmp_path, monkeypatch):
     cfg, real = compose()
-    method, log = METHODS["h2o_plus"], Training.log
+    method, go_on = METHODS["h2o_plus"], Training.evaluate
     train(method, cfg, real, tmp_path / "whole")
     with small_disk(tmp_path / "disk", "16m") as disk:
         filler = None
 
-        def full_at_the_second_evaluation(self, epoch, **metrics):
+        def full_at_the_second_evaluation(self, evaluator, policy, epoch, **metrics):
             nonlocal filler
             if epoch == 1:
                 filler = fill(disk)
-            log(self, epoch, **metrics)
+            go_on(self, evaluator, policy, epoch, **metrics)
 
-        monkeypatch.setattr(Training, "log", full_at_the_second_evaluation)
+        monkeypatch.setattr(Training, "evaluate", full_at_the_second_evaluation)
         with pytest.raises(OSError, match="No space left"):
             train(method, cfg, real, disk / "run")
         monkeypatch.undo()

@@ -43,10 +43,8 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
     assert evaluate(make_simulator(cfg, 1), policy, 1).mean == max(promised)
     assert evaluate(make_simulator(cfg, 1), load_policy(cfg, tmp_path / "whole"), 1).mean == max(promised)
 
-    monkeypatch.setattr(
-        "torchrl_h2o.training.progress.Training.log",
-        interrupt_at(epoch=promised.index(max(promised)) + 1, log=Training.log),
-    )
+    interrupted = interrupt_at(epoch=promised.index(max(promised)) + 1, evaluate=Training.evaluate)
+    monkeypatch.setattr(Training, "evaluate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         train(H2O_PLUS, cfg, real, tmp_path / "parts")
     monkeypatch.undo()

@@ -131,6 +131,7 @@ class ExperimentOptions(Options):
 
     eval_every: Count
     eval_episodes: Count
+    overlap: bool = False
     keep: Literal["last", "best_in_simulator"]
     final_episodes: Count
     checkpoint_every: Count

@@ -134,6 +134,8 @@ class TrainOptions(AnyMethodOptions, RunOptions):
                     "as seeds=[0,1]"
                 )
             return
+        if self.overlap:
+            raise ValueError("overlap=true is for single runs: leave it out with a population")
         if self.method != "h2o_plus" or self.baselines:
             raise ValueError(
                 f"method={self.method} baselines=[{','.join(self.baselines)}]: a population trains h2o_plus alone; "

@@ -21,12 +21,13 @@ from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.environments import make_replay, preprocessing_of, task_of
+from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.precision import at_precision
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
-from torchrl_h2o.training.returns import BestPolicy, evaluate
+from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import keeps_best
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
@@ -61,15 +62,16 @@ class Trainee:
     def __init__(self, make_learner: MakeLearner, cfg: DictConfig, replay: HybridReplayBuffer) -> None:
         self.cfg = cfg
         task, self._preprocessing = task_of(cfg), preprocessing_of(cfg)
-        self._reality = task.make_reality(cfg.eval_episodes, self._preprocessing)
-        observation_dim = self._reality.observation_spec["observation"].shape[-1]
+        reality = task.make_reality(cfg.eval_episodes, self._preprocessing)
+        observation_dim = reality.observation_spec["observation"].shape[-1]
         with replay.device:
-            action_spec = self._reality.action_spec_unbatched.to(replay.device)
+            action_spec = reality.action_spec_unbatched.to(replay.device)
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
         self._actor = self.learner.actor if replay.device.type == "cpu" else deepcopy(self.learner.actor).cpu()
         self.components = self.learner.components
         self.make_pairs = partial(make_pairs, cfg, task, preprocessing=self._preprocessing, replay=replay)
         self._open = ExitStack()
+        self.evaluator = self._open.enter_context(closing(evaluator_of(cfg, task, self._preprocessing)))
         self._collector = self._best = None
         if self.learner.simulates:
             simulator = task.make_training_simulator(cfg.num_worlds, self._preprocessing)
@@ -114,26 +116,19 @@ class Trainee:
         self.learner.replay.extend(simulated)
 
     def look(self, rows: list[dict]) -> dict[str, float]:
-        """Evaluates the current policy; with ``keep=best_in_simulator`` also stores it if it is the best so far.
+        """Metrics of the current networks; with ``keep=best_in_simulator``, stores the policy if it is the best so far.
 
         Args:
             rows: metrics of the earlier evaluations.
 
         Returns:
-            Metrics of this evaluation by name.
+            Metrics by name, without those of an evaluation in ``reality``.
         """
-        actor = self.actor
-        in_reality = evaluate(self._reality, actor, self.cfg.eval_episodes)
-        return {
-            **({} if self._best is None else self._best.consider(actor, rows)),
-            "return_real": in_reality.mean,
-            "return_real_std": in_reality.std,
-            "length_real": in_reality.mean_length,
-            **self.learner.figures(*self.learner.batches),
-        }
+        best = {} if self._best is None else self._best.consider(self.actor, rows)
+        return {**best, **self.learner.figures(*self.learner.batches)}
 
     def close(self) -> None:
-        """Ends the collector's worker processes."""
+        """Ends the processes of the collector and of the evaluator."""
         self._open.close()
 
 
@@ -169,5 +164,6 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
             schedule.step()
             if evaluating:
                 figures = {name: loss.item() for name, loss in losses.items()}
-                training.log(epoch, **trainee.look(training.rows), **figures)
+                figures = {**trainee.look(training.rows), **figures}
+                training.evaluate(trainee.evaluator, trainee.actor, epoch, **figures)
     return trainee.policy, training

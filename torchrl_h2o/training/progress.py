@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from torchrl_h2o.training.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
 from torchrl_h2o.training.divergence import DivergenceError, are_finite, not_finite_losses
+from torchrl_h2o.training.evaluators import Evaluator
 from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
 from torchrl_h2o.whole_file import whole_file
 
@@ -77,6 +78,7 @@ class Training:
         self.checkpoint = make_checkpoint(**components)
         self._components = components
         self._update = 0  # of the current epoch
+        self._awaited: tuple[Evaluator, int, dict[str, float]] | None = None  # the row of a running evaluation
         directory.mkdir(parents=True, exist_ok=True)
         folder = checkpoint_folder(directory, name)
         self.rotation = CheckpointRotation(folder, keep_last=1)
@@ -95,20 +97,28 @@ class Training:
 
     @property
     def rows(self) -> list[dict]:
-        """The metrics so far, one row per evaluation."""
+        """The metrics so far, one row per evaluation; waits for a running one."""
+        self._log_awaited()
         return self.progress["rows"]
 
     def epochs(self) -> Iterator[tuple[int, bool]]:
-        """Yields each epoch's number and whether to evaluate at its end; then saves a checkpoint if one is due."""
-        done, size = self.progress["epoch"], self.budget.updates_per_epoch
+        """Yields each epoch's number and whether to evaluate at its end; then saves a checkpoint if one is due.
+
+        While an evaluation runs, checkpoints are put off: a resumed run has the rows of all earlier evaluations.
+        """
+        done, size, due = self.progress["epoch"], self.budget.updates_per_epoch, False
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * size, unit=" updates")
         for epoch in range(done, self.budget.epochs):
             start = time.perf_counter()
             last = epoch + 1 == self.budget.epochs
             yield epoch, last or (epoch + 1) % self.budget.eval_every == 0
             self.progress["epoch"] = epoch + 1
+            if self._awaited is not None and (last or self._awaited[0].is_done):
+                self._log_awaited()
             self.progress["seconds"] += time.perf_counter() - start
-            if last or (epoch + 1) % self.budget.checkpoint_every == 0:
+            due |= last or (epoch + 1) % self.budget.checkpoint_every == 0
+            if due and self._awaited is None:
+                due = False
                 with uninterrupted():
                     save_checkpoint(self.rotation, self.checkpoint, epoch + 1, {"progress": self.progress})
                 self._saved = epoch + 1
@@ -146,6 +156,7 @@ class Training:
             raise self._diverged("a parameter is not finite")
 
     def _diverged(self, why: str) -> DivergenceError:
+        self._log_awaited()
         self._bar.close()
         size, epoch = self.budget.updates_per_epoch, self.progress["epoch"]
         before = epoch * size + self._update
@@ -166,11 +177,29 @@ class Training:
         """Updates per second; the time of collection and evaluation does not count."""
         return self.progress["epoch"] * self.budget.updates_per_epoch / self.progress["update_seconds"]
 
-    def log(self, epoch: int, **metrics: float) -> None:
-        """Adds a row of metrics, writes metrics.csv, and shows the return in reality beside the progress bar."""
-        self.rows.append(self._row(epoch, metrics))
-        write_metrics(self.directory, self.name, self.rows)
-        self._bar.set_postfix(return_real=f"{metrics['return_real']:.0f}")
+    def evaluate(self, evaluator: Evaluator, policy: nn.Module, epoch: int, **metrics: float) -> None:
+        """Evaluates a policy and adds a row of metrics, as soon as the evaluator has the returns.
+
+        The row is written to metrics.csv, and the mean return is shown beside the progress bar.
+
+        Args:
+            evaluator: evaluates in ``reality``; if it does so in a second process, the training goes on meanwhile.
+            policy: the policy.
+            epoch: number of the epoch.
+            **metrics: further metrics of the row.
+        """
+        self._log_awaited()
+        evaluator.start(policy)
+        self._awaited = evaluator, epoch, metrics
+
+    def _log_awaited(self) -> None:
+        """Adds the row of a running evaluation, if there is one."""
+        if self._awaited is None:
+            return
+        (evaluator, epoch, metrics), self._awaited = self._awaited, None
+        self.progress["rows"].append(self._row(epoch, {**evaluator.result().metrics(), **metrics}))
+        write_metrics(self.directory, self.name, self.progress["rows"])
+        self._bar.set_postfix(return_real=f"{self.progress['rows'][-1]['return_real']:.0f}")
 
     def _row(self, epoch: int, metrics: dict[str, float]) -> dict:
         return {"method": self.name, "updates": (epoch + 1) * self.budget.updates_per_epoch, **metrics}

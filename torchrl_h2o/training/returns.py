@@ -43,6 +43,10 @@ class Evaluation:
     def mean_length(self) -> float:
         return sum(self.lengths) / len(self.lengths)
 
+    def metrics(self) -> dict[str, float]:
+        """Metrics of an evaluation in ``reality`` during a training, by column of metrics.csv."""
+        return {"return_real": self.mean, "return_real_std": self.std, "length_real": self.mean_length}
+
     def summary(self) -> dict:
         return {"mean": self.mean, "std": self.std, "episodes": len(self.returns), "mean_length": self.mean_length}
 

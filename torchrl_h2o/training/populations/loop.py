@@ -169,7 +169,9 @@ def train_population(
                 elif evaluating:
                     trainee.learner.batches = learner.batches_of(number)
                     losses = {key: term[number].item() for key, term in terms.items()}
-                    training.log_member(epoch, name, **trainee.look(training.rows_of(name)), **losses)
+                    trainee.evaluator.start(trainee.actor)
+                    figures = {**trainee.evaluator.result().metrics(), **trainee.look(training.rows_of(name)), **losses}
+                    training.log_member(epoch, name, **figures)
     return {name: _outcome(name, trainee, training) for name, trainee in trainees.items()}
 
 

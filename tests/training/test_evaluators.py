@@ -1,0 +1,118 @@
+"""Evaluation in a second process, beside the updates: the same returns, and no checkpoint without an earlier row."""
+
+import os
+import signal
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from tests.small_runs import rows, trained
+from torchrl_h2o.objectives import make_actor
+from torchrl_h2o.training.environments import preprocessing_of, task_of
+from torchrl_h2o.training.evaluators import evaluator_of
+from torchrl_h2o.training.loop import train
+from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.training.progress import Budget, Training
+from torchrl_h2o.training.returns import Evaluation
+
+
+@pytest.fixture
+def evaluators(compose):
+    """Evaluators of the same run in this process and in a second one, and a policy."""
+    chosen = []
+    for overlap in ("false", "true"):
+        cfg, _ = compose(f"overlap={overlap}")
+        chosen.append(evaluator_of(cfg, task_of(cfg), preprocessing_of(cfg)))
+    torch.manual_seed(0)
+    spec = task_of(cfg).make_reality().action_spec_unbatched
+    yield *chosen, make_actor(4, spec, [8, 8])
+    for evaluator in chosen:
+        evaluator.close()
+
+
+def test_a_second_process_evaluates_the_policy_as_it_was_at_the_start(evaluators):
+    here, beside, actor = evaluators
+    for _ in range(2):
+        here.start(actor)
+        beside.start(actor)
+        for parameter in actor.parameters():
+            parameter.data.mul_(1.5)
+        assert beside.result() == here.result()
+
+
+def refuse(observation):
+    raise ValueError(f"no action for {len(observation)} values")
+
+
+def test_an_error_in_the_second_process_is_raised_in_this_one(evaluators):
+    _, beside, actor = evaluators
+    beside.start(TensorDictModule(refuse, in_keys=["observation"], out_keys=["action"]))
+    with pytest.raises(ValueError, match="no action for"):
+        beside.result()
+    beside.start(actor)
+    assert len(beside.result().returns) == 1
+
+
+def test_a_second_process_that_is_gone_is_named_with_what_to_do(evaluators):
+    _, beside, actor = evaluators
+    beside.start(actor)
+    os.kill(beside._process.pid, signal.SIGKILL)
+    with pytest.raises(RuntimeError, match="overlap=false"):
+        beside.result()
+
+
+@dataclass
+class Waiting:
+    """An evaluator that has its result when a test says so, and gives the policy's weight as the return."""
+
+    is_done: bool = False
+    weights: list = field(default_factory=list)
+
+    def start(self, policy):
+        self.weights.append(policy.weight.item())
+
+    def result(self):
+        return Evaluation([self.weights[-1]], [1])
+
+
+def advance(folder, evaluator, done_before=None, stop_before=None):
+    """Trains a network whose weight is the number of the epoch, with an evaluation after each second epoch."""
+    actor = torch.nn.Linear(1, 1, bias=False)
+    training = Training("H2O+", folder, Budget(6, 1, eval_every=2), actor=actor)
+    saved = []
+    for epoch, evaluating in training.epochs():
+        saved.append(training._saved)
+        if epoch == stop_before:
+            break
+        evaluator.is_done = epoch == done_before
+        actor.weight.data.fill_(epoch + 1)
+        if evaluating:
+            training.evaluate(evaluator, actor, epoch)
+    return training.progress["rows"], saved
+
+
+def test_checkpoints_are_put_off_while_an_evaluation_runs(tmp_path):
+    found, saved = advance(tmp_path, Waiting())
+    assert [row["return_real"] for row in found] == [2.0, 4.0, 6.0]
+    assert saved == [0, 1, 1, 1, 1, 1]  # after epoch 4 the first row is there, but the second evaluation runs
+    _, saved = advance(tmp_path / "sooner", Waiting(), done_before=2)
+    assert saved == [0, 1, 1, 3, 3, 3]
+
+
+def test_a_run_stopped_beside_an_evaluation_repeats_it(tmp_path):
+    unbroken, _ = advance(tmp_path / "unbroken", Waiting())
+    advance(tmp_path / "broken", Waiting(), stop_before=3)
+    again, saved = advance(tmp_path / "broken", Waiting())
+    assert saved[0] == 1
+    assert again == unbroken
+
+
+@pytest.mark.slow
+def test_a_training_beside_evaluations_is_the_training_without(compose, tmp_path):
+    for overlap in ("false", "true"):
+        cfg, real = compose("updates=60", "eval_every=1", f"overlap={overlap}", "keep=best_in_simulator")
+        train(METHODS["h2o_plus"], cfg, real, tmp_path / overlap)
+    assert rows(tmp_path / "true") == rows(tmp_path / "false")
+    assert trained(tmp_path / "true") == trained(tmp_path / "false")

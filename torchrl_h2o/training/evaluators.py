@@ -1,0 +1,138 @@
+"""Evaluates policies during a training: in the training's process, or in a second one beside the next updates."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Protocol
+
+import torch
+from omegaconf import DictConfig
+from torchrl.envs import EnvBase
+
+from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.returns import Evaluation, evaluate
+from torchrl_h2o.training.task import Task
+
+ENDS_WITHIN = 1.0  # s, after which a second process that still evaluates is ended
+
+
+class Evaluator(Protocol):
+    """Evaluates one policy at a time."""
+
+    @property
+    def is_done(self) -> bool:
+        """Whether :meth:`result` returns without waiting."""
+        ...
+
+    def start(self, policy: torch.nn.Module) -> None:
+        """Begins to evaluate a policy with its present parameters."""
+        ...
+
+    def result(self) -> Evaluation:
+        """The evaluation of the last policy; waits for it."""
+        ...
+
+    def close(self) -> None:
+        """Ends the evaluator's process, if it has one."""
+        ...
+
+
+def evaluator_of(cfg: DictConfig, task: Task, preprocessing: Preprocessing) -> Evaluator:
+    """Builds the evaluator of a run, in ``reality``.
+
+    With ``overlap=true`` it evaluates in a second process. The returns are the same, because an evaluation has its own
+    random numbers.
+
+    Args:
+        cfg: the run's configuration.
+        task: its task.
+        preprocessing: preprocessing of the observations.
+    """
+    make_env = partial(task.make_reality, cfg.eval_episodes, preprocessing)
+    # cfg.get, because configurations of earlier versions have no such entry.
+    return (_SecondProcess if cfg.get("overlap", False) else _ThisProcess)(make_env, cfg.eval_episodes)
+
+
+class _ThisProcess:
+    def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
+        self._env, self._episodes = make_env(), episodes
+
+    is_done = True
+
+    def start(self, policy: torch.nn.Module) -> None:
+        self._result = evaluate(self._env, policy, self._episodes)
+
+    def result(self) -> Evaluation:
+        return self._result
+
+    def close(self) -> None:
+        pass
+
+
+class _SecondProcess:
+    """Sends policies through a pipe to a process that ends when the pipe is closed, also by a kill of this process."""
+
+    def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
+        context = multiprocessing.get_context("spawn")  # a forked process would share locks of torch's threads
+        self._pipe, theirs = context.Pipe()
+        arguments = (theirs, make_env, episodes, torch.get_num_threads())
+        self._process = context.Process(target=_evaluate_what_comes, args=arguments, daemon=True)
+        self._process.start()
+        theirs.close()
+
+    @property
+    def is_done(self) -> bool:
+        return self._pipe.poll()
+
+    def start(self, policy: torch.nn.Module) -> None:
+        with _other_end():
+            self._pipe.send_bytes(pickle.dumps(policy))
+
+    def result(self) -> Evaluation:
+        with _other_end():
+            outcome = self._pipe.recv()
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def close(self) -> None:
+        self._pipe.close()
+        self._process.join(ENDS_WITHIN)
+        self._process.terminate()
+
+
+@contextmanager
+def _other_end() -> Iterator[None]:
+    """Says what to do if the process at the other end of the pipe has ended."""
+    try:
+        yield
+    except (EOFError, OSError):
+        raise RuntimeError(
+            "the second process, which evaluates, has ended: resume the run, or start one with overlap=false"
+        ) from None
+
+
+def _evaluate_what_comes(pipe: Connection, make_env: Callable[[], EnvBase], episodes: int, threads: int) -> None:
+    """Evaluates the policies that come through a pipe, until it is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; this one ends with the other
+    torch.set_num_threads(threads)
+    env = make_env()
+    while True:
+        try:
+            policy = pickle.loads(pipe.recv_bytes())
+        except EOFError:
+            return
+        try:
+            outcome = evaluate(env, policy, episodes)
+        except Exception as error:  # raised in the training's process
+            outcome = error
+        try:
+            pipe.send(outcome)
+        except BrokenPipeError:
+            return
