@@ -1,4 +1,4 @@
-"""Draws the cost of an update: one column per factor, seconds above and memory below."""
+"""Draws the cost of an update, and the throughput of more worlds, members and workers."""
 
 from pathlib import Path
 
@@ -14,6 +14,11 @@ LABELS = {
     "batch": "rows of a stream in a batch",
     "width": "width of the hidden layers",
     "population": "runs in one process",
+}
+GROWTH = {
+    "worlds": ("simulated worlds in one process", "transitions per second"),
+    "population": ("runs in one process", "updates per second, all runs"),
+    "workers": ("Ray workers", "transitions per second"),
 }
 COLOURS = {"in memory": "#0b6e4f", "memory-mapped": "#c8553d"}
 
@@ -49,6 +54,32 @@ def draw_scaling(path: Path, costs: list[dict]) -> None:
     axes[1, 0].set(ylabel="MB", yscale="log")
     axes[0, 0].legend(frameon=False, fontsize=8)
     for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.3)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=150)
+    plt.close(figure)
+
+
+def draw_growth(path: Path, rates: list[dict], pays_until: dict[str, int]) -> None:
+    """Draw growth.png: the throughput over the size, with a line at the size from which more do not pay.
+
+    Args:
+        path: PNG file to write.
+        rates: entries ``growth`` of scaling.json: the factor, its size, and its rate per second.
+        pays_until: by factor, the last size that pays.
+    """
+    factors = [grows for grows in GROWTH if grows in pays_until]
+    figure, axes = plt.subplots(1, len(factors), figsize=(4 * len(factors), 3.2), squeeze=False, layout="constrained")
+    for axis, grows in zip(axes.flat, factors, strict=True):
+        sizes, per_second = zip(*((r["size"], r["per_second"]) for r in rates if r["grows"] == grows), strict=True)
+        what, unit = GROWTH[grows]
+        axis.plot(sizes, per_second, "o-", ms=4, color=COLOURS["in memory"])
+        axis.axvline(pays_until[grows], color=COLOURS["memory-mapped"], ls=":")
+        axis.set_title(f"more than {pays_until[grows]:,} do not pay", fontsize=10, color=COLOURS["memory-mapped"])
+        axis.set(xlabel=what, ylabel=unit, xscale="log", ylim=(0.0, 1.1 * max(per_second)))
+        axis.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        axis.minorticks_off()
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.3)
     with whole_file(path) as partial:

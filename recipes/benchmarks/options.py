@@ -68,6 +68,8 @@ class ScalingOptions(TimingOptions):
     batch_sizes: Counts
     widths: Counts
     populations: Counts
+    worlds: Counts
+    workers: Counts
     scratch: AnyPath | None
 
 

@@ -1,11 +1,13 @@
-"""Measures the cost of an update: seconds and memory against buffer, batch, width and population.
+"""Measures what grows: the cost of an update, and the throughput of more worlds, members and Ray workers.
 
-python recipes/benchmarks/scaling.py                       # three minutes; up to ten million transitions
+python recipes/benchmarks/scaling.py                       # about ten minutes; up to ten million transitions
 python recipes/benchmarks/scaling.py buffer_sizes=[100_000,100_000_000] scratch=/data
 python recipes/benchmarks/scaling.py device=cuda
 
-One factor varies at a time, and configurations take turns. Memory-mapped buffers are removed at the end; a buffer that
-does not fit is skipped with a message. Writes scaling.json and scaling.png to the run's folder.
+One factor varies at a time. Updates are measured against buffer, batch, width and population; these configurations take
+turns. Memory-mapped buffers are removed at the end; a buffer that does not fit is skipped with a message. Writes
+scaling.json, scaling.png (seconds and memory of an update) and growth.png (throughput, and the size from which more do
+not pay) to the run's folder.
 """
 
 import json
@@ -16,7 +18,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
-from cost_figure import draw_scaling
+from cost_figure import draw_growth, draw_scaling
+from growth import Rate, collection_rates, pays_until
 from hydra.core.hydra_config import HydraConfig
 from memory import held, room_in_memory, room_on_disk, taken_by
 from omegaconf import DictConfig, OmegaConf
@@ -131,6 +134,20 @@ def measure(cfg: DictConfig, run: DictConfig, scratch: str) -> list[Cost]:
     ]
 
 
+def member_rates(costs: list[Cost]) -> list[Rate]:
+    """Updates per second of all members of a population together."""
+    sizes = [cost for cost in costs if cost.grows == "population"]
+    return [Rate("population", cost.size, cost.size / cost.seconds_per_update) for cost in sizes]
+
+
+def print_growth(rates: list[Rate]) -> None:
+    print(f"\n{'what grows':<20}{'per second':>14}")
+    for rate in rates:
+        print(f"{f'{rate.grows} {rate.size:,}':<20}{rate.per_second:>14,.0f}")
+    for grows, size in pays_until(rates).items():
+        print(f"{grows}: more than {size:,} do not pay here")
+
+
 def print_table(costs: list[Cost]) -> None:
     print(f"\n{'what grows':<40}{'ms an update':>14}{'ms a sample':>14}{'MB':>10}")
     for cost in costs:
@@ -143,13 +160,17 @@ def main(cfg: DictConfig) -> None:
     run = recipe_on(cfg)
     with TemporaryDirectory(dir=cfg.scratch) as scratch:
         costs = measure(cfg, run, scratch)
+    rates = [*collection_rates(cfg), *member_rates(costs)]
     directory = Path(HydraConfig.get().runtime.output_dir)
-    result = {"costs": [asdict(cost) for cost in costs], "torch": torch.__version__}
+    result = {"costs": [asdict(cost) for cost in costs], "growth": [asdict(rate) for rate in rates]}
+    result |= {"pays_until": pays_until(rates), "torch": torch.__version__}
     result |= {"threads": cfg.threads, "device": cfg.device}
     write_text(directory / "scaling.json", json.dumps(result, indent=2) + "\n")
     draw_scaling(directory / "scaling.png", result["costs"])
+    draw_growth(directory / "growth.png", result["growth"], result["pays_until"])
     print_table(costs)
-    print(f"\nresults    {os.path.relpath(directory)}/scaling.json, scaling.png")
+    print_growth(rates)
+    print(f"\nresults    {os.path.relpath(directory)}/scaling.json, scaling.png, growth.png")
 
 
 if __name__ == "__main__":

@@ -72,7 +72,7 @@ def test_a_population_s_updates_are_set_beside_a_single_run_s(tmp_path):
 def test_costs_are_told_for_all_that_grows_and_mapped_buffers_leave_nothing(tmp_path):
     (tmp_path / "scratch").mkdir()
     small = ["transitions=1000", "buffer_sizes=[500,20000,1000000000000]", "batch_sizes=[8,16]", "widths=[8,512]"]
-    small.append("populations=[1,4]")
+    small += ["populations=[1,4]", "worlds=[1,16]", "workers=[1]"]
     out = run("scaling.py", tmp_path, "seconds=0.01", "turns=1", "threads=1", f"scratch={tmp_path / 'scratch'}", *small)
     costs = json.loads((tmp_path / "scaling.json").read_text())["costs"]
     buffers = [(cost["size"], cost["storage"]) for cost in costs if cost["grows"] == "buffer"]
@@ -88,5 +88,12 @@ def test_costs_are_told_for_all_that_grows_and_mapped_buffers_leave_nothing(tmp_
     assert stacked["memory"] > alone["memory"] + 10_000_000
     assert stacked["seconds_per_update"] > alone["seconds_per_update"]
     assert "ms a sample" in out
+    result = json.loads((tmp_path / "scaling.json").read_text())
+    rates = {(rate["grows"], rate["size"]): rate["per_second"] for rate in result["growth"]}
+    assert rates["worlds", 16] > 2.0 * rates["worlds", 1]
+    assert rates["population", 4] == pytest.approx(4 / stacked["seconds_per_update"])
+    assert result["pays_until"]["worlds"] == 16
+    assert "more than 16 do not pay here" in out
+    assert (tmp_path / "growth.png").stat().st_size > 10_000
     assert (tmp_path / "scaling.png").stat().st_size > 10_000
     assert not list((tmp_path / "scratch").iterdir())
