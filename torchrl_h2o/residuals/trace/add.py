@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -72,55 +72,47 @@ class Additions:
 def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> Additions:
     """Finds the sets of entries that lower the held-out loss by enough, and significantly.
 
-    Pairs are tried where no single entry passes the tests, and sets of three where no pair does: one of two effects may
-    increase the loss as long as the other one is missing. They are not tried where so little of the loss is left that
-    even a set that explains all of it would not contribute its share; a single entry may halve what is left instead.
-
     Args:
         state: effects found so far.
         leads: screened entries, in descending order of their promise.
         rng: generator of synthetic noise.
 
     Returns:
-        The additions of the smallest size of which one passes, or none.
+        The additions of the first group of :func:`_groups` of which one passes, or none.
     """
-    rules = state.settings.trace
-    among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
-    left = state.first.selection_loss(state.fit.effects)
-    for size, count in rules.set_sizes:
-        enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
-        if len(among) < size or len(state.entries) + size > rules.max_effects or not enough_left:
-            break
-        if size == 1:
-            found = _singles(state, leads, slice(count), rng)
-            state = found.state
-        else:
-            sets = promising_sets(state.problem, state.fit.effects, among, size, state.windows.screened, count)
-            found = tested(state, leads, _sketches(state, sets), rng)
+    for sets in _groups(state, leads):
+        sketches = _sketches(state, sets)
+        if len(sets[0]) == 1:
+            state = _remember(state, sketches)
+        found = tested(state, leads, sketches, rng)
         if found.near:
             return found
     return Additions(state, leads)
 
 
-def other_singles(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> Additions:
-    """Finds single entries that lower the loss among those that :func:`additions` passes over.
+def _groups(state: SearchState, leads: Sequence[Lead]) -> Iterator[list[tuple[Lead, ...]]]:
+    """Groups of sets to try one after the other: single entries, then pairs, then sets of three.
 
-    The promise of an entry says little where the effects found make up for it.
-
-    Args:
-        state: effects found so far.
-        leads: screened entries, in descending order of their promise.
-        rng: generator of synthetic noise.
+    The most promising single entries come first. Without sensor noise all others follow, because something is evidently
+    missing, and the promise of an entry says little where the effects found make up for it. One of two effects may
+    increase the loss as long as the other one is missing, hence the larger sets. They are not tried where so little of
+    the loss is left that even a set that explains all of it would not contribute its share; a single entry may halve
+    what is left instead.
     """
-    first = dict(state.settings.trace.set_sizes).get(1, 0)
-    return _singles(state, leads, slice(first, None), rng)
-
-
-def _singles(state: SearchState, leads: Sequence[Lead], which: slice, rng: np.random.Generator) -> Additions:
-    """Single entries that pass the tests, of some of the unlike leads; their sketches are recorded in the state."""
-    sets = [(lead,) for lead in unlike(leads, state.settings.trace.same_change)[which]]
-    sketches = _sketches(state, sets)
-    return tested(_remember(state, sketches), leads, sketches, rng)
+    rules, problem = state.settings.trace, state.problem
+    among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
+    left = state.first.selection_loss(state.fit.effects)
+    for size, count in rules.set_sizes:
+        enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
+        if len(among) < size or len(state.entries) + size > rules.max_effects or not enough_left:
+            return
+        if size > 1:
+            yield promising_sets(problem, state.fit.effects, among, size, state.windows.screened, count)
+            continue
+        singles = [(lead,) for lead in unlike(leads, rules.same_change)]
+        yield singles[:count]
+        if problem.sensor_std is None and singles[count:]:
+            yield singles[count:]
 
 
 def tested(

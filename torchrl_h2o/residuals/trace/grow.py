@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.add import Additions, additions, distinct, other_singles
+from torchrl_h2o.residuals.trace.add import Additions, additions, distinct
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_free import without_noise
@@ -78,10 +78,7 @@ class _Beam:
                 to_beat = min(self.first.state.screened_loss(one.fit.effects) for one in [*complete, *beam])
                 beam += self._put_in(pairs_by_prediction(self.first, self.seen, to_beat, self.rng))
             if not beam:
-                best = _simplest_of_best(complete)
-                beam = self._with_any_other(best)
-                if not beam:
-                    return best
+                return _simplest_of_best(complete)
             exact = [one for one in beam if one.exact]
             lists = [min(exact, key=_size)] if exact else _closest([*complete, *beam])
             self.progress.show_found(lists[0].entries)
@@ -92,24 +89,13 @@ class _Beam:
 
     def _with_one_more(self, state: SearchState) -> list[SearchState]:
         """The states with one set of effects more; empty if the list is complete."""
-        if not _can_grow(state):
+        if state.exact or len(state.entries) >= state.settings.trace.max_effects:
             return []
-        added = additions(state, self._screened(state), self.rng)
+        one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
+        leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
+        added = additions(state, leads, self.rng)
         self.first = self.first or added
         return self._put_in(added)
-
-    def _with_any_other(self, state: SearchState) -> list[SearchState]:
-        """The states with one effect more of those that were passed over.
-
-        Empty with sensor noise, where no residual says for certain that something is missing.
-        """
-        if not _can_grow(state) or state.problem.sensor_std is not None:
-            return []
-        return self._put_in(other_singles(state, self._screened(state), self.rng))
-
-    def _screened(self, state: SearchState) -> list[Lead]:
-        one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
-        return screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
 
     def _put_in(self, possible: Additions) -> list[SearchState]:
         """The states with the additions that come close to the best one, without what they make redundant.
@@ -128,10 +114,6 @@ class _Beam:
             if added.exact:
                 break
         return grown
-
-
-def _can_grow(state: SearchState) -> bool:
-    return not state.exact and len(state.entries) < state.settings.trace.max_effects
 
 
 def _names(state: SearchState) -> frozenset[str]:
