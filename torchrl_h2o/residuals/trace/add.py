@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -72,47 +72,32 @@ class Additions:
 def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> Additions:
     """Finds the sets of entries that lower the held-out loss by enough, and significantly.
 
+    Pairs are tried where no single entry passes the tests, and sets of three where no pair does: one of two effects may
+    increase the loss as long as the other one is missing. They are not tried where so little of the loss is left that
+    even a set that explains all of it would not contribute its share; a single entry may halve what is left instead.
+
     Args:
         state: effects found so far.
         leads: screened entries, in descending order of their promise.
         rng: generator of synthetic noise.
 
     Returns:
-        The additions of the first group of :func:`_groups` of which one passes, or none.
+        The additions of the smallest size of which one passes, or none.
     """
-    for sets in _groups(state, leads):
-        sketches = _sketches(state, sets)
-        if len(sets[0]) == 1:
-            state = _remember(state, sketches)
-        found = tested(state, leads, sketches, rng)
-        if found.near:
-            return found
-    return Additions(state, leads)
-
-
-def _groups(state: SearchState, leads: Sequence[Lead]) -> Iterator[list[tuple[Lead, ...]]]:
-    """Groups of sets to try one after the other: single entries, then pairs, then sets of three.
-
-    The most promising single entries come first. Without sensor noise all others follow, because something is evidently
-    missing, and the promise of an entry says little where the effects found make up for it. One of two effects may
-    increase the loss as long as the other one is missing, hence the larger sets. They are not tried where so little of
-    the loss is left that even a set that explains all of it would not contribute its share; a single entry may halve
-    what is left instead.
-    """
-    rules, problem = state.settings.trace, state.problem
+    rules = state.settings.trace
     among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
     left = state.first.selection_loss(state.fit.effects)
     for size, count in rules.set_sizes:
         enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
         if len(among) < size or len(state.entries) + size > rules.max_effects or not enough_left:
-            return
-        if size > 1:
-            yield promising_sets(problem, state.fit.effects, among, size, state.windows.screened, count)
-            continue
-        singles = [(lead,) for lead in unlike(leads, rules.same_change)]
-        yield singles[:count]
-        if problem.sensor_std is None and singles[count:]:
-            yield singles[count:]
+            break
+        sketches = _sketches(state, leads, among, size, count)
+        if size == 1:
+            state = _remember(state, sketches)
+        found = tested(state, leads, sketches, rng)
+        if found.near:
+            return found
+    return Additions(state, leads)
 
 
 def tested(
@@ -168,11 +153,15 @@ def _exceeds_noise(state: SearchState, addition: Addition, before: float, rng: n
     return gain > state.settings.trace.beyond_noise * by_noise
 
 
-def _sketches(state: SearchState, sets: Sequence[tuple[Lead, ...]]) -> list[Sketch]:
-    """Quick fits of the effects found together with each of the sets."""
+def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], size: int, count: int) -> list[Sketch]:
+    """Quick fits of the most promising sets of one size."""
+    effects = state.fit.effects
+    sets = [(lead,) for lead in unlike(leads, state.settings.trace.same_change)[:count]]
+    if size > 1:
+        sets = promising_sets(state.problem, effects, among, size, state.windows.screened, count)
     sketches = []
     for chosen in sets:
-        sketch = sketched_set(state, [*state.fit.effects, *(lead.effect for lead in chosen)], chosen)
+        sketch = sketched_set(state, [*effects, *(lead.effect for lead in chosen)], chosen)
         if sketch is not None:
             sketches.append((chosen, sketch))
     return sketches

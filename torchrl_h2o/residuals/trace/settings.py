@@ -104,8 +104,7 @@ class TraceSettings:
     leads_combined: int = 60
     """Number of most promising leads from which sets are formed."""
     set_sizes: tuple[tuple[int, int], ...] = ((1, 16), (2, 4), (3, 4))
-    """Pairs (size of a set, number of sets of this size that are sketched); larger sets if no smaller one helps.
-    Without sensor noise, the other single entries are sketched too before pairs are."""
+    """Pairs (size of a set, number of sets of this size that are sketched); larger sets if no smaller one helps."""
     finalists: int = 3
     """Number of sketched sets of one size that are fitted on all windows of the search, at least."""
     close_sketch: float = 0.4
