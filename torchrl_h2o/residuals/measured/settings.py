@@ -24,9 +24,9 @@ class MeasuredSettings:
     """Largest share of transitions at which the simulator may diverge in one step, for example at falls."""
     settling_steps: int = 64
     """Control steps after which the observed coordinates determine the unobserved ones."""
-    settled_rows: int = 100
+    settled_rows: int = 50
     """Largest number of successive rows that share a simulation of the unobserved coordinates."""
-    windows_in_block: int = 50
+    windows_in_block: int = 25
     """Neighbouring windows that are kept together where there are unobserved coordinates, to share a simulation."""
     action_memory: int = 12
     """First control steps of a run in which earlier actions count as unknown."""

@@ -93,8 +93,6 @@ class TraceSettings:
     """Smallest number of windows on which entries are screened."""
     fitted_steps: int = 1200
     """Control steps, over all windows, in a fit during the search."""
-    fitted_steps_unobserved: int = 600
-    """The same number where coordinates are unobserved; their simulation takes two thirds of a fit's time."""
     min_fitted: int = 120
     """Smallest number of windows in a fit during the search."""
     noise_free_loss: float = 0.5

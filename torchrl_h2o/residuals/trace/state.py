@@ -40,9 +40,8 @@ class SearchWindows:
         """Chooses the windows of a problem; the screened ones are drawn at random."""
         rules, horizon = settings.trace, problem.horizon
         every = problem.measured.fitted(horizon)
-        block, hidden = problem.measured.block, problem.simulation.state_map.hidden
-        steps = rules.fitted_steps_unobserved if hidden else rules.fitted_steps
-        fitted = thinned(every, max(rules.min_fitted, steps // horizon), block)
+        block = problem.measured.block
+        fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon), block)
         few = min(max(rules.min_screened, rules.screened_steps // horizon), len(fitted))
         blocks = [fitted[first : first + block] for first in range(0, len(fitted), block)]
         chosen = rng.choice(len(blocks), min(-(-few // block), len(blocks)), replace=False)
