@@ -105,6 +105,7 @@ class _SecondProcess:
         self._pipe.close()
         self._process.join(ENDS_WITHIN)
         self._process.terminate()
+        self._process.join()
 
 
 @contextmanager
