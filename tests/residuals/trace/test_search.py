@@ -151,7 +151,9 @@ def test_what_was_as_good_once_makes_way_for_what_is_better_now():
     leads = screen(state.problem, known, [DAMPING, FRICTION], state.windows.screened)
     damped = state.refitted([GRAVITY, DAMPING], [*known, JointDamping(0.01)])
     state = replace(state.with_found([GRAVITY, DAMPING], damped), rivals={DAMPING.name: leads})
-    simplified, group = simplify_one(state, 1)
+    tried = []
+    simplified, group = simplify_one(state, 1, lambda: tried.append(1))
+    assert len(tried) == 2  # friction in the place of damping, then damping in the place of friction
     assert names(simplified.entries) == [GRAVITY.name, FRICTION.name]
     assert simplified.fit.effects[1].torque == pytest.approx(0.03, rel=0.01)
     assert group == ()

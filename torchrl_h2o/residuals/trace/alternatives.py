@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,9 @@ from torchrl_h2o.residuals.trace.screening import Lead, are_possible_alone, free
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
-def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
+def alternatives(
+    state: SearchState, index: int, advance: Callable[[], object] = lambda: None
+) -> tuple[SearchState, tuple[Attempt, ...]]:
     """Finds entries that explain the held-out data equally well in the place of one of the effects found.
 
     An alternative with fewer parameters that is significantly worse gets a second test, with residuals scaled by their
@@ -26,6 +29,7 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     Args:
         state: effects found.
         index: position of the effect.
+        advance: called after each entry that was tried in the effect's place.
 
     Returns:
         The state with residuals scaled by their size without the effect, and the alternatives, in ascending order of
@@ -39,7 +43,11 @@ def alternatives(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     explained = state.selection_losses(kept).mean() - with_it.mean()
     if explained <= 0.0:
         return state, ()  # an effect without a gain has no meaningful alternatives
-    attempts = [_attempt(state, index, rival, with_it) for rival in _sketched_rivals(state, index)]
+    attempts = []
+    for lead, sketch in _sketched_rivals(state, index):
+        if sketch is not None:
+            attempts.append(_attempt(state, index, lead, sketch, with_it))
+        advance()
     as_good = [attempt for attempt in attempts if _is_equivalent(state, attempt, with_it.mean(), explained)]
     return state, tuple(sorted(as_good, key=lambda attempt: attempt.loss))
 
@@ -74,35 +82,33 @@ def _repeats(state: SearchState, index: int, entry: CatalogueEntry) -> bool:
     )
 
 
-def _sketched_rivals(state: SearchState, index: int) -> list[tuple[Lead, Fit]]:
-    """Rivals that reach a minimum share of the effect's gain in a quick fit of all parameters, with this fit.
+def _sketched_rivals(state: SearchState, index: int) -> Iterator[tuple[Lead, Fit | None]]:
+    """Rivals with a quick fit of all parameters; None in its place if it misses a minimum share of the effect's gain.
 
     A rival that is far from this share after the first evaluations is given up.
     """
     rules, effects = state.settings.trace, state.fit.effects
     kept = [effect for i, effect in enumerate(effects) if i != index]
     few_with_it, few_without = map(state.screened_loss, (effects, kept))
-    gain, near = few_without - few_with_it, []
+    gain = few_without - few_with_it
     for lead in _rivals(state, index):
         instead = [*kept[:index], lead.effect, *kept[index:]]
         if not is_possible(state.problem, instead):
+            yield lead, None
             continue
         free = [free_parameters(entry) for entry in _entries_with(state, index, lead)]
         sketch = state.sketched(instead, free, rules.sketch_evaluations)
         if few_without - sketch.loss >= rules.rival_min_first * gain:
             sketch = state.sketched(sketch.effects, free, rules.rival_evaluations)
-        if few_without - sketch.loss >= state.rival_min_sketch * gain:
-            near.append((lead, sketch))
-    return near
+        yield lead, sketch if few_without - sketch.loss >= state.rival_min_sketch * gain else None
 
 
 def _entries_with(state: SearchState, index: int, lead: Lead) -> list:
     return [lead.entry if i == index else entry for i, entry in enumerate(state.entries)]
 
 
-def _attempt(state: SearchState, index: int, rival: tuple[Lead, Fit], with_it: np.ndarray) -> Attempt:
+def _attempt(state: SearchState, index: int, lead: Lead, sketch: Fit, with_it: np.ndarray) -> Attempt:
     """A rival fitted in the effect's place, with the p-value of being worse than the effect."""
-    lead, sketch = rival
     candidate = state.refitted(_entries_with(state, index, lead), sketch.effects)
     after = state.selection_losses(candidate.effects)
     p = state.p_value(after, with_it)

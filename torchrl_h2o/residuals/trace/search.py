@@ -24,7 +24,7 @@ from torchrl_h2o.residuals.trace.simplify import simplify
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SET_FITTED = 0.04  # share by which the fit of another set of effects brings the bar closer to the end of its stage
-EFFECT_SIMPLIFIED = 0.25  # share by which one effect brings the bar closer to the end of its stage
+ENTRY_TRIED = 0.015  # share by which an entry tried in an effect's place brings the bar closer to the end of its stage
 
 
 def trace_effects(
@@ -64,7 +64,7 @@ def trace_effects(
         if not state.entries:
             break
         progress.stage(OTHERS)
-        grown, simpler = state, simplify(state, lambda: progress.closer(EFFECT_SIMPLIFIED))
+        grown, simpler = state, simplify(state, lambda: progress.closer(ENTRY_TRIED))
         state = eliminate(simpler)
         progress.show_found(state.entries)
         if state is not simpler:

@@ -18,17 +18,18 @@ def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -
 
     Args:
         state: effects found.
-        advance: called after each effect.
+        advance: called after each entry that was tried in an effect's place.
     """
     state = replace(state, groups=())
     for index in range(len(state.entries)):
-        state, group = simplify_one(state, index)
+        state, group = simplify_one(state, index, advance)
         state = replace(state, groups=(*state.groups, group))
-        advance()
     return state
 
 
-def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
+def simplify_one(
+    state: SearchState, index: int, advance: Callable[[], object] = lambda: None
+) -> tuple[SearchState, tuple[Attempt, ...]]:
     """Replaces one effect by the equivalent one with the fewest parameters, and among these by the most usual one.
 
     What is usual on real machines decides where the data cannot: rotor inertia before a body with three times its
@@ -37,11 +38,12 @@ def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     Args:
         state: effects found so far.
         index: position of the effect.
+        advance: called after each entry that was tried in its place.
 
     Returns:
         The state, with residuals scaled by their size without the effect, and the other equivalent effects.
     """
-    state, as_good = _with_better_alternative(state, index)
+    state, as_good = _with_better_alternative(state, index, advance)
     own_loss = float(state.selection_losses(state.fit.effects).mean())
     group = [Attempt(state.entries[index], state.fit, index, own_loss, 1.0), *as_good]
     # the first of equals: the effect itself, so that a delay of the sensors and one of the motors do not take turns
@@ -50,7 +52,9 @@ def simplify_one(state: SearchState, index: int) -> tuple[SearchState, tuple[Att
     return _replaced(state, index, simplest), rest
 
 
-def _with_better_alternative(state: SearchState, index: int) -> tuple[SearchState, tuple[Attempt, ...]]:
+def _with_better_alternative(
+    state: SearchState, index: int, advance: Callable[[], object]
+) -> tuple[SearchState, tuple[Attempt, ...]]:
     """Takes significantly better alternatives until there is none; returns the alternatives of the last effect.
 
     An effect may have been chosen before other effects were found, and may no longer be the best in its place.
@@ -58,7 +62,7 @@ def _with_better_alternative(state: SearchState, index: int) -> tuple[SearchStat
     seen = set()
     while True:
         seen.add(state.entries[index].name)
-        state, as_good = alternatives(state, index)
+        state, as_good = alternatives(state, index, advance)
         state, as_good, better = _compared_closely(state, index, as_good)
         if not better or better[0].entry.name in seen:
             return state, as_good
