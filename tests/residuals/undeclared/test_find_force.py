@@ -16,7 +16,10 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize(("name", "noise"), [*((name, 0.01) for name in LAWS), ("torque ripple", 0.0)])
+NOISES = [*((name, 0.01) for name in LAWS), ("torque ripple", 0.0), ("a force that starts late", 0.0)]
+
+
+@pytest.mark.parametrize(("name", "noise"), NOISES)
 def test_force_that_no_catalogue_holds_is_found(name, noise):
     size, law = LAWS[name]
     simulation, truth = pendulum(), UnknownForce(size, law)

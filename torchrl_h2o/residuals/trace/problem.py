@@ -77,7 +77,7 @@ class Problem:
         problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std, settings)
         found = problem._missed((), fitted)
         rounding = problem._rounding(fitted, found)
-        size = np.maximum(np.nanmedian(np.abs(found), axis=(0, 1)), rounding)
+        size = _typical_size(np.abs(found), rounding, settings)
         if sensor_std is None:
             return replace(problem, scale=one * size)
         estimated = replace(problem, states=estimate_states(simulation, measured))
@@ -121,7 +121,7 @@ class Problem:
         """Whether the residual is within the rounding of single-precision data, or of the unobserved coordinates."""
         measured, fitted = self.measured, self.measured.fitted(self.horizon)
         left = self._missed((), fitted)
-        rounding = 3.0 * self._rounding(fitted, left)
+        rounding = self.settings.beyond_rounding * self._rounding(fitted, left)
         if self.simulation.state_map.hidden:
             change = (measured.following - measured.observation)[fitted].std(0)
             rounding = np.maximum(rounding, self.settings.rounding_unobserved * change)
@@ -170,6 +170,20 @@ class Problem:
         rounded_by = rounding * rng.uniform(-1.0, 1.0, observation.shape) * observation
         made = np.nanmean(np.abs(self._moved(rounded_by, starts, still)), axis=(0, 1))
         return made + rounding * np.abs(observation).max(0) + 1e-12
+
+
+def _typical_size(found: np.ndarray, rounding: np.ndarray, settings: ResidualSettings) -> np.ndarray:
+    """Median of absolute residuals (W, H, n) in each dimension, (n), or what rounding makes of them, if that is more.
+
+    If the median is rounding because the cause is at work in a smaller part of the data, such as a force that begins
+    late, the median of this part is the typical size.
+    """
+    typical = np.nanmedian(found, axis=(0, 1))
+    at_work = found > settings.beyond_rounding * rounding
+    partly = (typical <= rounding) & (at_work.mean((0, 1)) > settings.least_at_work)
+    for dimension in np.flatnonzero(partly):
+        typical[dimension] = np.median(found[..., dimension][at_work[..., dimension]])
+    return np.maximum(typical, rounding)
 
 
 def _sensors(simulation: Simulation) -> list[Effect]:
