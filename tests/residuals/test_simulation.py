@@ -1,5 +1,6 @@
 """Simulation: rollouts of many states equal MuJoCo's steps of each; effects; divergence is marked."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import mujoco
@@ -64,7 +65,7 @@ def test_a_small_rollout_uses_no_threads_and_gives_the_same_states(effects, monk
     simulation = pendulum().with_effects(*effects)
     states, actions, time = drawn()
     alone = simulation.rollout(states, actions, time=time)
-    monkeypatch.setattr(physics, "_ALONE", None)
+    monkeypatch.setattr(physics, "ALONE", None)
     with pytest.raises(AttributeError):
         simulation.rollout(states, actions, time=time)
     monkeypatch.setattr(physics, "_FEW", 0)
@@ -100,6 +101,31 @@ def test_what_diverges_is_nan_from_there_on_and_spoils_no_other(effects):
 def test_divergence_writes_no_warning(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     pendulum().rollout(np.full((1, 2), 1e12), np.zeros((1, 3, 1)))
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_threads_step_the_same_model_at_once():
+    """The finite differences of a fit run in threads, also with effects that leave the model as it is."""
+    simulation = pendulum()
+    simulations = [simulation.with_effects(replace(PULL, size=0.01 * i)) for i in range(60)]
+    states, actions, time = drawn(batch=500)
+
+    def reached(one):
+        return one.rollout(states, actions, time=time)
+
+    one_by_one = list(map(reached, simulations))
+    with ThreadPoolExecutor(4) as threads:
+        np.testing.assert_array_equal(list(threads.map(reached, simulations)), one_by_one)
+
+
+def test_divergence_in_threads_writes_no_warning_and_leaves_the_handler(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = mujoco.get_mju_user_warning()
+    with ThreadPoolExecutor(4) as threads:
+        far = np.full((100, 2), 1e12)
+        list(threads.map(lambda _: pendulum().rollout(far, np.zeros((100, 3, 1))), range(40)))
+    assert mujoco.get_mju_user_warning() is before
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
 

@@ -12,7 +12,7 @@ from torchrl_h2o.effects.effect import BatchedForce
 
 FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
-_ALONE = Rollout(nthread=0)
+ALONE = Rollout(nthread=0)  # steps in the calling thread
 _FEW = 128  # physics steps of one rollout below which threads cost more time than they save
 _CTRL_AND_FORCE = int(mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
@@ -47,7 +47,7 @@ def roll_out(
         The states after each control step, (B, H, size).
     """
     if len(states) * (1 if forces else actions.shape[1] * physics_steps) <= _FEW:
-        pool, data = _ALONE, data[:1]
+        pool, data = ALONE, data[:1]
     one_each = list(models) if isinstance(models, Sequence) else [models] * len(states)
 
     def reached_by(states: np.ndarray, control: np.ndarray, spec: int) -> np.ndarray:

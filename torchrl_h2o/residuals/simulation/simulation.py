@@ -5,8 +5,8 @@ All steps run through ``mujoco.rollout``. One control step is ``frame_skip`` phy
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import cpu_count
@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
 from torchrl_h2o.effects.effect import BatchedForce
-from torchrl_h2o.envs.physics import FULL_PHYSICS, roll_out
+from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
 from torchrl_h2o.residuals.simulation.from_env import source_of_env
 from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
 from torchrl_h2o.residuals.simulation.observability import hidden_coordinates
@@ -138,8 +138,17 @@ class Simulation:
         return {"entries": self.state_map.names, "actuators": self.actuators, **joint_names(self.model)}
 
     @cached_property
-    def _data(self) -> list[mujoco.MjData]:
-        return [mujoco.MjData(self.model) for _ in range(max(1, self._pool.nthread))]
+    def _scratch(self) -> threading.local:
+        """Scratch space of each thread that steps this model."""
+        return threading.local()
+
+    @property
+    def _workers(self) -> tuple[Rollout, list[mujoco.MjData]]:
+        """Threads and scratch space for a rollout. Other threads than the main one step on their own."""
+        pool = self._pool if threading.current_thread() is threading.main_thread() else ALONE
+        if not hasattr(self._scratch, "data"):
+            self._scratch.data = [mujoco.MjData(self.model) for _ in range(max(1, pool.nthread))]
+        return pool, self._scratch.data
 
     def catalogue(self) -> tuple[CatalogueEntry, ...]:
         """Returns candidate effects that the simulator may lack, sized by the model with the present effects."""
@@ -152,7 +161,7 @@ class Simulation:
         more = replace(self, effects=(*self.effects, *effects))
         if not any(isinstance(effect, ModelEffect) for effect in effects):
             # the model is unchanged, so it is not compiled again, for example for each trial value of a delay
-            more.__dict__.update(model=self.model, _data=self._data)
+            more.__dict__.update(model=self.model, _scratch=self._scratch)
         return more
 
     def executed(self, actions: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -200,7 +209,7 @@ class Simulation:
         forces = self.pipeline.batched_forces(self.model)
         chunk = max(1, self.settings.rollout_numbers // (horizon * self.frame_skip * full.shape[-1]))
         parts = []
-        with _no_warnings():
+        with _no_warnings:
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
                 own = None if applied is None else applied[rows]
                 parts.append(self._stepped(full[rows], actions[rows], forces, own))
@@ -225,7 +234,7 @@ class Simulation:
         forces = self.pipeline.batched_forces(self.model)
         reached = np.empty((*states.shape[:2], len(hidden)))
         carried = states[0][:, hidden]
-        with _no_warnings():
+        with _no_warnings:
             for step, now in enumerate(full):
                 now[:, places] = carried
                 carried = self._stepped(now, actions[step][:, None], forces)[:, 0, hidden]
@@ -249,9 +258,8 @@ class Simulation:
         applied: np.ndarray | None = None,
     ) -> np.ndarray:
         """States (B, H, nq + nv) after each control step from full physics states (B, size); NaN where it diverges."""
-        reached = roll_out(
-            self._pool, self.model, self._data, full, actions, self.frame_skip, forces=forces, applied=applied
-        )
+        pool, data = self._workers
+        reached = roll_out(pool, self.model, data, full, actions, self.frame_skip, forces=forces, applied=applied)
         # MuJoCo resets a simulation and its clock if the state is not finite or too large
         control_step = self.control_step
         expected = full[:, :1] + control_step * np.arange(1, actions.shape[1] + 1)
@@ -262,12 +270,27 @@ class Simulation:
         return states
 
 
-@contextmanager
-def _no_warnings() -> Iterator[None]:
-    """Suppresses MuJoCo's divergence warnings on the console and in its log file; the result is NaN instead."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
+class _NoWarnings:
+    """Suppresses MuJoCo's divergence warnings on the console and in its log file; the result is NaN instead.
+
+    The handler of warnings is global, so it is restored when the last of the threads that suppress them leaves.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = threading.Lock(), 0, None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._before = mujoco.get_mju_user_warning()
+                mujoco.set_mju_user_warning(lambda message: None)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                mujoco.set_mju_user_warning(self._before)
+
+
+_no_warnings = _NoWarnings()

@@ -7,7 +7,9 @@ import io
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from os import cpu_count
 from typing import Any
 
 import numpy as np
@@ -116,7 +118,7 @@ def _optimised(
     unknown = sysid.ParameterDict(
         {str(i): sysid.Parameter(str(i), settings.origin, *variable.bounds) for i, variable in enumerate(variables)}
     )
-    with _quiet():
+    with _quiet(), ThreadPoolExecutor(cpu_count()) as threads:  # finite differences use all processors
         best, result = sysid.optimize(
             unknown,
             residual,
@@ -127,6 +129,7 @@ def _optimised(
             diff_step=settings.difference_step,
             ftol=settings.loss_tolerance,
             xtol=settings.variable_tolerance,
+            workers=threads.map,
         )
     return best.as_vector(), result
 
