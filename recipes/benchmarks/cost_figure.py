@@ -67,16 +67,17 @@ def draw_growth(path: Path, rates: list[dict], pays_until: dict[str, int]) -> No
     Args:
         path: PNG file to write.
         rates: entries ``growth`` of scaling.json: the factor, its size, and its rate per second.
-        pays_until: by factor, the last size that pays.
+        pays_until: by factor, the last size that pays; without those whose largest size still pays.
     """
-    factors = [grows for grows in GROWTH if grows in pays_until]
+    factors = [grows for grows in GROWTH if any(rate["grows"] == grows for rate in rates)]
     figure, axes = plt.subplots(1, len(factors), figsize=(4 * len(factors), 3.2), squeeze=False, layout="constrained")
     for axis, grows in zip(axes.flat, factors, strict=True):
         sizes, per_second = zip(*((r["size"], r["per_second"]) for r in rates if r["grows"] == grows), strict=True)
         what, unit = GROWTH[grows]
         axis.plot(sizes, per_second, "o-", ms=4, color=COLOURS["in memory"])
-        axis.axvline(pays_until[grows], color=COLOURS["memory-mapped"], ls=":")
-        axis.set_title(f"more than {pays_until[grows]:,} do not pay", fontsize=10, color=COLOURS["memory-mapped"])
+        if grows in pays_until:
+            axis.axvline(pays_until[grows], color=COLOURS["memory-mapped"], ls=":")
+            axis.set_title(f"more than {pays_until[grows]:,} do not pay", fontsize=10, color=COLOURS["memory-mapped"])
         axis.set(xlabel=what, ylabel=unit, xscale="log", ylim=(0.0, 1.1 * max(per_second)))
         axis.set_xticks(sizes, [f"{size:,}" for size in sizes])
         axis.minorticks_off()

@@ -52,12 +52,16 @@ def collection_rates(cfg: DictConfig) -> list[Rate]:
 
 
 def _with_ray(workers: int) -> list[str]:
-    shares = ["collector.resources.num_cpus=0", "collector.init.address=local"]  # more workers than processors too
+    # without a share of the processors, because Ray refuses more workers than processors
+    shares = ["collector.resources.num_cpus=0", "collector.init.address=local"]
     return ["collector=ray", f"collector.workers={workers}", f"steps_per_epoch={STEPS * workers}", *shares]
 
 
 def _collected_per_second(overrides: Sequence[str], seconds: float, turns: int) -> float:
-    """Transitions per second of a run's collector, the best of several turns; epochs begin with new weights."""
+    """Transitions per second of a run's collector, the best of several turns.
+
+    New weights are sent before each batch, as in training.
+    """
     run = hydra.compose("any_method", [*TASK, *overrides])
     simulator = make_simulator(run, run.num_worlds)
     spec = simulator.observation_spec["observation"]
@@ -76,7 +80,10 @@ def _collected_per_second(overrides: Sequence[str], seconds: float, turns: int) 
 
 
 def pays_until(rates: Iterable[Rate]) -> dict[str, int]:
-    """For each factor, the last size before the first one that does not raise the rate by a tenth."""
+    """For each factor, the last size before the first one that does not raise the rate by a tenth.
+
+    A factor whose largest size still pays is left out.
+    """
     last: dict[str, Rate] = {}
     ended = set()
     for rate in sorted(rates, key=lambda rate: rate.size):
@@ -85,4 +92,4 @@ def pays_until(rates: Iterable[Rate]) -> dict[str, int]:
             ended.add(rate.grows)
         if rate.grows not in ended:
             last[rate.grows] = rate
-    return {grows: rate.size for grows, rate in last.items()}
+    return {grows: last[grows].size for grows in ended}

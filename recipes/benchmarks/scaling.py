@@ -1,4 +1,4 @@
-"""Measures what grows: the cost of an update, and the throughput of more worlds, members and Ray workers.
+"""Measures how the cost of an update and the throughput grow with their sizes.
 
 python recipes/benchmarks/scaling.py                       # about ten minutes; up to ten million transitions
 python recipes/benchmarks/scaling.py buffer_sizes=[100_000,100_000_000] scratch=/data
@@ -135,7 +135,7 @@ def measure(cfg: DictConfig, run: DictConfig, scratch: str) -> list[Cost]:
 
 
 def member_rates(costs: list[Cost]) -> list[Rate]:
-    """Updates per second of all members of a population together."""
+    """Updates per second of all runs of a population together."""
     sizes = [cost for cost in costs if cost.grows == "population"]
     return [Rate("population", cost.size, cost.size / cost.seconds_per_update) for cost in sizes]
 
@@ -144,8 +144,11 @@ def print_growth(rates: list[Rate]) -> None:
     print(f"\n{'what grows':<20}{'per second':>14}")
     for rate in rates:
         print(f"{f'{rate.grows} {rate.size:,}':<20}{rate.per_second:>14,.0f}")
-    for grows, size in pays_until(rates).items():
-        print(f"{grows}: more than {size:,} do not pay here")
+    ends = pays_until(rates)
+    for grows in dict.fromkeys(rate.grows for rate in rates):
+        largest = max(rate.size for rate in rates if rate.grows == grows)
+        end = f"more than {ends[grows]:,} do not pay here" if grows in ends else f"{largest:,}, the most measured, pay"
+        print(f"{grows}: {end}")
 
 
 def print_table(costs: list[Cost]) -> None:

@@ -1,8 +1,10 @@
 """Simulation speed: in tracing, and of the library compared with ``mujoco.rollout`` on the same states."""
 
 import dataclasses
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from os import cpu_count
 
@@ -17,10 +19,29 @@ BATCH, HORIZON = 4096, 20
 
 @dataclass
 class Count:
-    """Number of simulated control steps and the seconds they took."""
+    """Number of simulated control steps, and the seconds in which at least one thread simulated."""
 
     steps: int = 0
     seconds: float = 0.0
+    _inside: int = 0  # threads that simulate now
+    _since: float = 0.0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @contextmanager
+    def simulating(self, steps: int) -> Iterator[None]:
+        """Count a number of steps that one thread simulates."""
+        with self._lock:
+            if not self._inside:
+                self._since = time.perf_counter()
+            self._inside += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                self.steps += steps
+                if not self._inside:
+                    self.seconds += time.perf_counter() - self._since
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +64,8 @@ class CountingSimulation(Simulation):
     def _counted(
         self, simulate: Callable[..., np.ndarray], states: np.ndarray, actions: np.ndarray, *args: np.ndarray, **options
     ) -> np.ndarray:
-        start = time.perf_counter()
-        reached = simulate(states, actions, *args, **options)
-        self.count.steps += actions.shape[0] * actions.shape[1]
-        self.count.seconds += time.perf_counter() - start
-        return reached
+        with self.count.simulating(actions.shape[0] * actions.shape[1]):
+            return simulate(states, actions, *args, **options)
 
 
 def steps_per_second(simulation: Simulation, seed: int = 0) -> dict[str, float]:

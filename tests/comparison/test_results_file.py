@@ -64,3 +64,12 @@ def test_results_name_no_folder_of_the_machine(compose, override, shown):
     cfg.overrides = ["method=iql", override]
     assert shlex.split(repeating_command(cfg))[-1] == shown
     assert "/home" not in identity(cfg)["others"]
+
+
+def test_what_does_not_change_results_does_not_make_another_run(compose):
+    cfg, _ = compose("method=iql", config="train")
+    found = []
+    for overrides in ([], ["threads=1"], ["overlap=true"], ["compiled=false"], ["eval_every=2"]):
+        cfg.overrides = ["method=iql", *overrides]
+        found.append(identity(cfg)["others"])
+    assert found == ["", "", "", "", "eval_every=2"]

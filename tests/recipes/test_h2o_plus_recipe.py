@@ -71,14 +71,16 @@ def test_a_population_of_another_method_is_refused(command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interruption", [signal.SIGKILL, signal.SIGINT])
-def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption):
+@pytest.mark.parametrize(
+    ("interruption", "options"), [(signal.SIGKILL, []), (signal.SIGINT, []), (signal.SIGKILL, ["overlap=true"])]
+)
+def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption, options):
     small = [*SMALL, *ROBOT, "updates=300"]  # long enough that the signal comes before the end
     run(command(*small, "hydra.run.dir=unbroken"))
 
     broken = tmp_path / "broken"
     rotation = CheckpointRotation(broken / "checkpoints" / "h2o+", keep_last=1)
-    process = subprocess.Popen(**command(*small, "hydra.run.dir=broken"), text=True)
+    process = subprocess.Popen(**command(*small, *options, "hydra.run.dir=broken"), text=True)
     while rotation.latest() is None:
         assert process.poll() is None, process.communicate()[0]
     process.send_signal(interruption)
@@ -88,7 +90,7 @@ def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, i
     if interruption == signal.SIGINT:
         assert "resume=broken" in printed
 
-    run(command("resume=broken"))
+    run(command("resume=broken", *(["overlap=false"] if options else [])))
     assert trained(broken) == trained(tmp_path / "unbroken")
     assert rows(broken) == rows(tmp_path / "unbroken")
 

@@ -1,6 +1,6 @@
 """Evaluation in a second process, beside the updates: the same returns, and no checkpoint without an earlier row."""
 
-import os
+import multiprocessing
 import signal
 from dataclasses import dataclass, field
 
@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 
 from tests.small_runs import rows, trained
 from torchrl_h2o.objectives import make_actor
+from torchrl_h2o.training.checkpoint import load_checkpoint
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.loop import train
@@ -58,9 +59,35 @@ def test_an_error_in_the_second_process_is_raised_in_this_one(evaluators):
 def test_a_second_process_that_is_gone_is_named_with_what_to_do(evaluators):
     _, beside, actor = evaluators
     beside.start(actor)
-    os.kill(beside._process.pid, signal.SIGKILL)
+    (process,) = multiprocessing.active_children()
+    process.kill()
     with pytest.raises(RuntimeError, match="overlap=false"):
         beside.result()
+
+
+def refuse_with_a_lambda(observation):
+    error = ValueError("no action")
+    error.why = lambda: "what cannot be pickled"
+    raise error
+
+
+def test_an_error_that_cannot_be_sent_arrives_with_its_text_and_its_traceback(evaluators):
+    _, beside, _ = evaluators
+    beside.start(TensorDictModule(refuse_with_a_lambda, in_keys=["observation"], out_keys=["action"]))
+    with pytest.raises(RuntimeError, match="ValueError: no action") as caught:
+        beside.result()
+    assert "in refuse_with_a_lambda" in caught.value.__notes__[0]
+
+
+def test_a_second_process_whose_result_nobody_reads_ends_without_an_error(evaluators, capfd):
+    _, beside, actor = evaluators
+    (process,) = multiprocessing.active_children()
+    beside.start(actor)
+    while not beside.is_done:
+        process.join(0.01)
+    beside.close()
+    assert process.exitcode in (0, -signal.SIGTERM)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @dataclass
@@ -78,12 +105,13 @@ class Waiting:
 
 
 def advance(folder, evaluator, done_before=None, stop_before=None):
-    """Trains a network whose weight is the number of the epoch, with an evaluation after each second epoch."""
+    """Trains a network whose weight is the number of the epoch, with an evaluation after each third epoch."""
     actor = torch.nn.Linear(1, 1, bias=False)
-    training = Training("H2O+", folder, Budget(6, 1, eval_every=2), actor=actor)
+    training = Training("H2O+", folder, Budget(6, 1, eval_every=3), actor=actor)
     saved = []
     for epoch, evaluating in training.epochs():
-        saved.append(training._saved)
+        latest = training.rotation.latest()
+        saved.append(0 if latest is None else load_checkpoint(latest, training.checkpoint)["progress"]["epoch"])
         if epoch == stop_before:
             break
         evaluator.is_done = epoch == done_before
@@ -93,19 +121,19 @@ def advance(folder, evaluator, done_before=None, stop_before=None):
     return training.progress["rows"], saved
 
 
-def test_checkpoints_are_put_off_while_an_evaluation_runs(tmp_path):
+def test_checkpoints_are_put_off_while_an_evaluation_runs_but_not_beyond_the_next_one(tmp_path):
     found, saved = advance(tmp_path, Waiting())
-    assert [row["return_real"] for row in found] == [2.0, 4.0, 6.0]
-    assert saved == [0, 1, 1, 1, 1, 1]  # after epoch 4 the first row is there, but the second evaluation runs
-    _, saved = advance(tmp_path / "sooner", Waiting(), done_before=2)
-    assert saved == [0, 1, 1, 3, 3, 3]
+    assert [row["return_real"] for row in found] == [3.0, 6.0]
+    assert saved == [0, 1, 2, 2, 2, 5]
+    _, saved = advance(tmp_path / "sooner", Waiting(), done_before=3)
+    assert saved == [0, 1, 2, 2, 4, 5]
 
 
 def test_a_run_stopped_beside_an_evaluation_repeats_it(tmp_path):
     unbroken, _ = advance(tmp_path / "unbroken", Waiting())
     advance(tmp_path / "broken", Waiting(), stop_before=3)
     again, saved = advance(tmp_path / "broken", Waiting())
-    assert saved[0] == 1
+    assert saved[0] == 2
     assert again == unbroken
 
 

@@ -53,7 +53,10 @@ RESULT = (
 #: columns of the results for quantities that the task observes, and their names in summary.json
 OBSERVED = {"mean_v": ("v", "mean"), "max_abs_x": ("x", "max_abs")}
 #: overrides not listed in the column ``others``: they have columns of their own, or affect results by rounding only
-TOLD = {*IDENTITY, "gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled"}
+TOLD = {
+    *IDENTITY,
+    *("gap_strength", "final_episodes", "results", "folder", "resume", "render", "threads", "compiled", "overlap"),
+}
 #: overrides of paper.py that choose runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "sizes", "log", "seeds", "retries"}
 EVALUATED = {"mean": "return_real", "std": "return_real_std"}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import pickle
 import signal
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -19,7 +20,7 @@ from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
 
-ENDS_WITHIN = 1.0  # s, after which a second process that still evaluates is ended
+ENDS_WITHIN = 3.0  # s, after which a second process that still evaluates is ended
 
 
 class Evaluator(Protocol):
@@ -115,7 +116,7 @@ def _other_end() -> Iterator[None]:
         yield
     except (EOFError, OSError):
         raise RuntimeError(
-            "the second process, which evaluates, has ended: resume the run, or start one with overlap=false"
+            "the second process, which evaluates, has ended: resume the run with overlap=false, which changes no result"
         ) from None
 
 
@@ -127,13 +128,23 @@ def _evaluate_what_comes(pipe: Connection, make_env: Callable[[], EnvBase], epis
     while True:
         try:
             policy = pickle.loads(pipe.recv_bytes())
-        except EOFError:
+        except (EOFError, OSError):  # OSError: the other end was closed before it had read the last result
             return
         try:
             outcome = evaluate(env, policy, episodes)
         except Exception as error:  # raised in the training's process
-            outcome = error
+            outcome = _sendable(error)
         try:
             pipe.send(outcome)
-        except BrokenPipeError:
+        except OSError:
             return
+
+
+def _sendable(error: Exception) -> Exception:
+    """The error, or its text if it cannot be pickled, with the traceback as a note."""
+    try:
+        pickle.dumps(error)
+    except Exception:
+        error = RuntimeError(f"{type(error).__name__}: {error}").with_traceback(error.__traceback__)
+    error.add_note("".join(traceback.format_tb(error.__traceback__)))
+    return error

@@ -62,7 +62,7 @@ class Trainee:
     def __init__(self, make_learner: MakeLearner, cfg: DictConfig, replay: HybridReplayBuffer) -> None:
         self.cfg = cfg
         task, self._preprocessing = task_of(cfg), preprocessing_of(cfg)
-        reality = task.make_reality(cfg.eval_episodes, self._preprocessing)
+        reality = task.make_reality(preprocessing=self._preprocessing)
         observation_dim = reality.observation_spec["observation"].shape[-1]
         with replay.device:
             action_spec = reality.action_spec_unbatched.to(replay.device)

@@ -104,25 +104,31 @@ class Training:
     def epochs(self) -> Iterator[tuple[int, bool]]:
         """Yields each epoch's number and whether to evaluate at its end; then saves a checkpoint if one is due.
 
-        While an evaluation runs, checkpoints are put off: a resumed run has the rows of all earlier evaluations.
+        A resumed run has the rows of all earlier evaluations. So while an evaluation runs, checkpoints are put off, at
+        most until the epoch before the next evaluation.
         """
         done, size, due = self.progress["epoch"], self.budget.updates_per_epoch, False
         self._bar = tqdm(desc=self.name, total=self.updates, initial=done * size, unit=" updates")
         for epoch in range(done, self.budget.epochs):
             start = time.perf_counter()
             last = epoch + 1 == self.budget.epochs
-            yield epoch, last or (epoch + 1) % self.budget.eval_every == 0
+            yield epoch, self._evaluates(epoch)
             self.progress["epoch"] = epoch + 1
-            if self._awaited is not None and (last or self._awaited[0].is_done):
+            due |= last or (epoch + 1) % self.budget.checkpoint_every == 0
+            latest = last or (due and self._evaluates(epoch + 1))
+            if self._awaited is not None and (latest or self._awaited[0].is_done):
                 self._log_awaited()
             self.progress["seconds"] += time.perf_counter() - start
-            due |= last or (epoch + 1) % self.budget.checkpoint_every == 0
             if due and self._awaited is None:
                 due = False
                 with uninterrupted():
                     save_checkpoint(self.rotation, self.checkpoint, epoch + 1, {"progress": self.progress})
                 self._saved = epoch + 1
         self._bar.close()
+
+    def _evaluates(self, epoch: int) -> bool:
+        """Whether the policy is evaluated at the end of an epoch."""
+        return epoch + 1 == self.budget.epochs or (epoch + 1) % self.budget.eval_every == 0
 
     def epoch_updates(self) -> Iterator[int]:
         """Yields the number of each update of an epoch, advances the progress bar and measures the time.

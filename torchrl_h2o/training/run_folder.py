@@ -29,7 +29,8 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
 
     Args:
         cfg: configuration from the command line. A resumed run uses the configuration in its folder instead, in which
-            it allows the names that ``trust`` lists, see :mod:`torchrl_h2o.training.targets`.
+            it allows the names that ``trust`` lists, see :mod:`torchrl_h2o.training.targets`. ``overlap`` may change,
+            because results do not depend on it.
         go_on: whether to continue a run that exists in the folder, as with ``resume``.
 
     Returns:
@@ -43,14 +44,16 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
     if not OmegaConf.is_missing(cfg, "resume"):
-        allowed = ("resume=", "trust=", "results=")
+        allowed = ("resume=", "trust=", "results=", "overlap=")
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith(allowed)]
         if others:
             raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
         if not any(directory.iterdir()):
             directory.rmdir()  # Hydra has made it; a mistyped name shall not leave a folder
-        results = cfg.get("results")
+        results, overlap = cfg.get("results"), cfg.get("overlap")
         cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
+        if any(o.startswith("overlap=") for o in HydraConfig.get().overrides.task):
+            cfg.overlap = overlap
         check_options(cfg, TrainOptions, saved=True)
         _name_results(cfg, results)
     elif (directory / "config.yaml").exists():

@@ -1,21 +1,17 @@
-"""Growing lists of effects: which of several lists is kept, and when a list is fitted once more."""
-
-from dataclasses import replace
+"""Growing lists of effects: which of several lists is kept."""
 
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointFrictionLoss
-from torchrl_h2o.residuals.settings import DEFAULTS
-from torchrl_h2o.residuals.trace.grow import _is_sharper, _simplest_of_best
+from torchrl_h2o.residuals.trace.grow import _simplest_of_best
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
 FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
-MUCH_FINER = DEFAULTS.trace.much_finer
 
 
 def lists(friction):
@@ -43,18 +39,3 @@ def test_a_further_effect_must_contribute_its_share_however_significant_it_is(or
     losses = [both.selection_losses(state.fit.effects) for state in (gravity, both)]
     assert both.p_value(*losses) < both.settings.significance.level
     assert found(_simplest_of_best([gravity, both][::order])) == found(gravity)
-
-
-def test_a_list_is_fitted_again_where_its_residuals_are_much_finer_than_those_of_the_fit():
-    gravity, both = lists(friction=0.2)
-    finer = both.posed_at(both.fit.effects)
-    assert _is_sharper(finer, gravity.problem, MUCH_FINER)
-    assert not _is_sharper(gravity.problem, gravity.problem, MUCH_FINER)
-    assert not _is_sharper(gravity.problem, finer, MUCH_FINER)
-
-
-def test_a_list_is_fitted_again_where_what_looked_like_sensor_noise_was_its_error():
-    gravity, _ = lists(friction=0.2)
-    noisy = replace(gravity.problem, sensor_std=np.full(2, 0.01))
-    assert _is_sharper(gravity.problem, noisy, MUCH_FINER)
-    assert not _is_sharper(noisy, noisy, MUCH_FINER)

@@ -24,7 +24,7 @@ from torchrl_h2o.residuals import Split, trace_effects
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, STAGES, LoopBar
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import screen
-from torchrl_h2o.residuals.trace.simplify import simplify_one
+from torchrl_h2o.residuals.trace.simplify import simplify, simplify_one
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()
@@ -150,13 +150,16 @@ def test_what_was_as_good_once_makes_way_for_what_is_better_now():
     known = (Gravity(1.3),)
     leads = screen(state.problem, known, [DAMPING, FRICTION], state.windows.screened)
     damped = state.refitted([GRAVITY, DAMPING], [*known, JointDamping(0.01)])
-    state = replace(state.with_found([GRAVITY, DAMPING], damped), rivals={DAMPING.name: leads})
+    state = replace(state.with_found([GRAVITY, DAMPING], damped), rivals={GRAVITY.name: [], DAMPING.name: leads})
     tried = []
     simplified, group = simplify_one(state, 1, lambda: tried.append(1))
-    assert len(tried) == 2  # friction in the place of damping, then damping in the place of friction
+    assert len(tried) == 1  # friction; then only rounding is left
+    assert simplified.exact
     assert names(simplified.entries) == [GRAVITY.name, FRICTION.name]
     assert simplified.fit.effects[1].torque == pytest.approx(0.03, rel=0.01)
     assert group == ()
+    assert simplify(state).groups == ()  # those of gravity depend on friction
+    assert simplify(simplified).groups == ((), ())
     assert names(state.entries) == [GRAVITY.name, DAMPING.name]
 
 

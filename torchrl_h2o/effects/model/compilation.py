@@ -1,5 +1,6 @@
 """Compiles a MuJoCo specification with the edits of model effects."""
 
+import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -33,10 +34,13 @@ def compile_model(spec: mujoco.MjSpec, effects: Iterable[Effect] = ()) -> mujoco
         return spec.compile()
 
 
+_FILTERS = threading.Lock()  # the filters of warnings belong to all threads
+
+
 @contextmanager
 def accepting_total_mass() -> Iterator[None]:
-    """Suppresses the warning about ``settotalmass``, which Gymnasium's HalfCheetah file uses."""
-    with warnings.catch_warnings():
+    """Suppresses the warning about ``settotalmass``, which Gymnasium's HalfCheetah file uses; one thread at a time."""
+    with _FILTERS, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "compiler attribute 'settotalmass' is deprecated")  # not the user's file
         yield
 

@@ -119,13 +119,19 @@ def _attempt(state: SearchState, index: int, lead: Lead, sketch: Fit, with_it: n
 
 
 def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explained: float) -> bool:
-    """Whether an attempt misses a negligible share of the effect's gain, or a small and insignificant one."""
+    """Whether an attempt misses a negligible share of the effect's gain, or a small and insignificant one.
+
+    If the effect leaves only rounding, so must the attempt: differences between roundings may be significant.
+    """
     problem = state.problem
     if is_outside(attempt.effect, problem.simulation.model) or not are_possible_alone(problem, attempt.fit.effects):
         return False
     rules, worse = state.settings.trace, (attempt.loss - with_it) / explained
-    significant = attempt.p_value <= state.settings.significance.level
-    return bool(worse < rules.same_loss or (worse < rules.alike_loss and not significant))
+    if worse < rules.same_loss or worse >= rules.alike_loss:
+        return bool(worse < rules.same_loss)
+    if state.exact:
+        return state.posed_at(attempt.fit.effects).within_rounding
+    return attempt.p_value > state.settings.significance.level
 
 
 def _p_value_of_loss_gap(state: SearchState, worse: Fit, better: Fit) -> float:

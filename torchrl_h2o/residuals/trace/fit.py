@@ -91,7 +91,9 @@ def fit(
         return [scaled], None, None
 
     evaluations = settings.max_evaluations if max_evaluations is None else max_evaluations
-    best, result = _optimised(residual, variables, evaluations, settings)
+    # rollouts that follow unobserved coordinates step by step are too small for MuJoCo's own threads
+    in_threads = bool(problem.simulation.state_map.hidden)
+    best, result = _optimised(residual, variables, evaluations, settings, in_threads=in_threads)
     fitted = _with_values(effects, variables, best)
     widths = [{} for _ in effects]
     for variable, position, half in zip(variables, best, _half_widths(problem, result), strict=True):
@@ -113,12 +115,14 @@ def _optimised(
     variables: Sequence[_Variable],
     max_evaluations: int,
     settings: FitSettings,
+    *,
+    in_threads: bool,
 ) -> tuple[np.ndarray, Any]:
-    """Scaled variables at the least robust loss, and scipy's result."""
+    """Scaled variables at the least robust loss, and scipy's result; finite differences run in threads if wanted."""
     unknown = sysid.ParameterDict(
         {str(i): sysid.Parameter(str(i), settings.origin, *variable.bounds) for i, variable in enumerate(variables)}
     )
-    with _quiet(), ThreadPoolExecutor(cpu_count()) as threads:  # finite differences use all processors
+    with _quiet(), ThreadPoolExecutor(cpu_count()) as threads:  # starts threads when they are used
         best, result = sysid.optimize(
             unknown,
             residual,
@@ -129,7 +133,7 @@ def _optimised(
             diff_step=settings.difference_step,
             ftol=settings.loss_tolerance,
             xtol=settings.variable_tolerance,
-            workers=threads.map,
+            workers=threads.map if in_threads else None,
         )
     return best.as_vector(), result
 

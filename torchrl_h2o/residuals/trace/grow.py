@@ -17,11 +17,10 @@ from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import Additions, additions, distinct
 from torchrl_h2o.residuals.trace.eliminate import eliminate
-from torchrl_h2o.residuals.trace.fit import Fit
-from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
-from torchrl_h2o.residuals.trace.problem import Problem, matters
+from torchrl_h2o.residuals.trace.problem import matters
+from torchrl_h2o.residuals.trace.rescale import rescale
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -45,7 +44,7 @@ def grow(
         progress: bar that moves with every screened entry and names the effects found.
         found: called with the best list of effects after each round of additions.
     """
-    return _Beam(rng, progress, found).grow(_rescale(state))
+    return _Beam(rng, progress, found).grow(rescale(state))
 
 
 @dataclass(eq=False)
@@ -106,7 +105,7 @@ class _Beam:
         for addition in possible.near:
             added = state.with_found(addition.entries, addition.fit)
             added = _remember_leads(added, possible.leads, added.entries[len(state.entries) :])
-            added = _rescale(reorder(eliminate(added)))
+            added = rescale(reorder(eliminate(added)))
             self.progress.closer(ADDITION)
             if _names(added) not in self.seen:
                 self.seen.add(_names(added))
@@ -174,47 +173,3 @@ def _remember_leads(state: SearchState, leads: Sequence[Lead], added: Sequence) 
     narrowed = {lead.entry.name: replace(lead.entry, trials=(dict(lead.trial),)) for lead in leads}
     catalogue = tuple(narrowed.get(entry.name, entry) for entry in state.catalogue)
     return replace(state, rivals=rivals, catalogue=catalogue)
-
-
-def _rescale(state: SearchState) -> SearchState:
-    """Scales residuals by their present size.
-
-    Refits once if the better simulator gives other observed start states, or a sharper measure of what is left: a fit
-    ends where its loss hardly changes, which may be far from the rounding of the data.
-    """
-    posed = state.posed_at(state.fit.effects)
-    rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
-    within_rounding = posed.within_rounding
-    moved = not np.array_equal(observed(state.problem.states), observed(posed.states))
-    sharper = _is_sharper(posed, state.problem, state.settings.trace.much_finer)
-    if state.entries and not within_rounding and (moved or sharper):
-        kept = eliminate(rescaled.with_found(state.entries, _refitted(rescaled, again=sharper)))
-        posed = kept.posed_at(kept.fit.effects)
-        rescaled, within_rounding = kept.rescaled(posed), posed.within_rounding
-    return without_noise(replace(rescaled, exact=within_rounding))
-
-
-def _refitted(state: SearchState, *, again: bool) -> Fit:
-    """Refits the effects found.
-
-    Contacts make the residual jump, and jumps within the small differences can hide where the loss falls.
-
-    Args:
-        state: effects found.
-        again: whether a first fit that gains little without sensor noise is repeated with larger differences.
-    """
-    start, settings = state.fit.effects, state.settings
-    fitted = state.refitted(state.entries, start)
-    gained = state.screened_loss(fitted.effects) < settings.trace.much_lower * state.screened_loss(start)
-    if gained or not again or state.problem.sensor_std is not None:
-        return fitted
-    coarse = replace(settings.fit, difference_step=settings.fit.coarse_step)
-    return min(fitted, state.refitted(state.entries, start, settings=coarse), key=lambda one: one.loss)
-
-
-def _is_sharper(posed: Problem, before: Problem, much_finer: float) -> bool:
-    """Whether the sensors turn out to have no noise, or the residuals' scale falls much in the median dimension."""
-    if posed.sensor_std is None and before.sensor_std is not None:
-        return True
-    new, old = (np.median(one.scale, axis=(0, 1)) for one in (posed, before))
-    return bool(np.median(new / old) < much_finer)

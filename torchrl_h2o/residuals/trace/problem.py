@@ -145,30 +145,30 @@ class Problem:
         worst = self.settings.worst
         return np.nan_to_num(np.clip(residual, -worst, worst), nan=worst)
 
-    def _moved(self, observation: np.ndarray, starts: np.ndarray, still: np.ndarray) -> np.ndarray:
-        """Change, (W, H, n), of the residuals ``still`` when ``observation``, (T, n), is added to the start states."""
+    def _moved(self, observation: np.ndarray, starts: np.ndarray, unmoved: np.ndarray) -> np.ndarray:
+        """Change, (W, H, n), of the residuals when ``observation``, (T, n), is added to the start states."""
         moved = replace(self, states=self.states + observation @ self.simulation.state_map.restore_observed.T)
-        return moved._missed((), starts) - still
+        return moved._missed((), starts) - unmoved
 
     def _made_by_noise(self) -> np.ndarray:
         """Mean square of the residual that sensor noise causes in each window, (T, H, n)."""
         measured, rng = self.measured, np.random.default_rng(0)
         sensor_std = cast("np.ndarray", self.sensor_std)  # called only with noisy sensors
         starts = np.concatenate([measured.fitted(self.horizon), measured.selected_on(self.horizon)])
-        still = self._missed((), starts)
+        unmoved = self._missed((), starts)
         squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
         for _ in range(self.settings.noise_draws):
             noise = sensor_std * rng.standard_normal(measured.observation.shape)
-            moved = np.nan_to_num(self._moved(noise, starts, still) ** 2, nan=self.settings.worst**2)
+            moved = np.nan_to_num(self._moved(noise, starts, unmoved) ** 2, nan=self.settings.worst**2)
             squares[starts] += moved / self.settings.noise_draws
         return squares + sensor_std**2
 
-    def _rounding(self, starts: np.ndarray, still: np.ndarray) -> np.ndarray:
-        """Mean change, (n), of the residuals ``still`` by single-precision rounding of the start states."""
+    def _rounding(self, starts: np.ndarray, unmoved: np.ndarray) -> np.ndarray:
+        """Mean change, (n), of the residuals ``unmoved`` by single-precision rounding of the start states."""
         observation, rng = self.measured.observation, np.random.default_rng(0)
         rounding = self.settings.rounding
         rounded_by = rounding * rng.uniform(-1.0, 1.0, observation.shape) * observation
-        made = np.nanmean(np.abs(self._moved(rounded_by, starts, still)), axis=(0, 1))
+        made = np.nanmean(np.abs(self._moved(rounded_by, starts, unmoved)), axis=(0, 1))
         return made + rounding * np.abs(observation).max(0) + 1e-12
 
 
@@ -180,7 +180,7 @@ def _typical_size(found: np.ndarray, rounding: np.ndarray, settings: ResidualSet
     """
     typical = np.nanmedian(found, axis=(0, 1))
     at_work = found > settings.beyond_rounding * rounding
-    partly = (typical <= rounding) & (at_work.mean((0, 1)) > settings.least_at_work)
+    partly = (typical <= settings.beyond_rounding * rounding) & (at_work.mean((0, 1)) > settings.least_at_work)
     for dimension in np.flatnonzero(partly):
         typical[dimension] = np.median(found[..., dimension][at_work[..., dimension]])
     return np.maximum(typical, rounding)

@@ -67,8 +67,8 @@ def trace_effects(
         grown, simpler = state, simplify(state, lambda: progress.closer(ENTRY_TRIED))
         state = eliminate(simpler)
         progress.show_found(state.entries)
-        if state is not simpler:
-            continue  # an effect was replaced by one that is not needed
+        if state is not simpler or (state.exact and not grown.exact):
+            continue  # an effect was replaced by one that is not needed, or after which only rounding is left
         if state.exact:
             break
         state = divide_by_element(_rescaled(state), rng)

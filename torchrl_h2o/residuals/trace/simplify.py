@@ -9,6 +9,7 @@ from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
 from torchrl_h2o.residuals.trace.close_comparison import refined, worse_of
 from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.rescale import rescale
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -16,15 +17,19 @@ from torchrl_h2o.residuals.trace.state import SearchState
 def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -> SearchState:
     """Simplifies the effects found one by one; the state's groups then hold the alternatives of each.
 
+    The most unusual effect comes first, because it is the most likely one to stand in for another. Ends without groups
+    as soon as a better effect leaves only rounding: all alternatives depend on it.
+
     Args:
         state: effects found.
         advance: called after each entry that was tried in an effect's place.
     """
-    state = replace(state, groups=())
-    for index in range(len(state.entries)):
-        state, group = simplify_one(state, index, advance)
-        state = replace(state, groups=(*state.groups, group))
-    return state
+    state, exact, groups = replace(state, groups=()), state.exact, {}
+    for index in sorted(range(len(state.entries)), key=lambda i: -surprise(state.fit.effects[i])):
+        state, groups[index] = simplify_one(state, index, advance)
+        if state.exact and not exact:
+            return replace(state, groups=())
+    return replace(state, groups=tuple(groups[index] for index in range(len(state.entries))))
 
 
 def simplify_one(
@@ -41,9 +46,13 @@ def simplify_one(
         advance: called after each entry that was tried in its place.
 
     Returns:
-        The state, with residuals scaled by their size without the effect, and the other equivalent effects.
+        The state, with residuals scaled by their size without the effect, and the other equivalent effects. If a better
+        effect leaves only rounding, the state with this effect, and no others.
     """
+    exact = state.exact
     state, as_good = _with_better_alternative(state, index, advance)
+    if state.exact and not exact:
+        return state, ()
     own_loss = float(state.selection_losses(state.fit.effects).mean())
     group = [Attempt(state.entries[index], state.fit, index, own_loss, 1.0), *as_good]
     # the first of equals: the effect itself, so that a delay of the sensors and one of the motors do not take turns
@@ -67,15 +76,22 @@ def _with_better_alternative(
         if not better or better[0].entry.name in seen:
             return state, as_good
         state = _replaced(state, index, better[0])
+        if state.problem.sensor_std is None and (rescaled := rescale(state)).exact:
+            return rescaled, ()
 
 
 def _compared_closely(
     state: SearchState, index: int, as_good: Sequence[Attempt]
 ) -> tuple[SearchState, tuple[Attempt, ...], list[Attempt]]:
-    """The state and the alternatives, refined; those that are not worse than the effect, and those that are better."""
+    """The state and the alternatives, refined; those that are not worse than the effect, and those that are better.
+
+    Where the effects leave only rounding, no alternative is better.
+    """
+    if state.exact:
+        return state, tuple(as_good), []
     level = state.settings.significance.level
     better = [a for a in as_good if p_value_between(state, state.problem, state.fit, a.fit) < level]
-    if better or not as_good or state.exact:
+    if better or not as_good:
         return state, tuple(as_good), better
     state = state.with_found(state.entries, refined(state, state.entries, state.fit))
     near = [replace(a, fit=refined(state, _replaced(state, index, a).entries, a.fit)) for a in as_good]

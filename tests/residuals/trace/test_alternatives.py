@@ -1,0 +1,35 @@
+"""Alternatives to an effect: which of them count as equally good."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import ActionDelay, CatalogueEntry, ObservationDelay
+from torchrl_h2o.residuals.trace.alternatives import _is_equivalent
+from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.state import SearchState
+
+LATE = CatalogueEntry(ActionDelay(), ({"delay": 0.01},))
+SENSORS = CatalogueEntry(ObservationDelay(), ({"delay": 0.01},))
+
+
+@pytest.fixture(scope="module")
+def state():
+    """A search that has found late motors, and nothing is left but rounding."""
+    simulation = pendulum()
+    measured = recorded(simulation.with_effects(ActionDelay(0.013)), 400)
+    begun = SearchState.begin(Problem.pose(simulation, measured), [LATE, SENSORS], np.random.default_rng(0))
+    fitted = begun.refitted([LATE], [ActionDelay(0.013)])
+    return replace(begun.with_found([LATE], fitted), exact=True)
+
+
+@pytest.mark.parametrize(("delay", "equivalent"), [(0.013, True), (0.0131, False)])
+def test_where_only_rounding_is_left_an_alternative_that_leaves_rounding_is_as_good(state, delay, equivalent):
+    """A single row in which a wheel lands may make the difference of two roundings significant."""
+    fitted = replace(state.fit, effects=(ObservationDelay(delay),))
+    significantly_worse = Attempt(SENSORS, fitted, 0, loss=1e-3, p_value=0.0)
+    assert _is_equivalent(state, significantly_worse, 0.0, 1.0) is equivalent
+    assert not _is_equivalent(replace(state, exact=False), significantly_worse, 0.0, 1.0)

@@ -1,0 +1,57 @@
+"""Scales the residuals by what the effects found leave, and fits these effects once more where that is much less."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from torchrl_h2o.residuals.trace.eliminate import eliminate
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.noise_free import without_noise
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+def rescale(state: SearchState) -> SearchState:
+    """Scales residuals by their present size.
+
+    Refits once if the better simulator gives other observed start states, or a sharper measure of what is left: a fit
+    ends where its loss hardly changes, which may be far from the rounding of the data.
+    """
+    posed = state.posed_at(state.fit.effects)
+    rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
+    within_rounding = posed.within_rounding
+    moved = not np.array_equal(observed(state.problem.states), observed(posed.states))
+    sharper = _is_sharper(posed, state.problem, state.settings.trace.much_finer)
+    if state.entries and not within_rounding and (moved or sharper):
+        kept = eliminate(rescaled.with_found(state.entries, _refitted(rescaled, again=sharper)))
+        posed = kept.posed_at(kept.fit.effects)
+        rescaled, within_rounding = kept.rescaled(posed), posed.within_rounding
+    return without_noise(replace(rescaled, exact=within_rounding))
+
+
+def _refitted(state: SearchState, *, again: bool) -> Fit:
+    """Refits the effects found.
+
+    Contacts make the residual jump, and jumps within the small differences can hide where the loss falls.
+
+    Args:
+        state: effects found.
+        again: whether a first fit that gains little without sensor noise is repeated with larger differences.
+    """
+    start, settings = state.fit.effects, state.settings
+    fitted = state.refitted(state.entries, start)
+    gained = state.screened_loss(fitted.effects) < settings.trace.much_lower * state.screened_loss(start)
+    if gained or not again or state.problem.sensor_std is not None:
+        return fitted
+    coarse = replace(settings.fit, difference_step=settings.fit.coarse_step)
+    return min(fitted, state.refitted(state.entries, start, settings=coarse), key=lambda one: one.loss)
+
+
+def _is_sharper(posed: Problem, before: Problem, much_finer: float) -> bool:
+    """Whether the sensors turn out to have no noise, or the residuals' scale falls much in the median dimension."""
+    if posed.sensor_std is None and before.sensor_std is not None:
+        return True
+    new, old = (np.median(one.scale, axis=(0, 1)) for one in (posed, before))
+    return bool(np.median(new / old) < much_finer)
