@@ -72,9 +72,11 @@ def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjMode
     for coordinate in chosen:
         if coordinate not in names:
             close = get_close_matches(str(coordinate), names, 1)
+            like = close[0] if close else names[0]
             raise ValueError(
                 f"{path} has no coordinate {coordinate!r}{f', but {close[0]!r}' if close else ''}: it has "
-                f"{', '.join(names)}. Map a column with another name to its coordinate: {{'theta': 'pitch'}}"
+                f"{', '.join(names)}. Map each column with another name to its coordinate: {{{coordinate!r}: {like!r}}}, "
+                f"on the command line 'simulator.coordinates={{{coordinate}: {like}}}'"
             )
     twice = {coordinate for coordinate in chosen if chosen.count(coordinate) > 1}
     if twice:
