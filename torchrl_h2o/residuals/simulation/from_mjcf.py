@@ -75,8 +75,8 @@ def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjMode
             like = close[0] if close else names[0]
             raise ValueError(
                 f"{path} has no coordinate {coordinate!r}{f', but {close[0]!r}' if close else ''}: it has "
-                f"{', '.join(names)}. Map each column with another name to its coordinate: {{{coordinate!r}: {like!r}}}, "
-                f"on the command line 'simulator.coordinates={{{coordinate}: {like}}}'"
+                f"{', '.join(names)}. Map each column with another name to its coordinate: "
+                f"{{{coordinate!r}: {like!r}}}, on the command line 'simulator.coordinates={{{coordinate}: {like}}}'"
             )
     twice = {coordinate for coordinate in chosen if chosen.count(coordinate) > 1}
     if twice:
