@@ -76,10 +76,8 @@ class ResidualSettings:
     """Bound on a scaled residual, also used where the simulation diverges."""
     rounding: float = 2e-7
     """Relative rounding error of the data, which are single precision."""
-    beyond_rounding: float = 3.0
-    """Multiple of the mean rounding error from which a residual has another cause."""
-    least_at_work: float = 0.05
-    """Share of such residuals, in data that otherwise show rounding, from which they set the scale."""
+    most_cut_off: float = 0.05
+    """Share of the residuals that may be cut off at ``worst``; if there are more, they set the scale."""
     rounding_unobserved: float = 1e-4
     """Residual where coordinates are unobserved, in spreads of the change in a step, up to which it counts as zero.
     MuJoCo solves contacts up to a tolerance, and begins with the solution of the step before, which is not known."""

@@ -121,7 +121,7 @@ class Problem:
         """Whether the residual is within the rounding of single-precision data, or of the unobserved coordinates."""
         measured, fitted = self.measured, self.measured.fitted(self.horizon)
         left = self._missed((), fitted)
-        rounding = self.settings.beyond_rounding * self._rounding(fitted, left)
+        rounding = 3.0 * self._rounding(fitted, left)
         if self.simulation.state_map.hidden:
             change = (measured.following - measured.observation)[fitted].std(0)
             rounding = np.maximum(rounding, self.settings.rounding_unobserved * change)
@@ -175,15 +175,14 @@ class Problem:
 def _typical_size(found: np.ndarray, rounding: np.ndarray, settings: ResidualSettings) -> np.ndarray:
     """Median of absolute residuals (W, H, n) in each dimension, (n), or what rounding makes of them, if that is more.
 
-    If the median is rounding because the cause is at work in a smaller part of the data, such as a force that begins
-    late, the median of this part is the typical size.
+    If the cause is at work in less than half of the data, such as a force that begins late, the median is rounding, and
+    residuals in this scale would be cut off. Their own median is then the typical size.
     """
-    typical = np.nanmedian(found, axis=(0, 1))
-    at_work = found > settings.beyond_rounding * rounding
-    partly = (typical <= settings.beyond_rounding * rounding) & (at_work.mean((0, 1)) > settings.least_at_work)
-    for dimension in np.flatnonzero(partly):
-        typical[dimension] = np.median(found[..., dimension][at_work[..., dimension]])
-    return np.maximum(typical, rounding)
+    typical = np.maximum(np.nanmedian(found, axis=(0, 1)), rounding)
+    cut_off = found > settings.worst * typical
+    for dimension in np.flatnonzero(cut_off.mean((0, 1)) > settings.most_cut_off):
+        typical[dimension] = np.median(found[..., dimension][cut_off[..., dimension]])
+    return typical
 
 
 def _sensors(simulation: Simulation) -> list[Effect]:
