@@ -69,6 +69,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         normalise=cfg.normalise_observation,
         norm=cfg.observation_norm,
         frames=cfg.frames,
+        action_history=cfg.action_history,
         reward_scale=cfg.reward_scale,
         reward_offset=cfg.reward_offset,
     )

@@ -1,5 +1,6 @@
 """Observations for the learner: real data and environments are transformed in the same way."""
 
+from functools import partial
 from pathlib import Path
 
 import hydra
@@ -83,13 +84,15 @@ def test_worlds_at_once_have_episodes_of_their_own_that_count_to_their_ends(cfg,
     assert evaluate(worlds, actor, episodes=2).returns == at_once.returns[:2]
 
 
+@pytest.mark.parametrize("past", [0, 2])
 @pytest.mark.parametrize("worlds", [None, 3])
-def test_an_evaluation_measures_observations_in_physical_units(cfg, worlds):
+def test_an_evaluation_measures_observations_in_physical_units(cfg, worlds, past):
+    cfg.action_history = past
     cfg.env.make.max_episode_steps = 60
     cfg.observation_norm = {"loc": [1.0, 2.0, 3.0, 4.0], "scale": [0.1, 10.0, 0.5, 2.0]}
 
     push = TensorDictModule(lambda seen: torch.full((*seen.shape[:-1], 1), 2.0), ["observation"], ["action"])
-    measured = evaluate(make_reality(cfg, worlds), push, 3, physical=preprocessing_of(cfg).physical)
+    measured = evaluate(make_reality(cfg, worlds), push, 3, physical=partial(preprocessing_of(cfg).physical, size=4))
     raw = make_reality(cfg, worlds, raw=True)
     torch.manual_seed(SEED)
     raw.set_seed(SEED)

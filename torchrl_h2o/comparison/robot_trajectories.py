@@ -91,7 +91,7 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
 def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str]) -> torch.Tensor:
     """Select dimensions of the last frame of the learner's observations ``[*B, n]`` and undo their normalisation."""
     names = OBSERVATIONS[cfg.env.make.task]
-    return preprocessing_of(cfg).physical(observation)[..., [names.index(name) for name in wanted]]
+    return preprocessing_of(cfg).physical(observation, len(names))[..., [names.index(name) for name in wanted]]
 
 
 def counted(states: np.ndarray) -> np.ndarray:

@@ -128,6 +128,7 @@ class ExperimentOptions(Options):
     normalise_observation: bool
     observation_norm: NormOptions | None
     frames: Count
+    action_history: Annotated[int, Field(ge=0)] = 0
 
     eval_every: Count
     eval_episodes: Count

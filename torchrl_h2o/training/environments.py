@@ -27,7 +27,8 @@ def preprocessing_of(cfg: DictConfig) -> Preprocessing:
     return Preprocessing(
         loc=None if norm is None else tuple(norm.loc),
         scale=None if norm is None else tuple(norm.scale),
-        frames=cfg.get("frames", 1),  # configurations of earlier versions have no such entry
+        frames=cfg.get("frames", 1),  # configurations of earlier versions have no such entries
+        action_history=cfg.get("action_history", 0),
         reward_scale=cfg.reward_scale,
         reward_offset=cfg.reward_offset,
     )

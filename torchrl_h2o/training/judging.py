@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,7 @@ def judge(
     start = time.perf_counter()
     main = next(iter(policies))
     names = task.config.get("observations")
-    physical = None if names is None else preprocessing.physical
+    physical = None if names is None else partial(preprocessing.physical, size=len(names))
     in_reality = {name: evaluate(reality, policy, episodes, physical=physical) for name, policy in policies.items()}
     observed = {} if names is None else {"observed": in_reality[main].observed(names)}
     in_simulator = evaluate(simulator, policies[main], 1)

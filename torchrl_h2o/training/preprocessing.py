@@ -1,4 +1,4 @@
-"""Preprocessing of transitions for the learner: normalised, stacked observations and a scaled reward."""
+"""Preprocessing of transitions for the learner: normalised, stacked observations, past actions and a scaled reward."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import CatFrames, ObservationNorm, Transform
 
+from torchrl_h2o.envs import ActionHistory
+
 
 @dataclass(frozen=True)
 class Preprocessing:
@@ -19,6 +21,7 @@ class Preprocessing:
         loc: ``[n]``, mean that is subtracted from each observation; None for no normalisation.
         scale: ``[n]``, standard deviation by which observations are divided.
         frames: number of successive observations that are stacked into one input.
+        action_history: number of past actions in front of these observations.
         reward_scale: factor of the reward.
         reward_offset: constant that is added to the reward before scaling.
     """
@@ -26,6 +29,7 @@ class Preprocessing:
     loc: tuple[float, ...] | None = None
     scale: tuple[float, ...] | None = None
     frames: int = 1
+    action_history: int = 0
     reward_scale: float = 1.0
     reward_offset: float = 0.0
 
@@ -44,7 +48,7 @@ class Preprocessing:
             real: the measured transitions, ``[T]``.
             normalise: whether observations are normalised.
             norm: ``loc`` and ``scale`` to use instead of those measured in ``real``.
-            **options: ``frames``, ``reward_scale`` and ``reward_offset``.
+            **options: the other arguments of the class.
         """
         if norm is not None:
             return cls(tuple(norm["loc"]), tuple(norm["scale"]), **options)
@@ -70,6 +74,8 @@ class Preprocessing:
             chosen.append(ObservationNorm(loc, scale, in_keys=["observation"], standard_normal=True))
         if self.frames > 1:
             chosen.append(CatFrames(N=self.frames, dim=-1, in_keys=["observation"]))
+        if self.action_history:
+            chosen.append(ActionHistory(self.action_history))
         return chosen
 
     def apply(self, real: TensorDictBase) -> TensorDictBase:
@@ -84,23 +90,24 @@ class Preprocessing:
             both = CatFrames(N=self.frames, dim=-1, in_keys=["observation", ("next", "observation")])
             real = both.unfolding(real.refine_names("time"))
             real.names = None
-        return real
+        return ActionHistory(self.action_history).unfolding(real) if self.action_history else real
 
-    def physical(self, observation: torch.Tensor) -> torch.Tensor:
+    def physical(self, observation: torch.Tensor, size: int) -> torch.Tensor:
         """Recovers the latest observation in physical units, in float64.
 
         Args:
-            observation: preprocessed observations, ``[*B, frames * n]``.
+            observation: preprocessed observations, ``[*B, k]``.
+            size: size n of the observation before preprocessing.
 
         Returns:
             The last of the stacked observations, not normalised, ``[*B, n]``.
 
         Example:
             >>> preprocessing = Preprocessing(loc=(1.0,), scale=(10.0,), frames=2)
-            >>> preprocessing.physical(torch.tensor([0.0, 0.5])).tolist()
+            >>> preprocessing.physical(torch.tensor([0.0, 0.5]), size=1).tolist()
             [6.0]
         """
-        latest = observation[..., -(observation.shape[-1] // self.frames) :].double()
+        latest = observation[..., -size:].double()
         norm = self._tensors()
         return latest * norm["scale"] + norm["loc"] if norm else latest
 
@@ -112,7 +119,7 @@ class Preprocessing:
             following: the other next observations in physical units, ``[T, n]``.
 
         Returns:
-            ``[T, frames * n]``; the earlier frames are those of the real transitions.
+            ``[T, k]``; the past actions and the earlier frames are those of the real transitions.
         """
         if self.loc is not None:
             norm = self._tensors()
