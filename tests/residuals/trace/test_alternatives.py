@@ -7,9 +7,10 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionDelay, CatalogueEntry, ObservationDelay
-from torchrl_h2o.residuals.trace.alternatives import _is_equivalent
+from torchrl_h2o.residuals.trace.alternatives import _is_equivalent, _sketched_rivals
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.screening import Lead
 from torchrl_h2o.residuals.trace.state import SearchState
 
 LATE = CatalogueEntry(ActionDelay(), ({"delay": 0.01},))
@@ -33,3 +34,11 @@ def test_where_only_rounding_is_left_an_alternative_that_leaves_rounding_is_as_g
     significantly_worse = Attempt(SENSORS, fitted, 0, loss=1e-3, p_value=0.0)
     assert _is_equivalent(state, significantly_worse, 0.0, 1.0) is equivalent
     assert not _is_equivalent(replace(state, exact=False), significantly_worse, 0.0, 1.0)
+
+
+def test_an_entry_with_the_effects_parameters_starts_from_the_effects_values(state):
+    """The screening that gave the first values knew fewer effects; a fit from there may end beside the best values."""
+    far = Lead(SENSORS, ObservationDelay(0.5), promise=1.0, trial={"delay": 0.5}, change=np.zeros(1))
+    state = replace(state, rivals={state.entries[0].name: [far]})
+    ((_, sketch),) = _sketched_rivals(state, 0)
+    assert sketch.effects[0].delay == pytest.approx(0.013, rel=1e-4)

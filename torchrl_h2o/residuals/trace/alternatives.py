@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
@@ -85,22 +85,39 @@ def _repeats(state: SearchState, index: int, entry: CatalogueEntry) -> bool:
 def _sketched_rivals(state: SearchState, index: int) -> Iterator[tuple[Lead, Fit | None]]:
     """Rivals with a quick fit of all parameters; None in its place if it misses a minimum share of the effect's gain.
 
-    A rival that is far from this share after the first evaluations is given up.
+    A rival that is far from this share after the first evaluations is given up. A rival with the parameters of the
+    effect starts from the effect's values if they are better than those of the screening, which knew fewer effects.
     """
     rules, effects = state.settings.trace, state.fit.effects
     kept = [effect for i, effect in enumerate(effects) if i != index]
     few_with_it, few_without = map(state.screened_loss, (effects, kept))
     gain = few_without - few_with_it
     for lead in _rivals(state, index):
-        instead = [*kept[:index], lead.effect, *kept[index:]]
-        if not is_possible(state.problem, instead):
+        starts = [
+            [*kept[:index], start, *kept[index:]]
+            for start in (lead.effect, *_with_values_of(effects[index], lead.effect))
+        ]
+        starts = [start for start in starts if is_possible(state.problem, start)]
+        if not starts:
             yield lead, None
             continue
+        instead = min(starts, key=state.screened_loss) if len(starts) > 1 else starts[0]
         free = [free_parameters(entry) for entry in _entries_with(state, index, lead)]
         sketch = state.sketched(instead, free, rules.sketch_evaluations)
         if few_without - sketch.loss >= rules.rival_min_first * gain:
             sketch = state.sketched(sketch.effects, free, rules.rival_evaluations)
         yield lead, sketch if few_without - sketch.loss >= state.rival_min_sketch * gain else None
+
+
+def _with_values_of(effect: Effect, rival: Effect) -> list[Effect]:
+    """The rival with the values of an effect that has the same parameters; empty for other or rejected parameters."""
+    values = {name: parameter.value for name, parameter in effect.parameters.items()}
+    if values.keys() != rival.parameters.keys():
+        return []
+    try:
+        return [rival.with_parameters(values)]
+    except ValueError:  # outside the rival's bounds
+        return []
 
 
 def _entries_with(state: SearchState, index: int, lead: Lead) -> list:
