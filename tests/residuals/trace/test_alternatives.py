@@ -41,4 +41,5 @@ def test_an_entry_with_the_effects_parameters_starts_from_the_effects_values(sta
     far = Lead(SENSORS, ObservationDelay(0.5), promise=1.0, trial={"delay": 0.5}, change=np.zeros(1))
     state = replace(state, rivals={state.entries[0].name: [far]})
     ((_, sketch),) = _sketched_rivals(state, 0)
-    assert sketch.effects[0].delay == pytest.approx(0.013, rel=1e-4)
+    assert sketch is not None
+    assert sketch.effects[0].parameters["delay"].value == pytest.approx(0.013, rel=1e-4)
