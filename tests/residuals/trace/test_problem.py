@@ -36,3 +36,15 @@ def test_unobserved_coordinates_follow_from_the_effects():
     posed, starts = Problem.pose(simulation, measured), measured.fitted()
     without, with_it = (np.abs(posed.residual(effects, starts)).mean() for effects in ([], [larger]))
     assert with_it < 1e-3 * without
+
+
+@pytest.mark.parametrize(("missed", "within"), [(0.02, True), (0.2, False)])
+def test_a_few_rows_in_which_a_wheel_lands_do_not_count_as_a_missing_effect(missed, within):
+    env = WheelLeggedEnv()
+    simulation = Simulation.from_env(env)
+    measured = Measured.from_ted(record(env, noisy_balance_controller(), 300, seed=0), simulation)
+    following = measured.following.copy()
+    landed = np.random.default_rng(0).random(len(following)) < missed
+    following[landed] += 0.5 * (following - measured.observation).std(0)
+    problem = Problem.pose(simulation, replace(measured, following=following), sensor_std=np.zeros(4))
+    assert problem.within_rounding is within

@@ -78,8 +78,10 @@ class ResidualSettings:
     """Relative rounding error of the data, which are single precision."""
     most_cut_off: float = 0.05
     """Share of the residuals that may be cut off at ``worst``; if there are more, they set the scale."""
-    rounding_unobserved: float = 1e-4
+    rounding_unobserved: float = 2e-4
     """Residual where coordinates are unobserved, in spreads of the change in a step, up to which it counts as zero.
     MuJoCo solves contacts up to a tolerance, and begins with the solution of the step before, which is not known."""
+    settled_share: float = 0.9
+    """Share of the residuals that must be this small."""
     noise_draws: int = 4
     """Number of draws of sensor noise for the estimate of its effect on each window."""
