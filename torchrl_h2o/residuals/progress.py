@@ -11,6 +11,7 @@ from torchrl_h2o.effects import CatalogueEntry
 
 # Stages in their order, with their usual shares of the time in per cent, rounded from four runs on HalfCheetah and on a
 # double pendulum. A run in which nothing is missing, or in which the effects explain the data exactly, is shorter.
+MEASURING = "measuring the residual"  # before the first stage
 EFFECTS, OTHERS = "looking for effects", "looking for other explanations"
 FORCES, NOISE, REPORT = "looking for undeclared forces", "looking for action noise", "reporting"
 STAGES = {EFFECTS: 35.0, OTHERS: 30.0, FORCES: 20.0, NOISE: 5.0, REPORT: 10.0}
@@ -32,6 +33,7 @@ class LoopBar(tqdm):
 
     def __init__(self, **options: Any) -> None:
         form = "{desc}{percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
+        options.setdefault("desc", MEASURING)
         options.setdefault("smoothing", 0.0)  # the time left follows from all the time passed; the last steps are tiny
         super().__init__(total=sum(STAGES.values()), bar_format=form, **options)
         self._end = 0.0
