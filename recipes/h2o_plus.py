@@ -114,7 +114,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
     )
     loss.make_value_estimator(gamma=cfg.gamma)
     accelerate(loss)  # optional: computes the same losses faster
-    loss_fn = maybe_compiled(at_precision(loss, cfg.get("precision", "float32")), cfg.compiled, cfg.updates)
+    loss_fn = at_precision(loss, cfg.get("precision", "float32"))
+    loss_fn = maybe_compiled(loss_fn, cfg.compiled, cfg.updates, parameters=loss.parameters())
 
     # Optimiser, target networks, and the collector of simulated transitions
     budget = Budget(cfg.updates, cfg.updates_per_epoch, cfg.eval_every, cfg.checkpoint_every)

@@ -91,17 +91,20 @@ def contenders(cfg: DictConfig, run: DictConfig) -> dict[str, Callable[[], objec
         chosen["authors' code"] = authors_update(cfg, run, replay)
     if cfg.compiled:
         learner = h2o_plus.make_learner(*what)
-        learner.terms_of = compiled(learner.terms_of)
+        learner.terms_of = compiled(learner.terms_of, learner.parameters)
         chosen["ours"] = learner.update
-        learner = knowing_real_rows(h2o_plus.make_learner(*what), run)
+        learner = h2o_plus.make_learner(*what)
         learner.terms_of = compiled(learner.terms_of)
+        chosen["ours, gradients in a second graph"] = learner.update
+        learner = knowing_real_rows(h2o_plus.make_learner(*what), run)
+        learner.terms_of = compiled(learner.terms_of, learner.parameters)
         chosen["ours, num_real"] = learner.update
         if cfg.device == "cpu" and has_bf16():
             learner = knowing_real_rows(h2o_plus.make_learner(*what), run)
-            learner.terms_of = compiled(at_precision(learner.terms_of, "bf16"))
+            learner.terms_of = compiled(at_precision(learner.terms_of, "bf16"), learner.parameters)
             chosen["ours, num_real, precision=bf16"] = learner.update
         learner = not_accelerated(h2o_plus.make_learner(*what))
-        learner.terms_of = compiled(learner.terms_of)
+        learner.terms_of = compiled(learner.terms_of, learner.parameters)
         chosen["ours, not accelerated"] = learner.update
     chosen["ours, not compiled"] = h2o_plus.make_learner(*what).update
     chosen["ours, neither"] = not_accelerated(h2o_plus.make_learner(*what)).update

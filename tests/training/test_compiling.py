@@ -9,9 +9,11 @@ from torch._inductor.utils import fresh_cache
 from torchrl.data import Bounded
 
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.objectives.relu_perceptron import relu
 from torchrl_h2o.training.compiling import PAYS_FROM, compiled, maybe_compiled
 from torchrl_h2o.training.methods.h2o_plus import make_learner
+from torchrl_h2o.training.one_graph import OneGraph
 
 
 def learner_of(cfg, real):
@@ -41,10 +43,32 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     torch._dynamo.reset()
     counters = torch._dynamo.utils.counters
     counters.clear()
-    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates, parameters=learner.parameters)
     torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-6)
     assert counters["stats"]["unique_graphs"] == 1  # no graph break and no recompilation
     assert not counters["graph_break"]
+
+
+@torch.compiler.set_stance("force_eager")  # without a compiler
+def test_known_gradients_are_those_of_the_sum():
+    weight, bias = torch.nn.Parameter(torch.tensor([2.0, 1.0])), torch.nn.Parameter(torch.tensor(0.5))
+    unused = torch.nn.Parameter(torch.tensor(1.0))
+
+    def losses_of(batch):
+        return {"loss_1": (weight * batch).sum(), "mean": batch.mean() * bias, "loss_2": bias**3}
+
+    known = OneGraph(losses_of, [weight, bias, unused])
+    batch = torch.tensor([3.0, 4.0])
+    terms = known(batch)
+    assert terms["mean"] == 1.75
+    assert not terms["mean"].requires_grad
+    (0.5 * total_loss(terms)).backward()
+    torch.testing.assert_close(weight.grad, 0.5 * batch)
+    torch.testing.assert_close(bias.grad, torch.tensor(0.5 * 3 * 0.25))
+    assert unused.grad is None
+    terms = known(batch)
+    with pytest.raises(ValueError, match="differentiated as their sum"):
+        (terms["loss_1"] + 2.0 * terms["loss_2"]).backward()
 
 
 @pytest.mark.slow
@@ -57,7 +81,7 @@ def test_what_one_start_compiles_the_next_one_finds():
         for _ in range(2):
             torch._dynamo.reset()  # a new process has no compiled functions
             counters.clear()
-            compiled(lambda x: relu(x).square().sum())(x).backward()
+            total_loss(compiled(lambda x: {"loss_relu": relu(x).square().sum()}, [x])(x)).backward()
             found.append(counters["aot_autograd"]["autograd_cache_hit"])
     assert found == [0, 1]
 
@@ -75,7 +99,7 @@ def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, 
     cfg, real = compose("compiled=auto", f"updates={PAYS_FROM}")
     expected = updated(learner_of(cfg, real))
     learner = learner_of(cfg, real)
-    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates, parameters=learner.parameters)
     torch.testing.assert_close(updated(learner), expected, rtol=0.0, atol=0.0)
     assert capsys.readouterr().out.count("cannot be compiled here") == 1
 
@@ -85,7 +109,7 @@ def test_a_machine_that_cannot_compile_says_so_and_trains_all_the_same(compose, 
 def test_where_compiled_losses_are_asked_for_it_is_an_error_that_there_can_be_none(compose):
     cfg, real = compose("compiled=true")
     learner = learner_of(cfg, real)
-    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates)
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates, parameters=learner.parameters)
     with pytest.raises(RuntimeError, match="compiler"):
         learner.update()
 

@@ -29,6 +29,8 @@ class Learner:
         terms_of: maps these batches to terms named ``loss_*``, which are summed, and values to log.
         figures: maps the same batches to further values to log, computed at evaluations only.
         pays_to_compile: whether ``terms_of`` is faster when compiled.
+        one_graph: whether ``terms_of`` is then compiled together with its gradients. TorchRL's SAC and IQL store
+            tensors of their forward pass, which prevents that.
         pairs: source of the second batch, which trains the discriminators; the replay buffer if None.
         batches: the batches of the last update.
     """
@@ -42,6 +44,7 @@ class Learner:
     terms_of: Callable[..., dict[str, torch.Tensor]]
     figures: Callable[..., dict[str, float]] = lambda *batches: {}
     pays_to_compile: bool = True
+    one_graph: bool = False
     pairs: PairedTransitions | None = None
     batches: list[TensorDictBase] = field(default_factory=list)
 
@@ -61,6 +64,11 @@ class Learner:
         self.optimiser.step()
         self.targets.step()
         return losses
+
+    @property
+    def parameters(self) -> list[torch.nn.Parameter]:
+        """The parameters that the optimiser changes."""
+        return [parameter for group in self.optimiser.param_groups for parameter in group["params"]]
 
     @property
     def simulates(self) -> bool:

@@ -50,6 +50,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         [cfg.batch_size, cfg.discriminator_batch_size],
         loss,
         figures,
+        one_graph=True,
     )
 
 

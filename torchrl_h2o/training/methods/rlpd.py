@@ -17,7 +17,8 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     loss.make_value_estimator(gamma=cfg.gamma)
     accelerate(loss)
     targets = SoftUpdate(loss, tau=cfg.tau)
-    return Learner(actor, {"loss": loss}, adam(loss, lr=cfg.lr), targets, replay, [cfg.batch_size], loss)
+    optimiser = adam(loss, lr=cfg.lr)
+    return Learner(actor, {"loss": loss}, optimiser, targets, replay, [cfg.batch_size], loss, one_graph=True)
 
 
 RLPD = Method("RLPD", make_learner)

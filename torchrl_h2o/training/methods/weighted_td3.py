@@ -30,9 +30,8 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         return {**loss(estimator(batch)), **ratio_losses}
 
     losses, sizes = {"loss": loss, "ratio_loss": ratio_loss}, [cfg.batch_size, cfg.discriminator_batch_size]
-    return Learner(
-        actor, losses, adam(loss, ratio_loss, lr=cfg.lr), SoftUpdate(loss, tau=cfg.tau), replay, sizes, terms_of
-    )
+    optimiser, targets = adam(loss, ratio_loss, lr=cfg.lr), SoftUpdate(loss, tau=cfg.tau)
+    return Learner(actor, losses, optimiser, targets, replay, sizes, terms_of, one_graph=True)
 
 
 WEIGHTED_TD3 = Method("weighted TD3", make_learner)
