@@ -25,6 +25,7 @@ def test_a_run_that_another_group_has_done_is_taken_over_with_its_curve(tmp_path
             append_rows(tmp_path / name, columns, [row], row)
     (tmp_path / "notes.csv").write_bytes(b"anybody's\xff, x\n")
     (tmp_path / "empty.csv").touch()
+    (tmp_path / "folder.csv").mkdir()
     for _ in range(2):
         adopt_runs(tmp_path / "b.csv", [who, who | {"seed": "z"}])
     assert [row["seed"] for row in read_rows(tmp_path / "b.csv")] == ["x"]

@@ -202,7 +202,7 @@ def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
     """
     missing = {_key(who) for who in runs} - recorded(path)
     for other in sorted(path.parent.glob("[!.]*.csv")):
-        if other == path or not _is_group(other):
+        if other == path or not other.is_file() or not _is_group(other):
             continue
         rows, curves = read_rows(other), read_rows(curves_of(other))
         for row in rows:

@@ -6,14 +6,25 @@ import numpy as np
 import pytest
 from torchrl.envs import TransformedEnv
 
-from torchrl_h2o.effects import ActionDelay, ActionGain, BodyMass, CatalogueEntry, JointFrictionLoss, RollingResistance
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import (
+    ActionDelay,
+    ActionGain,
+    BodyMass,
+    CatalogueEntry,
+    JointFrictionLoss,
+    ObservationDelay,
+    RollingResistance,
+)
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.screening import screen
-from torchrl_h2o.residuals.trace.simplify import simplify_one
+from torchrl_h2o.residuals.trace.screening import Lead, screen
+from torchrl_h2o.residuals.trace.simplify import simplify, simplify_one
 from torchrl_h2o.residuals.trace.state import SearchState
 
+LATE = CatalogueEntry(ActionDelay(), ({"delay": 0.01},))
+SENSORS = CatalogueEntry(ObservationDelay(), ({"delay": 0.01},))
 FACTORS = ({"scale": 0.8}, {"scale": 1.25})
 GAIN = CatalogueEntry(ActionGain(), FACTORS)
 TORSO = CatalogueEntry(BodyMass(bodies="torso"), FACTORS)
@@ -23,6 +34,38 @@ ENTRIES = (
     CatalogueEntry(RollingResistance(geoms="*wheel*"), ({"coefficient": 0.002},)),
     CatalogueEntry(JointFrictionLoss(joints="axle"), ({"torque": 0.1},)),
 )
+
+
+@pytest.fixture
+def late_motors():
+    """A search that has found late motors, whose delay is a little off, with late sensors as their rival."""
+    simulation = pendulum()
+    measured = recorded(simulation.with_effects(ActionDelay(0.013)), 400)
+    begun = SearchState.begin(Problem.pose(simulation, measured), [LATE, SENSORS], np.random.default_rng(0))
+    found = begun.with_found(
+        [LATE], replace(begun.refitted([LATE], [ActionDelay(0.013)]), effects=(ActionDelay(0.0130001),))
+    )
+    lead = Lead(SENSORS, ObservationDelay(0.013), promise=1.0, trial={"delay": 0.01}, change=np.zeros(1))
+    return replace(found, rivals={LATE.name: [lead]})
+
+
+def test_an_alternative_that_is_better_by_rounding_does_not_take_an_effects_place(late_motors):
+    """Late motors and late sensors took turns, and each time all alternatives were looked for again."""
+    state, alternatives = simplify_one(late_motors, 0)
+    assert state.entries == (LATE,)
+    (sensors,) = alternatives
+    assert sensors.entry is SENSORS
+    assert sensors.loss < state.selection_losses(late_motors.fit.effects).mean()
+
+
+def test_alternatives_beside_the_same_effects_are_looked_for_once(late_motors):
+    tried = []
+    first = simplify(late_motors, lambda: tried.append(1))
+    assert tried == [1]
+    again = simplify(first, lambda: tried.append(1))
+    assert tried == [1]
+    assert again.groups == first.groups
+    assert again.groups[0][0].entry is SENSORS
 
 
 @pytest.mark.slow

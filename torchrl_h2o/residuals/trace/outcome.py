@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.effects.catalogue.plausibility import surprise
@@ -31,6 +32,20 @@ class Attempt:
     def effect(self) -> Effect:
         """The entry's effect at its fitted values."""
         return self.fit.effects[self.index]
+
+
+class Question(NamedTuple):
+    """The question which other entries explain the data as well in the place of an effect.
+
+    Args:
+        name: name of the effect's entry.
+        beside: names of the entries of all effects found.
+        exact: whether these leave only rounding.
+    """
+
+    name: str
+    beside: frozenset[str]
+    exact: bool
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
 from torchrl_h2o.residuals.trace.close_comparison import refined, worse_of
-from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.outcome import Attempt, Question
 from torchrl_h2o.residuals.trace.rescale import rescale
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -18,7 +18,8 @@ def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -
     """Simplifies the effects found one by one; the state's groups then hold the alternatives of each.
 
     The most unusual effect comes first, because it is the most likely one to stand in for another. Ends without groups
-    as soon as a better effect leaves only rounding: all alternatives depend on it.
+    as soon as a better effect leaves only rounding: all alternatives depend on it. The alternatives of an effect beside
+    the same others as in an earlier round are not looked for again.
 
     Args:
         state: effects found.
@@ -26,10 +27,19 @@ def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -
     """
     state, exact, groups = replace(state, groups=()), state.exact, {}
     for index in sorted(range(len(state.entries)), key=lambda i: -surprise(state.fit.effects[i])):
+        if (known := state.alternatives.get(_question(state, index))) is not None:
+            groups[index] = known
+            continue
         state, groups[index] = simplify_one(state, index, advance)
         if state.exact and not exact:
             return replace(state, groups=())
+        state = replace(state, alternatives={**state.alternatives, _question(state, index): groups[index]})
     return replace(state, groups=tuple(groups[index] for index in range(len(state.entries))))
+
+
+def _question(state: SearchState, index: int) -> Question:
+    """What the alternatives of an effect depend on."""
+    return Question(state.entries[index].name, frozenset(entry.name for entry in state.entries), state.exact)
 
 
 def simplify_one(
@@ -85,19 +95,34 @@ def _compared_closely(
 ) -> tuple[SearchState, tuple[Attempt, ...], list[Attempt]]:
     """The state and the alternatives, refined; those that are not worse than the effect, and those that are better.
 
-    Where the effects leave only rounding, no alternative is better.
+    An alternative that differs from the effect by rounding is equally good, and so are all where the effects leave only
+    rounding.
     """
-    if state.exact:
+    equal, differing = _divided_by_rounding(state, index, as_good)
+    if state.exact or not differing:
         return state, tuple(as_good), []
     level = state.settings.significance.level
-    better = [a for a in as_good if p_value_between(state, state.problem, state.fit, a.fit) < level]
-    if better or not as_good:
+    better = [a for a in differing if p_value_between(state, state.problem, state.fit, a.fit) < level]
+    if better:
         return state, tuple(as_good), better
     state = state.with_found(state.entries, refined(state, state.entries, state.fit))
-    near = [replace(a, fit=refined(state, _replaced(state, index, a).entries, a.fit)) for a in as_good]
+    near = [replace(a, fit=refined(state, _replaced(state, index, a).entries, a.fit)) for a in differing]
     worse = [worse_of(state, state.fit, a.fit) for a in near]
     better = [a for a, which in zip(near, worse, strict=True) if which is state.fit]
-    return state, tuple(a for a, which in zip(near, worse, strict=True) if which is not a.fit), better
+    return state, (*equal, *(a for a, which in zip(near, worse, strict=True) if which is not a.fit)), better
+
+
+def _divided_by_rounding(
+    state: SearchState, index: int, attempts: Sequence[Attempt]
+) -> tuple[list[Attempt], list[Attempt]]:
+    """Attempts whose loss differs from the effect's by a negligible share of the effect's gain, and the others."""
+    effects = state.fit.effects
+    with_it, without = (
+        state.selection_losses(which).mean() for which in (effects, [*effects[:index], *effects[index + 1 :]])
+    )
+    negligible = state.settings.trace.same_loss * (without - with_it)
+    equal = [attempt for attempt in attempts if abs(attempt.loss - with_it) <= negligible]
+    return equal, [attempt for attempt in attempts if attempt not in equal]
 
 
 def _replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:

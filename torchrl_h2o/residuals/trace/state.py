@@ -14,7 +14,7 @@ from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.transitions import thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.trace.fit import Fit, Free, fit
-from torchrl_h2o.residuals.trace.outcome import Attempt
+from torchrl_h2o.residuals.trace.outcome import Attempt, Question
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters
 from torchrl_h2o.residuals.trace.settings import FitSettings
@@ -64,6 +64,7 @@ class SearchState:
         attempts: entries that were sketched in addition to the effects found, by name.
         rivals: all leads of the screening after which an entry was added, by the entry's name.
         groups: for each effect found, alternatives with an equivalent loss.
+        alternatives: the alternatives that were found so far, by question.
         exact: True if the residual is within the rounding of single-precision data.
     """
 
@@ -78,6 +79,7 @@ class SearchState:
     attempts: Mapping[str, Attempt] = field(default_factory=dict)
     rivals: Mapping[str, Sequence[Lead]] = field(default_factory=dict)
     groups: tuple[tuple[Attempt, ...], ...] = ()
+    alternatives: Mapping[Question, tuple[Attempt, ...]] = field(default_factory=dict)
     exact: bool = False
 
     @classmethod
