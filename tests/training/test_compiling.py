@@ -12,11 +12,11 @@ from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.objectives.relu_perceptron import relu
 from torchrl_h2o.training.compiling import PAYS_FROM, compiled, maybe_compiled
-from torchrl_h2o.training.methods.h2o_plus import make_learner
+from torchrl_h2o.training.methods import h2o, h2o_plus, weighted_td3
 from torchrl_h2o.training.one_graph import OneGraph
 
 
-def learner_of(cfg, real):
+def learner_of(cfg, real, make_learner=h2o_plus.make_learner):
     replay = HybridReplayBuffer(real, sim_capacity=len(real), batch_size=cfg.batch_size)
     replay.extend(real)
     return make_learner(cfg, 4, Bounded(-1.0, 1.0, (1,)), replay)
@@ -46,6 +46,21 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
     learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates, parameters=learner.parameters)
     torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-6)
     assert counters["stats"]["unique_graphs"] == 1  # no graph break and no recompilation
+    assert not counters["graph_break"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
+@pytest.mark.parametrize("method", [h2o, weighted_td3], ids=["h2o", "weighted_td3"])
+def test_terms_of_several_losses_are_compiled_with_their_gradients(compose, method):
+    cfg, real = compose("compiled=true", config="train")
+    expected = updated(learner_of(cfg, real, method.make_learner))
+    learner = learner_of(cfg, real, method.make_learner)
+    torch._dynamo.reset()
+    counters = torch._dynamo.utils.counters
+    counters.clear()
+    learner.terms_of = maybe_compiled(learner.terms_of, cfg.compiled, cfg.updates, parameters=learner.parameters)
+    torch.testing.assert_close(updated(learner), expected, rtol=1e-4, atol=1e-5)
     assert not counters["graph_break"]
 
 
