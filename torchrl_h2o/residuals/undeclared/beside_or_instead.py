@@ -62,14 +62,16 @@ def add_undeclared_force(
     """
     if explanation.trace.exact:
         return explanation
-    parts = explanation.parts
+    parts, horizon = explanation.parts, _horizon(explanation, settings)
+    first = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+    nothing, present = (first.selection_loss(effects) for effects in ((), explanation.effects))
+    if not matters(nothing, present, 0.0, settings.undeclared.min_share):
+        return explanation  # not even a force that left no residual would be added
     candidates = _candidates(simulation, measured, explanation, settings)
     if not candidates:
         return explanation
     compared = [parts, *(candidate.parts for candidate in candidates)]
-    horizon = _horizon(explanation, settings)
     problem = _with_least_noise(simulation, measured, compared, horizon, settings)
-    first = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     before = _selection_losses(problem, parts)
     paying = []
     for candidate in candidates:

@@ -1,0 +1,42 @@
+"""A force outside the catalogue is looked for only where it could be added."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import UnknownForce, pendulum, recorded
+from torchrl_h2o.effects import CatalogueEntry, Gravity
+from torchrl_h2o.residuals.explanation import Explanation
+from torchrl_h2o.residuals.trace.outcome import Trace
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.undeclared import beside_or_instead
+from torchrl_h2o.residuals.undeclared.beside_or_instead import add_undeclared_force
+
+GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
+RIPPLE = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
+
+
+@pytest.mark.parametrize(("gravity", "looked_for"), [(0.501, False), (0.7, True)])
+def test_a_force_is_not_looked_for_where_the_effects_leave_less_than_it_must_explain(monkeypatch, gravity, looked_for):
+    simulation, asked = pendulum(), []
+    measured = recorded(simulation.with_effects(Gravity(0.5)), 400)
+    state = SearchState.begin(Problem.pose(simulation, measured), [GRAVITY], np.random.default_rng(0))
+    fitted = replace(state.refitted([GRAVITY], [Gravity(0.5)]), effects=(Gravity(gravity),))
+    explanation = Explanation.of(Trace((GRAVITY,), fitted, (), ((),), exact=False))
+    monkeypatch.setattr(beside_or_instead, "find_undeclared", lambda *args, **kwargs: asked.append(1))
+    found = add_undeclared_force(simulation, measured, explanation, rng=np.random.default_rng(0))
+    assert bool(asked) is looked_for
+    assert found.effects == (Gravity(gravity),)
+
+
+def test_a_force_is_looked_for_where_nothing_is_explained():
+    simulation = pendulum()
+    measured = recorded(simulation.with_effects(RIPPLE), noise=0.002)
+    nothing = SearchState.begin(Problem.pose(simulation, measured), [], np.random.default_rng(0)).fit
+    found = add_undeclared_force(
+        simulation, measured, Explanation.of(Trace((), nothing, (), (), exact=False)), rng=np.random.default_rng(0)
+    )
+    (force,) = found.effects
+    assert force.describe().startswith("torque on joint elbow: ")
