@@ -72,10 +72,12 @@ def test_a_population_of_another_method_is_refused(command):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("interruption", "options"), [(signal.SIGKILL, []), (signal.SIGINT, []), (signal.SIGKILL, ["overlap=true"])]
+    ("interruption", "options", "updates"),
+    # long enough that the signal comes before the end; with overlap=true a checkpoint waits for the evaluation
+    [(signal.SIGKILL, [], 300), (signal.SIGINT, [], 300), (signal.SIGKILL, ["overlap=true"], 1000)],
 )
-def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption, options):
-    small = [*SMALL, *ROBOT, "updates=300"]  # long enough that the signal comes before the end
+def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption, options, updates):
+    small = [*SMALL, *ROBOT, f"updates={updates}"]
     run(command(*small, "hydra.run.dir=unbroken"))
 
     broken = tmp_path / "broken"
