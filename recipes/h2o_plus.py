@@ -103,7 +103,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     value_loss = make_value_loss(cfg, observation_dim)  # with V; expectile, sparse or exponential
-    ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay)
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay, delayed=True)
     pairs_replay = make_pairs(cfg, task, real, preprocessing, replay) or replay  # trains the discriminators
     loss = H2OPlusLoss(
         MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing),
@@ -167,7 +167,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
                 actor,
                 epoch,
                 **({} if best is None else best.consider(actor, training.rows)),
-                ratio_of_sim=float(ratio_loss.estimator(batch)["dynamics_ratio"][~batch["real"]].mean()),
+                ratio_of_sim=float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean()),
                 **{name: term.item() for name, term in losses.items()},
             )
     evaluator.close()

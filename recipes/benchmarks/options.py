@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 
 from torchrl_h2o.options import Options
 from torchrl_h2o.options.sources import AnyPath
-from torchrl_h2o.options.types import Count, Device, NotNegative, Positive, Rows, Seed, Widths
+from torchrl_h2o.options.types import Count, Device, Inside, NotNegative, Positive, Rows, Seed, Widths
 
 Counts = Annotated[list[Count], Field(min_length=1)]
 Seeds = Annotated[list[Seed], Field(min_length=1)]
@@ -109,4 +109,6 @@ class RatioOptions(Options):
     change_noise: NotNegative
     ratio_weight_penalty: NotNegative
     ratio_logit_bound: Positive
+    delayed: bool
+    tau: Inside
     threads: Count

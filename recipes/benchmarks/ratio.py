@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 from options import RatioOptions
 from ratio_systems import SYSTEMS, System
 from tensordict import TensorDictBase
+from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
@@ -57,9 +58,13 @@ def make_loss(name: str, system: System, cfg: DictConfig) -> DynamicsRatioLoss:
     estimator = make_dynamics_ratio_estimator(*sizes, **options)
     if name == "pairs":
         return DynamicsRatioLoss(
-            estimator, input_noise={NEXT: cfg.change_noise}, weight_penalty=cfg.ratio_weight_penalty
+            estimator,
+            input_noise={NEXT: cfg.change_noise},
+            weight_penalty=cfg.ratio_weight_penalty,
+            delay_estimator=cfg.delayed,
         )
-    return DynamicsRatioLoss(estimator, input_noise=cfg.input_noise if name == "paper" else {NEXT: cfg.input_noise})
+    noise = cfg.input_noise if name == "paper" else {NEXT: cfg.input_noise}
+    return DynamicsRatioLoss(estimator, input_noise=noise, delay_estimator=cfg.delayed and name == "change")
 
 
 def make_sampler(name: str, system: System, rows: int) -> Sample:
@@ -86,11 +91,14 @@ def shuffled(name: str, system: System, rows: int) -> System:
 
 def train(loss: DynamicsRatioLoss, sample: Sample, cfg: DictConfig, steps: int) -> None:
     optimiser = torch.optim.Adam(loss.parameters(), lr=cfg.lr, fused=True)
+    targets = SoftUpdate(loss, tau=cfg.tau) if loss.delay_estimator else None
     for _ in range(steps):
         losses = loss(sample(tuple(cfg.batch_size)))
         optimiser.zero_grad()
         total_loss(losses).backward()
         optimiser.step()
+        if targets is not None:
+            targets.step()
 
 
 def measure(loss: DynamicsRatioLoss, system: System, new: System, rows: int) -> dict[str, float]:

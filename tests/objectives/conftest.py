@@ -70,8 +70,10 @@ class Parts:
     def bellman(self, **kwargs) -> MixedBellmanLoss:
         return _move_targets(MixedBellmanLoss(self.actor, self.qvalues, self.value, **kwargs))
 
-    def h2o_plus(self, value_loss=ExpectileValueLoss, ratio: bool = True, **kwargs) -> H2OPlusLoss:
-        ratio_loss = DynamicsRatioLoss(self.estimator) if ratio else None
+    def h2o_plus(
+        self, value_loss=ExpectileValueLoss, ratio: bool = True, delay_estimator: bool = False, **kwargs
+    ) -> H2OPlusLoss:
+        ratio_loss = DynamicsRatioLoss(self.estimator, delay_estimator=delay_estimator) if ratio else None
         own, bellman = _split(kwargs)
         bellman_loss = MixedBellmanLoss(self.actor, self.qvalues, self.value, **bellman)
         return _move_targets(H2OPlusLoss(bellman_loss, value_loss(self.value), ratio_loss, **own))

@@ -279,3 +279,20 @@ def test_a_compiled_loss_that_knows_where_the_real_rows_are_is_the_same():
 def test_real_rows_elsewhere_than_promised_give_no_number(num_real):
     losses, _ = losses_and_gradients(Parts().h2o_plus(num_real=num_real), make_batch(4, 3))
     assert losses["loss_value"].isnan()
+
+
+def test_the_target_networks_of_q_and_of_a_delayed_ratio_are_updated_together(parts, batch):
+    loss = parts.h2o_plus(delay_estimator=True)
+    targets = SoftUpdate(loss, tau=0.5)
+    with torch.no_grad():
+        for parameter in loss.parameters():
+            parameter.add_(1.0)
+    targets.step()
+    for path in (("bellman_loss", "qvalue_network"), ("ratio_loss", "estimator")):
+        part = getattr(loss, path[0])
+        online, target = (getattr(part, f"{prefix}{path[1]}_params") for prefix in ("", "target_"))
+        torch.testing.assert_close((online - target).data, torch.full_like(online.data, 0.5))
+    torch.testing.assert_close(
+        loss(batch)["unclamped_ratio"],
+        loss.ratio_loss.log_and_clamped_ratio(batch[~batch["real"]])[0].exp().mean(),
+    )

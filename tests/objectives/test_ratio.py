@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
 
 from tests.objectives import reference
 from tests.objectives.conftest import CELLS, OBSERVATION_DIM, Parts, make_batch
@@ -267,3 +268,17 @@ def test_a_discriminator_without_two_logits_is_refused(batch):
 def test_bounds_that_cannot_be_are_refused(bad):
     with pytest.raises(ValueError, match=r"logit_bound|clamp"):
         make_dynamics_ratio_estimator(OBSERVATION_DIM, 1, CELLS, **bad)
+
+
+def test_a_delayed_ratio_is_that_of_the_averaged_discriminators(parts, batch):
+    loss = DynamicsRatioLoss(parts.estimator, input_noise=None, delay_estimator=True)
+    targets, before = SoftUpdate(loss, tau=0.25), loss.estimator_params.data.clone()
+    first = loss.log_and_clamped_ratio(batch)
+    with torch.no_grad():
+        for parameter in loss.parameters():
+            parameter.add_(torch.linspace(-0.5, 0.5, parameter.numel()).view_as(parameter))
+    torch.testing.assert_close(loss.log_and_clamped_ratio(batch), first)  # the targets have not moved yet
+    targets.step()
+    average = before.lerp(loss.estimator_params.data, 0.25)
+    torch.testing.assert_close(loss.log_and_clamped_ratio(batch), loss.estimator.ratio(batch, average))
+    assert not torch.isclose(loss.log_and_clamped_ratio(batch)[0], first[0]).any()

@@ -28,8 +28,10 @@ LOSSES = {
     "sparse": lambda parts: SparseValueLoss(parts.value),
     "exponential": lambda parts: ExponentialValueLoss(parts.value),
     "ratio": lambda parts: DynamicsRatioLoss(parts.estimator, input_noise=None),
+    "delayed_ratio": lambda parts: DynamicsRatioLoss(parts.estimator, input_noise=None, delay_estimator=True),
     "bellman": lambda parts: parts.bellman(),
     "h2o_plus": lambda parts: parts.h2o_plus(),
+    "h2o_plus_delayed_ratio": lambda parts: parts.h2o_plus(delay_estimator=True),
     "without_value": lambda parts: parts.sac(),
 }
 losses = pytest.mark.parametrize("name", LOSSES)

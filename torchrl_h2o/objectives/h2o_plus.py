@@ -121,6 +121,9 @@ class H2OPlusLoss(LossWrapper):
                     f"{type(part).__name__} has reduction={part.reduction!r} and {type(bellman_loss).__name__} "
                     f"{self.reduction!r}: build both alike."
                 )
+        if ratio_loss is not None:  # one record, in which SoftUpdate notes that it updates the target networks of both
+            bellman_loss._has_update_associated |= ratio_loss._has_update_associated
+            ratio_loss._has_update_associated = bellman_loss._has_update_associated
         if value_loss is not None:  # one container, so that conversions of dtype or device keep V shared
             bellman_loss.value_network_params = value_loss.value_network_params
         if not fixed_alpha:
@@ -169,6 +172,8 @@ class H2OPlusLoss(LossWrapper):
         return self.bellman_loss.alpha
 
     def __getattr__(self, name: str) -> Any:
+        if name in ("estimator_params", "target_estimator_params"):
+            return getattr(self.ratio_loss, name)
         reached = ("actor_network", "qvalue_network", "value_network", "log_alpha")
         if name in reached and (inside := self._inside_if_set) is not None:
             return getattr(inside, name)

@@ -110,7 +110,7 @@ class LossWrapper(HybridLoss):
             _ = self._inside.target_entropy
         super()._load_from_state_dict(*args, **kwargs)
 
-    # SoftUpdate finds the target networks of the inner loss through the property and the method below.
+    # SoftUpdate finds the target networks of the inner losses through the property and the method below.
     @property
     def _has_update_associated(self) -> dict[str, bool]:
         inside = self._inside_if_set
@@ -122,7 +122,8 @@ class LossWrapper(HybridLoss):
 
     def named_children(self) -> Iterator[tuple[str, nn.Module]]:
         yield from super().named_children()
-        yield from ((name, module) for name, module in self._inside.named_children() if name.startswith("target_"))
+        for part in self._parts:
+            yield from ((name, module) for name, module in part.named_children() if name.startswith("target_"))
 
     def __getattr__(self, name: str) -> Any:
         if name.endswith("_params") and (inside := self._inside_if_set) is not None:

@@ -251,6 +251,9 @@ class DynamicsRatioLoss(HybridLoss):
         weight_penalty (float, optional): λ of :math:`\tfrac\lambda 2\|W\|^2`, over the weights (not the biases) of
             each network, added to the network's loss. It reduces over-fitting, which biases the ratio of the rows that
             the networks were trained on. Needs ``reduction="mean"``. Defaults to 0.
+        delay_estimator (bool, optional): whether the ratio is that of target networks, the exponential moving average
+            of the discriminators that ``SoftUpdate(loss, tau=...)`` computes. The average has less noise than the
+            discriminators of any one update. Defaults to ``False``, as in the authors' code.
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
 
     Reads the estimator's inputs, ``real`` ``[*B]`` and, if present, ``priority_weight`` ``[*B]``. Returns
@@ -286,6 +289,7 @@ class DynamicsRatioLoss(HybridLoss):
         *,
         input_noise: float | Mapping[NestedKey, float] | None = 0.1,
         weight_penalty: float = 0.0,
+        delay_estimator: bool = False,
         reduction: str = "mean",
     ) -> None:
         super().__init__(reduction=reduction)
@@ -294,7 +298,8 @@ class DynamicsRatioLoss(HybridLoss):
         noise = _noise_by_entry(input_noise, estimator.in_keys)
         self._network_inputs = estimator.network_inputs
         # TorchRL accepts any compatible module, although it annotates a TensorDictModule.
-        self.convert_to_functional(cast(TensorDictModule, estimator), "estimator", create_target_params=False)
+        self.convert_to_functional(cast(TensorDictModule, estimator), "estimator", create_target_params=delay_estimator)
+        self.delay_estimator = delay_estimator
         self.input_noise = input_noise
         self._noise = noise
         self.weight_penalty = weight_penalty
@@ -311,12 +316,16 @@ class DynamicsRatioLoss(HybridLoss):
         return cast(Tensor, next(iter(self.estimator_params.values(True, True)))).dtype
 
     def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
-        """Compute Eq. (9) with this loss's current parameters, as a constant, ``[*B]``."""
+        """Compute the clamped ratio of Eq. (9), as a constant, ``[*B]``; see :meth:`log_and_clamped_ratio`."""
         return self.log_and_clamped_ratio(tensordict)[1]
 
     def log_and_clamped_ratio(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Compute the logarithm of Eq. (9) without clamp, and the clamped ratio, constants, ``[*B]`` each."""
-        return self.estimator.ratio(tensordict, self.estimator_params, self.calls)
+        """Compute the logarithm of Eq. (9) without clamp, and the clamped ratio, constants, ``[*B]`` each.
+
+        With ``delay_estimator`` they are those of the target networks, otherwise of the current discriminators.
+        """
+        params = self.target_estimator_params if self.delay_estimator else self.estimator_params
+        return self.estimator.ratio(tensordict, params, self.calls)
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

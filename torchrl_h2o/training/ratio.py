@@ -3,6 +3,7 @@
 ``paper``: the authors' two discriminators, trained on the batches of the replay buffer. ``change``: the same with the
 normalised change s' - s as input, noise on this change only, and unbounded logits given (s, a). ``pairs``: one
 discriminator, trained on the real transitions and on what the run's simulator makes of the same states and actions.
+The ratio of ``change`` and ``pairs`` can be that of averaged discriminators, which has less noise.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def ratio_estimator_of(cfg: DictConfig) -> str:
 
 
 def make_ratio_loss(
-    cfg: DictConfig, observation_dim: int, action_dim: int, replay: HybridReplayBuffer
+    cfg: DictConfig, observation_dim: int, action_dim: int, replay: HybridReplayBuffer, *, delayed: bool = False
 ) -> DynamicsRatioLoss:
     """Builds the estimator named in the configuration, and the loss that holds and trains it.
 
@@ -43,6 +44,8 @@ def make_ratio_loss(
         observation_dim: size of the observation.
         action_dim: size of the action.
         replay: the preprocessed data, from which the scale of the change of the observation is measured.
+        delayed: whether ``change`` and ``pairs`` use averaged discriminators, for methods whose ``SoftUpdate`` averages
+            them. ``paper`` never does, as in the authors' code.
     """
     following = replay.next_observation
     sizes = observation_dim, action_dim, cfg.num_cells
@@ -56,11 +59,16 @@ def make_ratio_loss(
     noise = CHANGE_NOISE[ratio_estimator_of(cfg)] if cfg.change_noise == "auto" else cfg.change_noise
     if ratio_estimator_of(cfg) == CHANGE:
         estimator = make_dynamics_ratio_estimator(*sizes, **change, logit_bound=(None, cfg.ratio_logit_bound))
-        return DynamicsRatioLoss(estimator, input_noise={following: noise})
+        return DynamicsRatioLoss(estimator, input_noise={following: noise}, delay_estimator=delayed)
     estimator = make_dynamics_ratio_estimator(
         *sizes, **change, with_sa_network=False, logit_bound=cfg.ratio_logit_bound
     )
-    return DynamicsRatioLoss(estimator, input_noise={following: noise}, weight_penalty=cfg.ratio_weight_penalty)
+    return DynamicsRatioLoss(
+        estimator,
+        input_noise={following: noise},
+        weight_penalty=cfg.ratio_weight_penalty,
+        delay_estimator=delayed,
+    )
 
 
 def make_pairs(

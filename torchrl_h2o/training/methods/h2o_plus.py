@@ -25,8 +25,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     """Build H2O+: one loss, one optimiser, and two batches per update, the second for the discriminators."""
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     value_loss = make_value_loss(cfg, observation_dim)
-    ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
-    estimator = ratio_loss.estimator
+    ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay, delayed=True)
 
     loss = H2OPlusLoss(
         MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing),
@@ -39,7 +38,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     accelerate(loss)
 
     def figures(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, float]:
-        return {"ratio_of_sim": float(estimator(batch)["dynamics_ratio"][~batch["real"]].mean())}
+        return {"ratio_of_sim": float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean())}
 
     return Learner(
         actor,
