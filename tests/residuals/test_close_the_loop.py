@@ -86,7 +86,7 @@ def test_mass_and_gain_are_one_group_where_the_data_cannot_tell_them_apart():
     assert effects[BodyMass].scale == pytest.approx(1.4, rel=0.02)
     assert effects[ActionGain].scale == pytest.approx(1.0 / 1.4, rel=0.02)
     assert len(report.effects) == 1
-    assert "cannot tell them apart" in report.sentence()
+    assert "These data cannot tell" in report.sentence()
 
 
 def test_mass_and_gain_are_told_apart_where_weight_shows():

@@ -30,6 +30,7 @@ from torchrl_h2o.options import CloseTheLoopOptions
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 from torchrl_h2o.residuals.report.json_file import write_json
 from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
+from torchrl_h2o.residuals.report.sentence import sentences
 
 
 def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
@@ -113,8 +114,8 @@ def audited(cfg: DictConfig, recording: Recording, simulation: Simulation) -> Au
 
 
 def print_report(report: Report, directory: Path) -> None:
-    """Print the report's one-sentence result, tables of its effects and errors, and the paths of the files written."""
-    print(f"\n{report.sentence()}\n\ndata       {report.data.source}")
+    """Print the result in words, tables of its effects and errors, and the paths of the files written."""
+    print("", *sentences(report), f"\ndata       {report.data.source}", sep="\n")
     if report.found:
         print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
     for found in report.found:

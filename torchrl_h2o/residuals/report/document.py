@@ -43,7 +43,7 @@ class Report(ReportContents):
     """
 
     def sentence(self) -> str:
-        """The whole report in one sentence."""
+        """The result in words: one sentence, and a further one for each qualification."""
         return sentence(self)
 
     def mended(self, env: EnvBase) -> TransformedEnv:

@@ -13,7 +13,7 @@ from torchrl_h2o.effects import is_negligible, quantity_name
 from torchrl_h2o.residuals.report import plots
 from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
 from torchrl_h2o.residuals.report.mended_model import REMEDY
-from torchrl_h2o.residuals.report.sentence import sentence
+from torchrl_h2o.residuals.report.sentence import sentences
 from torchrl_h2o.residuals.report.windows import RunError
 from torchrl_h2o.residuals.report.words import (
     change,
@@ -66,7 +66,7 @@ def report_page(report: ReportContents) -> str:
     environment.filters |= {"number": number, "quantity": quantity}
     return environment.get_template(_TEMPLATE).render(
         report=report,
-        sentence=sentence(report),
+        sentences=sentences(report),
         change=change,
         duration=duration,
         readable=in_readable_unit,

@@ -1,4 +1,4 @@
-"""The whole report in one sentence."""
+"""The result of a report in words: one sentence, and a further one for each qualification."""
 
 from __future__ import annotations
 
@@ -6,40 +6,51 @@ import math
 from collections.abc import Sequence
 from itertools import takewhile
 
-from torchrl_h2o.residuals.report.contents import EXPLAINED_IN_PART, NOT_EXPLAINED, FoundEffect, ReportContents, Verdict
+from torchrl_h2o.residuals.report.contents import EXPLAINED_IN_PART, NOT_EXPLAINED, ReportContents, Verdict
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
 
 MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together
-NOT_IN_CATALOGUE = "Something is missing that this catalogue does not explain"
+NOT_IN_CATALOGUE = "this catalogue does not explain"
 
 
 def sentence(report: ReportContents) -> str:
-    """The whole report in one sentence, and a second one if the audit found severe faults in the data."""
-    if report.audit is None or not report.audit.severe:
-        return _verdict_words(report)
-    faults = "; ".join(finding.words for finding in report.audit.severe)
-    return f"{_verdict_words(report)} Do not rely on this: the data are faulty ({faults})."
+    """The result in words: the sentences of :func:`sentences`, joined."""
+    return " ".join(sentences(report))
 
 
-def _verdict_words(report: ReportContents) -> str:
+def sentences(report: ReportContents) -> list[str]:
+    """The result in words, and what qualifies it.
+
+    Returns:
+        The result; other effects that these data cannot rule out; what the effects found do not explain; and severe
+        faults of the data. Those that do not apply are left out.
+    """
+    words = _verdict_words(report)
+    if report.audit is not None and report.audit.severe:
+        faults = "; ".join(finding.words for finding in report.audit.severe)
+        words.append(f"Do not rely on this: the data are faulty ({faults}).")
+    return words
+
+
+def _verdict_words(report: ReportContents) -> list[str]:
     if report.conclusion is not None:
-        return f"No conclusion: {report.conclusion.rstrip('. ')}."
+        return [f"No conclusion: {report.conclusion.rstrip('. ')}."]
     if report.unfinished is not None:
         so_far = (
             f"so far the simulator lacks {_listed(_found_words(report))}" if report.found else "nothing was found yet"
         )
-        return f"Unfinished, when {report.unfinished}: {so_far}."
+        return [f"Unfinished, when {report.unfinished}: {so_far}."]
     error = _error_words(report.error) if report.error else ""
-    words = _listed(_found_words(report)) + _others_words(report) if report.found else ""
+    words = _listed(_found_words(report)) if report.found else ""
     kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
     if kind == NOT_EXPLAINED:
         attempt = words and f"the best attempt, {words}, is not recommended"
-        return f"{NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."
+        return [f"Something is missing that {NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."]
     if report.found:
-        rest = unknown and f"something else is missing that this catalogue does not explain: {unknown}"
-        return f"Your simulator lacks: {_joined(words, error, rest)}."
-    return f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
+        rest = [f"Something else is missing that {NOT_IN_CATALOGUE}: {unknown}."] if unknown else []
+        return [f"Your simulator lacks: {_joined(words, error)}.", *_alternatives_words(report), *rest]
+    return [f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."]
 
 
 def _unknown_words(verdict: Verdict) -> str:
@@ -54,19 +65,11 @@ def _joined(*parts: str) -> str:
 
 
 def _found_words(report: ReportContents) -> list[str]:
-    """Each effect found, with the alternatives that the data cannot rule out."""
-    others = {effect_name(group.effects[0]): group.words[1:] for group in report.indistinguishable}
-    alone: dict[type, list[str]] = {}  # effects without alternatives; those of one kind are named together
+    """The effects found; those of one kind are named together."""
+    kinds: dict[type, list[str]] = {}
     for found in report.found:
-        if not others.get(found.name):
-            alone.setdefault(type(found.effect), []).append(found.words)
-    words = []
-    for found in report.found:
-        if others.get(found.name):
-            words.append(_one_of(found, others[found.name]))
-        elif alike := alone.pop(type(found.effect), None):
-            words += together(alike)
-    return words
+        kinds.setdefault(type(found.effect), []).append(found.words)
+    return [words for alike in kinds.values() for words in together(alike)]
 
 
 def together(words: Sequence[str]) -> list[str]:
@@ -90,22 +93,22 @@ def _num_alike(phrases: Sequence[Sequence[str]]) -> int:
     return len(list(takewhile(lambda column: len(set(column)) == 1, zip(*phrases, strict=False))))
 
 
-def _others_words(report: ReportContents) -> str:
-    """Other sets of effects that these data cannot rule out; empty if there are none."""
-    if not report.others:
-        return ""
-    more = len(report.others) - 1
-    sets = "one other set" if more == 1 else f"one of {more} other sets"
-    further = f", or {sets} of effects" if more else ""
-    return f", or instead {_listed(report.others[0].words)}{further} (these data cannot tell them apart)"
+def _alternatives_words(report: ReportContents) -> list[str]:
+    """Other effects, and other sets of effects, that these data cannot rule out, in up to two sentences."""
+    others = {effect_name(group.effects[0]): group.words[1:] for group in report.indistinguishable}
+    pairs = [
+        f"{found.words} from {_one_or_count(others[found.name])}" for found in report.found if others.get(found.name)
+    ]
+    words = [f"These data cannot tell {', nor '.join(pairs)}."] if pairs else []
+    if report.others:
+        first, more = _listed(report.others[0].words), len(report.others) > 1
+        sets = f"{len(report.others)} other sets of effects explain" if more else "Another set of effects explains"
+        words.append(f"{sets} these data as well{', such as' if more else ':'} {first}.")
+    return words
 
 
-def _one_of(found: FoundEffect, others: Sequence[str]) -> str:
-    if not others:
-        return found.words
-    if len(others) == 1:
-        return f"either {found.words} or {others[0]} (these data cannot tell them apart)"
-    return f"{found.words} or one of {len(others)} others (these data cannot tell them apart)"
+def _one_or_count(others: Sequence[str]) -> str:
+    return others[0] if len(others) == 1 else f"{len(others)} other effects"
 
 
 def _listed(words: Sequence[str]) -> str:
