@@ -7,7 +7,7 @@ import pytest
 from tests.ended_process import ended_process
 from tests.full_disk import full_disk
 from tests.residuals.report.made_up_reports import full_report, nothing_missing
-from torchrl_h2o.whole_file import remove_partial, write_text
+from torchrl_h2o.whole_file import MACHINE, remove_partial, write_text
 
 
 def contents(folder):
@@ -36,15 +36,17 @@ def test_text_that_cannot_be_written_leaves_the_earlier_file_and_nothing_else(tm
 
 
 def test_the_next_writing_removes_what_a_killed_process_has_left_of_the_same_file(tmp_path):
-    (tmp_path / f".a[1].{ended_process()}.partial.csv").write_text("half")
+    (tmp_path / f".a[1].{MACHINE}-{ended_process()}.partial.csv").write_text("half")
     write_text(tmp_path / "a[1].csv", "whole")
     assert contents(tmp_path) == {"a[1].csv": b"whole"}
 
 
-def test_only_files_and_folders_of_ended_processes_are_removed(tmp_path):
-    ended, parent = ended_process(), os.getppid()
+def test_only_files_and_folders_of_ended_processes_of_this_machine_are_removed(tmp_path):
+    number = ended_process()
+    ended, parent, elsewhere = f"{MACHINE}-{number}", f"{MACHINE}-{os.getppid()}", f"other-{MACHINE}-{number}"
     left = [tmp_path / f".summary.{ended}.partial.json", tmp_path / "deep" / f".mended.{ended}.partial" / "report.json"]
-    kept = [tmp_path / f".summary.{parent}.partial.json", tmp_path / ".my.partial", tmp_path / "a.partial.json"]
+    kept = [tmp_path / f".summary.{process}.partial.json" for process in (parent, elsewhere)]
+    kept += [tmp_path / ".my.partial", tmp_path / "a.partial.json"]
     for path in (*left, *kept):
         write_text(path, "half")
     remove_partial(tmp_path)

@@ -1,12 +1,13 @@
 """Writes files so that a full disk or a kill leaves the earlier one: under a temporary name, renamed when complete.
 
-The temporary name contains the number of the process, so that what a killed process has left can be told from what
-another one is writing.
+The temporary name contains the machine and the number of the process, so that what a killed process has left can be
+told from what another one is writing, also in a folder that several machines share.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import re
 import shutil
 from collections.abc import Iterable, Iterator
@@ -14,7 +15,8 @@ from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 
-_PARTIAL = re.compile(r"\..+\.(\d+)\.partial(\.\w+)?")
+_PARTIAL = re.compile(r"\..+\.([\w-]+)-(\d+)\.partial(\.\w+)?")
+MACHINE = re.sub(r"[^\w-]", "_", platform.node()) or "machine"
 
 
 def partial_name(path: Path) -> Path:
@@ -24,7 +26,7 @@ def partial_name(path: Path) -> Path:
     """
     before, after = f".{path.stem}.", f".partial{path.suffix}"
     _remove_left(path.parent.glob(f"{escape(before)}*{escape(after)}"))
-    return path.with_name(f"{before}{os.getpid()}{after}")
+    return path.with_name(f"{before}{MACHINE}-{os.getpid()}{after}")
 
 
 @contextmanager
@@ -75,7 +77,7 @@ def write_text(path: str | Path, text: str) -> Path:
 def remove_partial(folder: str | Path) -> None:
     """Removes temporary files and folders that killed processes have left in a folder and below it.
 
-    Those of processes that run are left alone.
+    Those of processes that run, and those of other machines, are left alone.
 
     Args:
         folder: the folder.
@@ -86,7 +88,7 @@ def remove_partial(folder: str | Path) -> None:
 def _remove_left(paths: Iterable[Path]) -> None:
     for path in sorted(paths):  # first all names, because the folders change
         named = _PARTIAL.fullmatch(path.name)
-        if named is None or _runs(int(named[1])):
+        if named is None or named[1] != MACHINE or _runs(int(named[2])):
             continue
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -53,6 +53,12 @@ def test_sac_that_uses_no_real_data_stands_at_every_size_and_beside_every_kind_o
     assert points_of([row("sac", 0, 1)]) == {}  # a grid that has not begun to use real data
 
 
+def test_the_table_counts_runs_whose_simulator_mending_left_unchanged():
+    rows = [row("sac", seed, 1, "2.5", mend="true", effects_added=added) for seed, added in enumerate(("0", "4", ""))]
+    assert "nothing added in 1 (3)" in markdown(points_of(rows))
+    assert "nothing added" not in markdown(points_of(some_rows()))
+
+
 def test_runs_with_settings_that_the_figure_does_not_show_are_not_averaged():
     with pytest.raises(MixedRunsError, match=r"two runs of iql have seed 0 in the panel 'standing still' at 2\.5 s"):
         points_of([row("iql", 0, 1, "2.5"), row("iql", 0, 2, "2.5", others="n_steps=10")])

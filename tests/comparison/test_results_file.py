@@ -1,6 +1,7 @@
 """The results file: rows that are taken over, kept from earlier versions, and free of the machine's folders."""
 
 import csv
+import json
 import shlex
 
 import pytest
@@ -11,6 +12,7 @@ from torchrl_h2o.comparison.results_file import (
     RESULT,
     adopt_runs,
     append_rows,
+    append_run,
     identity,
     read_rows,
     repeating_command,
@@ -74,3 +76,22 @@ def test_what_does_not_change_results_does_not_make_another_run(compose):
         cfg.overrides = ["method=iql", *overrides]
         found.append(identity(cfg)["others"])
     assert found == ["", "", "", "", "eval_every=2"]
+
+
+@pytest.mark.parametrize(
+    ("mend", "mended", "column"),
+    [
+        (None, None, ""),
+        (True, None, "0"),
+        (True, {"effects": [{"effect": "Gravity", "scale": 0.5}], "worlds": None}, "1"),
+    ],
+)
+def test_a_run_records_how_many_effects_mending_has_added(compose, tmp_path, mend, mended, column):
+    cfg, _ = compose("method=iql", config="train")
+    cfg.mend, cfg.mended = mend, mended
+    real = {"mean": 1.0, "std": 0.0, "episodes": 1, "mean_length": 2.0}
+    summary = {"return_real": real, "return_data": {"mean": 1.0}, "updates_per_second": 1.0, "versions": {}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    (tmp_path / "metrics.csv").write_text("updates,return_real,return_real_std,length_real\n1,1,0,2\n")
+    append_run(tmp_path / "results.csv", cfg, tmp_path)
+    assert [row["effects_added"] for row in read_rows(tmp_path / "results.csv")] == [column]

@@ -24,7 +24,7 @@ from torchrl_h2o.residuals.report.contents import (
     Verdict,
 )
 from torchrl_h2o.residuals.report.errors import ErrorSummary
-from torchrl_h2o.training import cached_search
+from torchrl_h2o.training import cache_key, cached_search
 from torchrl_h2o.training.cached_search import BLOCK, MOST_ROWS, digest, searched_rows
 from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.environments import simulator_maker, task_of
@@ -74,7 +74,12 @@ def pendulum(tmp_path, monkeypatch):
 
 def cached(pendulum_task, real):
     """The folder of the cache for a search."""
-    return cache_folder() / "mended" / digest(pendulum_task.config["make"], pendulum_task.simulator, real)
+    return cache_folder() / "mended" / key_of(pendulum_task, real)
+
+
+def key_of(task, real):
+    """The key of a search in the cache."""
+    return digest(task.make_simulator(), task.simulator, task.config["make"], real)
 
 
 def new_folder(folder, name):
@@ -142,16 +147,37 @@ def test_a_report_that_advises_against_its_effects_is_named(compose, tmp_path, c
 
 def test_data_simulator_and_settings_tell_searches_apart(pendulum, monkeypatch):
     _, task, real, _ = pendulum
-    make = task.config["make"]
-    one = digest(make, task.simulator, real)
-    changed = real.clone()
+    one = key_of(task, real)
+    assert key_of(task, real.clone()) == one
+    changed, estimated, several = real.clone(), real.clone(), real.clone()
     changed["next", "observation"][7, 1] += 1e-6
-    assert digest(make, task.simulator, real.clone()) == one
-    others = {digest(make, task.simulator, changed), digest(make, (), real), digest(make, (Gravity(1.9),), real)}
+    estimated["observation_std"] = torch.full_like(real["observation"], 0.1)
+    several["log"] = (torch.arange(len(real)) >= 200).long()
+    others = {key_of(task, rows) for rows in (changed, estimated, several)}
+    others |= {key_of(replace(task, simulator=effects), real) for effects in ((), (Gravity(1.9),), (ActionDelay(0.1),))}
     monkeypatch.setitem(cached_search.SEARCH, "held_out", 0.4)
-    others.add(digest(make, task.simulator, real))
-    assert len(others) == 4
+    others.add(key_of(task, real))
+    assert len(others) == 7
     assert one not in others
+
+
+def test_the_model_and_the_code_tell_searches_apart(pendulum, monkeypatch, tmp_path):
+    _, task, real, _ = pendulum
+    one = key_of(task, real)
+    simulator = task.make_simulator()
+    mujoco_model(simulator).geom_size[-1, 0] *= 1.01  # as if the user had edited the model's file
+    assert digest(simulator, task.simulator, task.config["make"], real) != one
+    (tmp_path / "residuals").mkdir()
+    (tmp_path / "residuals" / "fit.py").write_text("tolerance = 1")
+    monkeypatch.setattr(cache_key.torchrl_h2o, "__file__", str(tmp_path / "__init__.py"))
+    keys = []
+    for code in ("tolerance = 1", "tolerance = 2", "tolerance = 1"):
+        (tmp_path / "residuals" / "fit.py").write_text(code)
+        cache_key.code_of.cache_clear()
+        keys.append(key_of(task, real))
+    cache_key.code_of.cache_clear()
+    assert one not in keys
+    assert keys[0] == keys[2] != keys[1]
 
 
 def test_a_resumed_run_reads_the_report_in_its_folder(pendulum):
@@ -192,6 +218,18 @@ def test_a_search_that_fails_is_recorded_and_does_not_end_the_run(pendulum, caps
         part["observation"] = part["observation"][:, :3]
     assert_nothing_is_added(cfg, task, narrow, folder, "the search failed (DataError: ", capsys)
     assert not cached(task, narrow).exists()  # the next run tries again
+
+
+def test_a_defect_of_the_search_ends_the_run(pendulum, monkeypatch):
+    cfg, task, real, folder = pendulum
+
+    def close_the_loop(*_, **__):
+        raise AttributeError("a defect")
+
+    monkeypatch.setattr(cached_search, "close_the_loop", close_the_loop)
+    with pytest.raises(AttributeError, match="a defect"):
+        find_missing_effects(cfg, task, real, folder)
+    assert not (folder / "mended").exists()  # the same command searches again
 
 
 def test_too_few_rows_are_refused_without_an_error(pendulum, capsys):

@@ -42,12 +42,21 @@ NOTES = (
 
 @dataclass(frozen=True)
 class Run:
-    """One run in reality: its return, seconds balanced (mean length of an episode) and mean speed forward (m/s)."""
+    """One run in reality.
+
+    Args:
+        seed: the run's seed.
+        value: its return.
+        seconds: seconds balanced, the mean length of an episode.
+        speed: mean speed forward in m/s; None if it does not have to move.
+        is_unmended: whether ``mend`` has added no effect to its simulator.
+    """
 
     seed: int
     value: float
     seconds: float
     speed: float | None
+    is_unmended: bool = False
 
 
 Points = Mapping[str, Mapping[str, Mapping[float, list[Run]]]]
@@ -67,7 +76,13 @@ def points_of(rows: Iterable[Row]) -> Points:
         method, panel = row["method"] + SUFFIXES.get(row["mend"], ""), _OF_ENV.get(row["env"])
         if method not in METHODS or panel is None or row["mend"] not in SUFFIXES:
             continue
-        run = Run(int(row["seed"]), float(row["return_mean"]), float(row["seconds"]), _speed(row))
+        run = Run(
+            int(row["seed"]),
+            float(row["return_mean"]),
+            float(row["seconds"]),
+            _speed(row),
+            row.get("effects_added") == "0",
+        )
         for where, size in _places(row, method, panel):
             runs = points[where][method][size]
             if any(run.seed == other.seed for other in runs):
@@ -132,4 +147,6 @@ def _cell(runs: list[Run]) -> str:
     speeds = [run.speed for run in runs if run.speed is not None]
     if speeds:
         parts.append(f"{statistics.mean(speeds):.2f} m/s")
+    if unmended := sum(run.is_unmended for run in runs):
+        parts.append(f"nothing added in {unmended}")
     return "; ".join(parts) + f" ({len(runs)})"

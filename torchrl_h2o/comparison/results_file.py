@@ -45,6 +45,7 @@ RESULT = (
     "seconds",  # mean length of an episode
     "mean_v",
     "max_abs_x",
+    "effects_added",  # to the simulator by the option mend; empty without it, and in files of earlier versions
     "return_data",
     "updates_per_second",
     "versions",
@@ -129,6 +130,7 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
         "episodes": real["episodes"],
         "seconds": _rounded(real["mean_length"] * cfg.env.seconds_per_step),
         **{column: _observed(real, *where) for column, where in OBSERVED.items()},
+        "effects_added": _effects_added(cfg),
         "return_data": _rounded(summary["return_data"]["mean"]),
         "updates_per_second": _rounded(summary["updates_per_second"]),
         "versions": " ".join(f"{name}={number}" for name, number in summary["versions"].items()),
@@ -137,6 +139,13 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
     with open(directory / "metrics.csv", newline="") as file:
         curve = [who | _point(row, cfg.env.seconds_per_step) for row in csv.DictReader(file)]
     _append(path, result, curve)
+
+
+def _effects_added(cfg: DictConfig) -> int | str:
+    """Return how many effects ``mend`` has added to the simulator, or an empty text without ``mend``."""
+    if not cfg.get("mend"):
+        return ""
+    return 0 if cfg.get("mended") is None else len(cfg.mended["effects"])
 
 
 def _observed(real: Mapping, quantity: str, statistic: str) -> float | str:

@@ -1,4 +1,4 @@
-"""Reports of closing the loop, cached by the data, the simulator and the settings of the search.
+"""Reports of closing the loop, cached by the data, the simulator, the settings and the code of the search.
 
 A search takes minutes, and the runs of a grid share their data and simulators: the first run searches, the others wait
 for its report. The cache is in the folder of the recordings, see :func:`~torchrl_h2o.training.real_data.cache_folder`.
@@ -6,8 +6,6 @@ for its report. The cache is in the folder of the recordings, see :func:`~torchr
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -21,16 +19,19 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from torchrl_h2o import __version__
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 from torchrl_h2o.effects import Effect, effect_to_dict
 from torchrl_h2o.residuals import LoopSettings, Report, close_the_loop
+from torchrl_h2o.training.cache_key import SEARCHES, begin_key
 from torchrl_h2o.training.real_data import cache_folder
 
 MOST_ROWS = 20_000  # a search fits and judges a few thousand windows; more rows cost time and add little precision
 BLOCK = 1_000  # rows in sequence, of data that are longer
 SEARCH = {"held_out": 0.25, "seed": 0}
-READ = ("observation", "action", ("next", "observation"), ("next", "done"), "time")  # by the search, if there
+READ = (  # by the search, if the data have them
+    *("observation", "action", ("next", "observation"), ("next", "done")),
+    *("time", "log", "observation_std"),
+)
 
 
 def cached_report(
@@ -56,10 +57,12 @@ def cached_report(
         ValueError: if the simulator's state cannot be computed from its observations.
     """
     rows = searched_rows(real)
-    cached = cache_folder() / "mended" / digest(make, effects, rows)
+    cached = cache_folder() / "mended" / digest(simulator, effects, make, rows)
     cached.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(cached.with_suffix(".lock")):  # another process may be at the same search; its report is then read
-        if not cached.exists():
+        if cached.exists():
+            tqdm.write(f"mend: these data were searched before; the report is in {cached}")
+        else:
             chosen = f"{len(rows)} of {len(real)} rows" if len(rows) < len(real) else f"all {len(real)} rows"
             tqdm.write(f"mend: searching {chosen} for effects that the simulator lacks; this takes minutes")
             report = close_the_loop(simulator, rows, source=f"{source}, {chosen}", **SEARCH)
@@ -87,10 +90,17 @@ def searched_rows(real: TensorDictBase) -> TensorDictBase:
     return cast(TensorDictBase, torch.cat([real[start : start + BLOCK] for start in starts]))  # typed as a tensor
 
 
-def digest(make: Mapping[str, Any], effects: tuple[Effect, ...], rows: TensorDictBase) -> str:
-    """Identifies a search by the simulator, the data's values, the settings and the library's version."""
-    settings = [make, [*map(effect_to_dict, effects)], asdict(LoopSettings()), SEARCH, __version__]
-    total = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+def digest(simulator: EnvBase, effects: tuple[Effect, ...], make: Mapping[str, Any], rows: TensorDictBase) -> str:
+    """Identifies a search by the simulator, the data's values, the settings and the code.
+
+    Args:
+        simulator: the simulator with its effects.
+        effects: these effects, because the model does not show those on actions, observations and forces.
+        make: target and arguments of the simulator's env without effects.
+        rows: the transitions that are searched.
+    """
+    settings = [dict(make), [*map(effect_to_dict, effects)], asdict(LoopSettings()), SEARCH]
+    total = begin_key(settings, simulator, SEARCHES)
     for key in READ:
         if (values := rows.get(key, None)) is not None:
             total.update(f"{key} {values.dtype} {tuple(values.shape)}".encode())

@@ -15,6 +15,7 @@ from torchrl_h2o.data.readers.sources import Source, words_of
 from torchrl_h2o.effects import Effect, effect_to_dict
 from torchrl_h2o.options.run import POSTERIOR_WORLDS
 from torchrl_h2o.residuals import Report
+from torchrl_h2o.residuals.close_the_loop import FAILURES
 from torchrl_h2o.residuals.report.contents import DataSummary
 from torchrl_h2o.training.cached_search import cached_report, write_whole
 from torchrl_h2o.training.task import Task
@@ -41,8 +42,8 @@ def prepare_mending(cfg: DictConfig) -> None:
 def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, directory: Path) -> dict[str, Any] | None:
     """Closes the loop between the real data and the simulator if ``mend`` is set, and writes ``mended/report.json``.
 
-    A run that is resumed reads the report in its folder. A search that fails does not end the run: the report then
-    contains the reason and no effects. Effects that the report does not recommend are not used.
+    A run that is resumed reads the report in its folder. If the data cannot be searched, the run goes on, and the
+    report contains the reason and no effects. Effects that the report does not recommend are not used.
 
     Args:
         cfg: the run's configuration.
@@ -74,7 +75,7 @@ def _search(task: Task, real: TensorDictBase, data: Source, folder: Path) -> Rep
     source = Path(data).name if isinstance(data, str) and Path(data).exists() else words_of(data)
     try:
         return cached_report(task.make_simulator(), task.simulator, task.config["make"], real, source, folder)
-    except Exception as error:  # of any kind, because training is possible without the result
+    except FAILURES as error:  # data that do not fit the simulator, or leave its equations singular
         reason = f"the search failed ({type(error).__name__}: {' '.join(str(error).split())})"
         report = Report(simulator=task.name, data=DataSummary(source, len(real), 0), conclusion=reason)
         write_whole(report, folder)

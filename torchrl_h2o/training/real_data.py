@@ -1,24 +1,22 @@
 """Real transitions of a run, read from a data set or a log, or recorded once in ``reality`` and cached."""
 
-import contextlib
-import hashlib
-import json
 import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
+from filelock import FileLock
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-from torchrl_h2o import __version__
-from torchrl_h2o.data import DataError, check_specs, episodes, load, read_ted, write_ted
+from torchrl_h2o.data import check_specs, episodes, load, read_ted, write_ted
 from torchrl_h2o.data.readers.sources import Source, is_log, words_of
 from torchrl_h2o.envs import record
 from torchrl_h2o.options.sources import RECORDED
+from torchrl_h2o.training.cache_key import SIMULATES, begin_key
 from torchrl_h2o.training.returns import Evaluation
 
 
@@ -95,13 +93,13 @@ def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
             "such as data=halfcheetah/medium-replay-v0"
         )
     made_of = [config[key] for key in ("make", "reality", "behaviour", "recording")]
-    digest = hashlib.sha256(json.dumps([made_of, __version__], sort_keys=True).encode()).hexdigest()[:12]
+    digest = begin_key(made_of, reality, SIMULATES).hexdigest()[:12]
     name = re.sub(r"[^\w-]+", "_", config["name"])  # no path, because a folder from somebody else may name the env
     folder = cache_folder() / f"{name}_{digest}"
-    if not folder.exists():
-        data = record(reality, instantiate(config["behaviour"]), **config["recording"])
-        with contextlib.suppress(DataError):  # another run may have written the folder in the meantime
-            write_ted(data, folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder.with_name(f"{folder.name}.lock")):  # several runs of a grid may begin at once
+        if not folder.exists():
+            write_ted(record(reality, instantiate(config["behaviour"]), **config["recording"]), folder)
     return read_ted(folder)
 
 

@@ -12,7 +12,7 @@ from tests.residuals.report.made_up_reports import DATA, full_report, nothing_mi
 from torchrl_h2o.effects import ActionDelay, ActionGain, BodyMass, Gravity, JointDamping
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.residuals import Measured, Simulation, close_the_loop, residuals
-from torchrl_h2o.residuals.report.contents import FoundEffect, IndistinguishableGroup
+from torchrl_h2o.residuals.report.contents import FoundEffect, IndistinguishableGroup, OtherExplanation
 from torchrl_h2o.residuals.report.document import Report
 
 
@@ -47,6 +47,14 @@ def test_draws_repeat_with_their_seed_and_a_longer_sample_begins_with_the_shorte
     assert full_report().sample(6) == full_report().sample(6) != full_report().sample(6, seed=1)
     assert full_report().sample(9)[:6] == full_report().sample(6)
     assert len(set(full_report().sample(20))) == 20
+
+
+def test_other_sets_of_effects_are_drawn_as_often_as_the_effects_found():
+    found = report((Gravity(0.5), {}))
+    other = OtherExplanation((BodyMass(1.2), JointDamping(0.1)), 0.1, "faster motion")
+    draws = dataclasses.replace(found, others=(other,)).sample(1000)
+    assert set(draws) == {(Gravity(0.5),), (BodyMass(1.2), JointDamping(0.1))}
+    assert draws.count(other.effects) == pytest.approx(500, abs=60)
 
 
 def test_every_explanation_that_the_data_allow_is_drawn_equally_often():

@@ -86,8 +86,8 @@ class Report(ReportContents):
     def sample(self, n: int, *, seed: int = 0) -> list[tuple[Effect, ...]]:
         """Draws lists of effects from what the data leave open, for domain randomisation.
 
-        Each draw chooses an explanation: the effects found, or those with one of them replaced by an alternative, as
-        they were fitted together. All explanations have the same weight, because the search's test found none of them
+        Each draw chooses an explanation: the effects found, those with one of them replaced by an alternative, as they
+        were fitted together, or another set of effects. All explanations have the same weight, because the search's test found none of them
         worse than the first at its level; a likelihood computed from their errors would treat successive rows as
         independent and decide by differences that are smaller than the scatter between blocks of the data. Then each
         parameter with a 95 % interval is drawn from a normal distribution around the fitted value with this interval,

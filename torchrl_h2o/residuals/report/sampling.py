@@ -27,9 +27,10 @@ def sample(report: ReportContents, n: int, *, seed: int = 0) -> list[tuple[Effec
 
 
 def explanations_of(report: ReportContents) -> list[Fitted]:
-    """The report's explanation, then one for each alternative, in which the alternative replaces its effect.
+    """The report's explanation, one for each alternative to an effect, and one for each other set of effects.
 
-    Two effects are never replaced at once: alternatives were compared with the data one at a time.
+    Two effects are never replaced at once: alternatives were compared with the data one at a time. The values of other
+    sets have no intervals.
     """
     found: Fitted = tuple((part.effect, part.ci95) for part in report.found)
     alternatives = [
@@ -37,7 +38,8 @@ def explanations_of(report: ReportContents) -> list[Fitted]:
         for group in report.indistinguishable
         for effect, together in zip(group.effects[1:], group.together[1:], strict=True)
     ]
-    return [found, *alternatives]
+    sets: list[Fitted] = [tuple((effect, {}) for effect in other.effects) for other in report.others]
+    return [found, *alternatives, *sets]
 
 
 def _replaced(found: Fitted, old: Effect, new: Effect) -> Fitted:
