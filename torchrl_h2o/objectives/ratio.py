@@ -233,9 +233,9 @@ def fit_change_scale(
 class DynamicsRatioLoss(HybridLoss):
     r"""Cross-entropy of the two discriminators, with equal weight on both streams.
 
-    In training mode, Gaussian noise is added to all inputs; after ``loss.eval()``, none is added. In evaluation mode,
-    ``accuracy`` on a held-out batch therefore measures how well the discriminator detects the dynamics gap (0.5 is
-    chance).
+    In training mode, Gaussian noise is added to the inputs, by default to all of them (see ``input_noise``); after
+    ``loss.eval()``, none is added. In evaluation mode, ``accuracy`` on a held-out batch therefore measures how well the
+    discriminator detects the dynamics gap (0.5 is chance).
 
     By default each network is trained by its own loss, unlike in the authors' code; see ``detach_residual`` of
     :class:`DynamicsRatioEstimator`.

@@ -139,7 +139,7 @@ def explain(
         rng: generator for screened windows and synthetic noise.
         progress: bar that shows how far the search is, and its stage.
         known: effects from which the search begins.
-        so_far: called with a preliminary explanation, and what was going on, as it grows.
+        so_far: called with a preliminary explanation, as it grows, and the current stage.
         settings: thresholds and budgets.
 
     Returns:

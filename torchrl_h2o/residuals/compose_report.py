@@ -102,7 +102,7 @@ def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) 
     Args:
         evidence: the simulator and the data.
         explanation: the effects so far.
-        stage: what was going on.
+        stage: the current stage, in words.
     """
     simulation = evidence.simulation
     words, units = partial(effect_words, names=simulation.names), partial(effect_units, names=simulation.names)
@@ -120,7 +120,7 @@ def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) 
 
 
 def _fitted_together(explanation: Explanation) -> dict[Effect, Fitted]:
-    """By alternative: the explanation that contains it, as fitted; empty if an undeclared force changed the values."""
+    """Maps each alternative to the explanation refitted with it; empty if an undeclared force changed the values."""
     trace, count = explanation.trace, len(explanation.trace.fit.effects)
     if explanation.effects[:count] != trace.fit.effects:
         return {}

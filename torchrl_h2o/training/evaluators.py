@@ -77,7 +77,10 @@ class _ThisProcess:
 
 
 class _SecondProcess:
-    """Sends policies through a pipe to a process that ends when the pipe is closed, also by a kill of this process."""
+    """Sends policies through a pipe to a second process.
+
+    The second process ends when the pipe closes, also if this process is killed.
+    """
 
     def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
         context = multiprocessing.get_context("spawn")  # a forked process would share locks of torch's threads

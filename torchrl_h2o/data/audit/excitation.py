@@ -127,7 +127,7 @@ def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: Audi
             note.words.startswith(f"{effect} and motor gain of {gain.joint} ") for note in pairs for effect in _JOINT
         ):
             continue
-        # the whole mass and a gain always show as their ratio, which is a note of its own
+        # total mass and motor gain are only identifiable as a ratio, which has a note of its own
         others = [s for s in found if s.joint in (gain.joint, "") and s.effect in (*_JOINT, "gravity")]
         if not others:
             continue

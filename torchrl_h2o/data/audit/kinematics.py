@@ -69,7 +69,7 @@ def _moves(log: Log, pair: Pair) -> bool:
 
 
 def _explained(derivative: Derivative, step: Response | None, settings: AuditSettings) -> bool:
-    """Whether the simulator leads to the measured positions, so that a factor beside 1 is due to coarse sampling."""
+    """Whether the simulator reproduces the positions; a factor other than 1 is then due to coarse sampling."""
     low, high = settings.scale_severe
     if step is None or not low <= derivative.factor <= high:
         return False

@@ -11,8 +11,8 @@ from torchrl_h2o.data.audit.settings import AuditSettings
 def lag_of_events(response: Response, settings: AuditSettings) -> int:
     """Lag in rows at which sudden changes of the actions and of the accelerations coincide; 0 if it is not clear.
 
-    Smooth actions tell little about their lag beside friction and masses that are not known exactly. Second differences
-    of the velocities leave these out. The lag must be the same over one and two rows, and significant.
+    If actions are smooth, errors of the friction and the masses hide the lag. Second differences of the velocities
+    contain little of these errors. The lag must be significant, and the same for differences over one and two rows.
     """
     found = {_lag_of_changes(response, rows, settings) for rows in (1, 2)}
     return found.pop() if len(found) == 1 else 0

@@ -1,4 +1,4 @@
-"""Checks of units, signs, order and zeros that only the simulator can tell: the columns agree among themselves."""
+"""Checks that need the simulator: faults of units, signs, order and zeros that leave the columns consistent."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Change = Callable[[np.ndarray], np.ndarray]
 
 
 def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
-    """Asks whether the simulator fits much better to scaled, reversed, exchanged or shifted columns.
+    """Checks whether the simulator fits the data much better after columns are scaled, reversed, exchanged or shifted.
 
     Args:
         response: simulated windows.

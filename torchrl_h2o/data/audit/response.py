@@ -115,8 +115,8 @@ class Response:
     def anchor(self) -> np.ndarray:
         """Actions of the windows about which the simulation is linearised, (W, H, nu).
 
-        They are the logged ones, or zero if these do not bring the simulator nearer to the log: the error of the
-        linearisation about wrong actions would follow them.
+        The logged actions, or zero if they do not reduce the simulator's error: linearising about wrong actions adds an
+        error correlated with them.
         """
         logged = self.limited[self.rows]
         without = self.misfit(actions=np.zeros_like)
@@ -272,7 +272,7 @@ def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, settings: AuditSet
 def _settled(
     log: Log, simulation: AuditedSimulation, states: np.ndarray, actions: np.ndarray, starts: np.ndarray, steps: int
 ) -> np.ndarray:
-    """States of some rows; unobserved coordinates are simulated from some steps before, with the others measured."""
+    """Start states of windows; unobserved coordinates are simulated over the steps before, with the others measured."""
     chosen = states[starts]
     if steps:
         before = starts + np.arange(-steps, 0)[:, None]

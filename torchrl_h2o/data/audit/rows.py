@@ -93,7 +93,7 @@ def _duplicates(log: Log, settings: AuditSettings) -> list[Finding]:
 
 
 def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: AuditSettings) -> list[Finding]:
-    """Rows after which positions are where neither their velocities nor the simulator lead."""
+    """Rows whose next position agrees neither with the integrated velocity nor with the simulator."""
     size = np.zeros(len(log))
     repeated = (log.following == log.observation).all(1)
     known = log.clipped | repeated | np.append(False, repeated[:-1])
@@ -104,7 +104,7 @@ def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray, settings: 
         spread = position_spread(log, pair)
         # where most rows jump, the usual deviation is that of jumps
         usual = max(min(settings.jump_noise * deviation(error), spread), settings.jump * spread)
-        # a velocity that changes within the row accounts for as much
+        # a change of the velocity within the row explains deviations up to this size
         speed = np.maximum(
             2.0 * np.abs(log.following[:, pair.velocity] - log.observation[:, pair.velocity]),
             1.5 * log.observation[:, pair.velocity].std(),
@@ -154,7 +154,7 @@ def _deviations(log: Log, pair: Pair) -> np.ndarray:
 
 
 def _surprising(log: Log, simulation: AuditedSimulation, rows: np.ndarray, settings: AuditSettings) -> np.ndarray:
-    """Which rows the simulator does not lead to either, from a state with the position or velocity measured."""
+    """Mask of rows whose next position neither the integrated velocity nor a simulation from the row reproduces."""
     states = simulation.state_map.states(log.observation[rows])
     reached = simulation.state_map.observations(simulation.rollout(states, log.action[rows][:, None])[:, 0])
     surprising = np.zeros(len(rows), bool)

@@ -134,8 +134,8 @@ class AuditSettings:
     action_matters: float = 0.15
     """Share of the explained change that must be due to actions before conclusions about them are drawn."""
     unrelated: float = 0.05
-    """Share of the variance that actions explain at any lag, relative to the simulator's claim, below which they belong
-    to another run."""
+    """Share of the variance beyond friction that actions explain at their best lag, below which they belong to another
+    run."""
     action_lags: tuple[int, int] = (-5, 40)
     """Rows by which actions may act early or late."""
     clear_lag: int = 4

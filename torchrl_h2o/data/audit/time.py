@@ -19,7 +19,7 @@ CHECK = "time"
 def check_time(
     log: Log, simulation: AuditedSimulation, derivatives: Sequence[Derivative], settings: AuditSettings
 ) -> list[Finding]:
-    """Stamps, the step that the velocities ask for, and rows per period of the model's oscillations."""
+    """Checks the stamps, the time step that the velocities imply, and the rows per period of an oscillation."""
     return [
         *_stamps(log, settings),
         *_step_of_motion(log, derivatives, settings),
@@ -140,7 +140,7 @@ def _step_of_motion(log: Log, derivatives: Sequence[Derivative], settings: Audit
 
 
 def check_step(step: Response | None, settings: AuditSettings) -> list[Finding]:
-    """Whether the simulator leads from row to row in a multiple of its control step, and not in one."""
+    """Whether the simulator reproduces the rows with a multiple of its control step, but not with one step."""
     if step is None:
         return []
     columns = [column for pair in step.log.pairs for column in (pair.position, pair.velocity)]

@@ -219,8 +219,8 @@ class LogColumns:
         """Read a layout from a YAML file, or a layout of the package by its name.
 
         Args:
-            source: a path, or ``"wheel_legged_standing_still"``, ``"wheel_legged_moving_forward"``
-                or ``"simple_pendulum"``.
+            source: a path, or ``"wheel_legged_standing_still"``, ``"wheel_legged_moving_forward"``,
+                ``"simple_pendulum"`` or ``"double_pendulum"``.
 
         Raises:
             DataError: a missing file, invalid YAML, an unknown, duplicate or invalid entry, or contradicting entries.

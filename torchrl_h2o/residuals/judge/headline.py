@@ -18,10 +18,10 @@ _VELOCITY = ("rad/s", "m/s")
 def headline_horizon(
     simulation: Simulation, measured: Measured, settings: JudgeSettings = DEFAULTS.judge
 ) -> int | None:
-    """Control steps ahead at which the sentence reports the error; None if the data hold too few windows.
+    """Control steps ahead at which the report's sentence gives the error; None if the data hold too few windows.
 
-    The shortest of the settings' times at which the simulator's error stands out of the sensors' noise, on the part of
-    the data for fits; the longest possible one if it never does.
+    The shortest of the settings' times at which the simulator's error exceeds the sensors' noise by a factor, on the
+    part of the data for fits; the longest possible time if it never does.
 
     Args:
         simulation: the simulator before effects are put in.

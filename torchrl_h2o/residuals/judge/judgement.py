@@ -181,8 +181,8 @@ def _others(
 ) -> tuple[tuple[RivalSet, float, str], ...]:
     """Error of each other set of effects, and the data that would distinguish it from the effects found.
 
-    There are none beside an undeclared force: these sets explain as much as the catalogue's effects alone, and the
-    force explains more.
+    Empty if the explanation contains an undeclared force: the sets explain only as much as the catalogue's effects
+    alone, and the force explains more.
     """
     if not all(part.declared for part in explanation.parts):
         return ()

@@ -40,8 +40,8 @@ def reach_verdict(
 ) -> Verdict:
     """Reaches a verdict from the part of the data that neither a fit nor a choice has used.
 
-    Nothing is missing only if a classifier, the autocorrelation of the residuals and the error far ahead agree.
-    Otherwise something is missing, and effects that were found explain it wholly, in part or not at all.
+    Nothing is missing if there are no effects and neither a classifier, nor the autocorrelation of the residuals, nor
+    the error far ahead shows a difference. Otherwise the effects explain what is missing wholly, in part or not at all.
 
     Args:
         simulation: the simulator before effects are put in.

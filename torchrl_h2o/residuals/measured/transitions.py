@@ -24,7 +24,11 @@ REMEMBERED = 32  # results that are kept with the data
 
 
 class Split(IntEnum):
-    """What a transition is used for. A figure of a part says nothing about the parts that chose what it measures."""
+    """The use of a transition: fit, selection or report.
+
+    Errors on FIT and SELECTION are biased, because the parameters and the effects were chosen on these parts. Report
+    errors on REPORT only.
+    """
 
     FIT = 0
     """Parameters are fitted to it."""

@@ -72,9 +72,10 @@ class Additions:
 def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> Additions:
     """Finds the sets of entries that lower the held-out loss by enough, and significantly.
 
-    Pairs are tried where no single entry passes the tests, and sets of three where no pair does: one of two effects may
-    increase the loss as long as the other one is missing. They are not tried where so little of the loss is left that
-    even a set that explains all of it would not contribute its share; a single entry may halve what is left instead.
+    Pairs are tried if no single entry passes the tests, and sets of three if no pair does, because one of two effects
+    may increase the loss as long as the other one is missing. Pairs and larger sets are not tried if so little of the
+    loss is left that even a set that explains all of it would not contribute its share. Single entries are always
+    tried, because an entry that halves the present loss may pass without this share.
 
     Args:
         state: effects found so far.
@@ -121,7 +122,7 @@ def tested(
 
 
 def _close_to_best(found: Sequence[Addition], rules: TraceSettings) -> list[Addition]:
-    """The first of these sorted additions, as long as their loss comes close to the lowest one; none twice."""
+    """The leading additions whose loss is close to the lowest, without duplicates; at most ``beam_width``."""
     near = [one for one in found if one.loss <= rules.beam_loss * found[0].loss]
     return distinct(near, _loss, rules.same_fit)[: rules.beam_width]
 
@@ -131,9 +132,15 @@ def _loss(addition: Addition) -> float:
 
 
 def distinct(found: Sequence[Found], loss: Callable[[Found], float], same: float) -> list[Found]:
-    """Those whose loss differs from that of each earlier one by more than a share.
+    """Keeps the first of any items with nearly equal losses.
 
-    Equal losses mean equal motion: a gain of all motors does what the mass of all bodies does.
+    Equal losses are taken as equal motion: for example, a gain of all motors changes the motion as the mass of all
+    bodies does.
+
+    Args:
+        found: the items.
+        loss: returns the loss of an item.
+        same: relative difference up to which two losses count as equal.
     """
     kept: list[Found] = []
     for one in found:
@@ -230,7 +237,7 @@ def _pays(state: SearchState, present: Addition, candidate: Addition) -> bool:
 
 
 def _matters(state: SearchState, present: Addition, candidate: Addition) -> bool:
-    """Whether each added effect contributes its share of the whole reduction, or all of them reduce the rest much."""
+    """Whether the added effects contribute their required shares, or lower the present loss by a large factor."""
     rules = state.settings.trace
     much = candidate.loss < rules.much_lower * present.loss
     share = candidate.added * state.min_share

@@ -70,9 +70,9 @@ def _rivals(state: SearchState, index: int) -> list[Lead]:
 
 
 def _repeats(state: SearchState, index: int, entry: CatalogueEntry) -> bool:
-    """Whether an entry says the same as the effects found in other words.
+    """Whether an entry only regroups the effects found.
 
-    With friction of the hip and of the knee, friction of both in the place of the knee's is no other explanation.
+    Example: with friction of the hip and of the knee found, friction of both in place of the knee's is no alternative.
     """
     simulation, own = state.problem.simulation, state.entries[index]
     others = [other for i, other in enumerate(state.entries) if i != index and type(other.effect) is type(entry.effect)]
@@ -83,10 +83,10 @@ def _repeats(state: SearchState, index: int, entry: CatalogueEntry) -> bool:
 
 
 def _sketched_rivals(state: SearchState, index: int) -> Iterator[tuple[Lead, Fit | None]]:
-    """Rivals with a quick fit of all parameters; None in its place if it misses a minimum share of the effect's gain.
+    """Quick fits of all rivals; None for a rival that the model rejects or that misses a share of the effect's gain.
 
-    A rival that is far from this share after the first evaluations is given up. A rival with the parameters of the
-    effect starts from the effect's values if they are better than those of the screening, which knew fewer effects.
+    A rival that is far from the required share after the first evaluations is given up. A rival with the parameters of
+    the effect starts from the effect's values if they are better than those of the screening, which knew fewer effects.
     """
     rules, effects = state.settings.trace, state.fit.effects
     kept = [effect for i, effect in enumerate(effects) if i != index]

@@ -21,7 +21,7 @@ def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) 
 
 
 def worse_of(state: SearchState, one: Fit, other: Fit) -> Fit | None:
-    """The worse of two explanations, whichever of the two scales the residuals; None if the data leave it open."""
+    """The explanation that is clearly and significantly worse under both scalings of the residuals; None if none is."""
     scaled = [state.rescaled(state.posed_at(scaling.effects)) for scaling in (one, other)]
     for worse, better in ((one, other), (other, one)):
         if all(_is_worse(at, worse, better) for at in scaled):

@@ -35,7 +35,8 @@ def _without_one(state: SearchState) -> SearchState | None:
         kept = (*state.fit.effects[:index], *state.fit.effects[index + 1 :])
         if not is_possible(state.problem, kept) or _is_clearly_needed(state, index):
             continue
-        # an effect that has become neutral is not needed, however a fit without it ends
+        # the joint fit without the effect is a candidate as well: it is the better one if the effect has become neutral
+        # and the new fit ends in a worse minimum
         fits = (state.refitted(entries, kept), state.fit.without(index))
         after, fitted = min(((state.selection_losses(one.effects), one) for one in fits), key=lambda one: one[0].mean())
         level = state.settings.significance.level

@@ -1,7 +1,7 @@
 """Grows lists of effects side by side (a beam search): adds sets, drops what they make redundant, and rescales.
 
-A search that keeps only one list goes astray where a wrong effect imitates two right ones. A heavier torso and friction
-of the axles look like heavier wheels until one of the two has been put in.
+A search that keeps only one list fails if a wrong effect imitates two right ones. For example, a heavier torso and
+friction of the axles together look like heavier wheels until one of the two has been added.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def grow(
 ) -> SearchState:
     """Adds effects until no addition passes the tests, the limit is reached, or the residual is within rounding.
 
-    The first effect is chosen while all others are missing, so that a wrong one may look far better than a right one.
-    After the second round, pairs are therefore grown as well whose first effect was not among the best single ones.
+    The first effect is chosen while all others are missing, so a wrong one may look far better than a right one. After
+    the second round, the lists therefore also include pairs whose first effect was not among the best single ones.
 
     Args:
         state: effects found so far.
@@ -122,8 +122,8 @@ def _names(state: SearchState) -> frozenset[str]:
 def _closest(states: Sequence[SearchState]) -> list[SearchState]:
     """The states whose loss comes close to the lowest one, in ascending order of their loss.
 
-    The losses are compared with residuals scaled by what the best list leaves, because those with the scales of the
-    first effect say little about the last one.
+    The losses are compared with residuals scaled by what the best list leaves. Scaled by their size before the first
+    effect, the residuals would hardly show what the last effect changes.
     """
     rules = states[0].settings.trace
     means = [float(losses.mean()) for losses in _comparable_losses(states)]

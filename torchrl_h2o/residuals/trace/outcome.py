@@ -35,7 +35,7 @@ class Attempt:
 
 
 class Question(NamedTuple):
-    """The question which other entries explain the data as well in the place of an effect.
+    """Key of a search for alternatives: the effect, all effects found, and whether only rounding remains.
 
     Args:
         name: name of the effect's entry.

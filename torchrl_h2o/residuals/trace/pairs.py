@@ -1,4 +1,4 @@
-"""Finds pairs of entries from the fits of single ones, so that a pair is found whose first effect was passed over."""
+"""Predicts pairs from fits of single entries, to find pairs whose first entry alone was not among the best."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PAIR = 2
 def pairs_by_prediction(
     singles: Additions, seen: Collection[frozenset[str]], to_beat: float, rng: np.random.Generator
 ) -> Additions:
-    """Finds pairs whose first entry was fitted alone, however far it is from the best single one.
+    """Finds pairs whose first entry passed the tests alone, also if its loss is far above that of the best entry.
 
     The residual of a pair is predicted without simulation: what the first entry's fit leaves, plus the change by the
     second entry that the screening found. The pairs with the lowest predicted loss get a quick fit, and those that come

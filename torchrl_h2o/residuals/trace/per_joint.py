@@ -19,7 +19,7 @@ def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchSta
     """Replaces effects on several joints or motors by one effect each, where that lowers the loss significantly.
 
     One value for all is the simpler explanation and is found first; a hip and a knee may still differ. The division
-    that lowers the loss most comes first, because a wrong value of one effect may be made up by another's division.
+    that lowers the loss most is tested first, because dividing one effect may compensate a wrong value of another.
 
     Args:
         state: effects found.
@@ -91,7 +91,7 @@ def _pays(state: SearchState, divided: SearchState, rng: np.random.Generator) ->
     least = rules.min_gain_under_noise if noisy else rules.min_gain
     if gain <= least or state.p_value(before, after) >= state.settings.significance.level:
         return False
-    if noisy:  # the whole reduction of the loss also contains that of the noise, so a share of it says little
+    if noisy:  # the total reduction includes the noise, so a share of it is no criterion
         free = [free_parameters(entry) for entry in divided.entries]
         return gain > rules.beyond_noise * explained_by_noise(state, divided.fit.effects, free, rng)
     one, each = (state.first.selection_loss(which.fit.effects) for which in (state, divided))

@@ -120,8 +120,9 @@ class Problem:
     def within_rounding(self) -> bool:
         """Whether the residual is within the rounding of single-precision data, or of the unobserved coordinates.
 
-        The mean residual counts. Where coordinates are unobserved, it is a high quantile: a wheel's speed is not known
-        just after the wheel has landed, so the true effects, too, leave large residuals in about 1 % of the rows.
+        The mean absolute residual is compared with the rounding or, if coordinates are unobserved, a high quantile that
+        leaves out the largest residuals. A wheel's speed, for example, is not known just after the wheel has landed, so
+        even the true effects leave large residuals in about 1 % of the rows.
         """
         measured, fitted = self.measured, self.measured.fitted(self.horizon)
         left = self._missed((), fitted)
@@ -178,10 +179,10 @@ class Problem:
 
 
 def _typical_size(found: np.ndarray, rounding: np.ndarray, settings: ResidualSettings) -> np.ndarray:
-    """Median of absolute residuals (W, H, n) in each dimension, (n), or what rounding makes of them, if that is more.
+    """Median of absolute residuals (W, H, n) in each dimension, (n), at least the rounding error.
 
-    If the cause is at work in less than half of the data, such as a force that begins late, the median is rounding, and
-    residuals in this scale would be cut off. Their own median is then the typical size.
+    If fewer than half of the rows show the cause, such as a force that begins late, the median is rounding. If too many
+    residuals therefore exceed the bound ``settings.worst`` in this scale, the median of these larger ones is used.
     """
     typical = np.maximum(np.nanmedian(found, axis=(0, 1)), rounding)
     cut_off = found > settings.worst * typical

@@ -1,4 +1,4 @@
-"""Scales the residuals by what the effects found leave, and fits these effects once more where that is much less."""
+"""Scales residuals by their size with the effects found, and refits if that size fell much or start states changed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from torchrl_h2o.residuals.trace.state import SearchState
 def rescale(state: SearchState) -> SearchState:
     """Scales residuals by their present size.
 
-    Refits once if the better simulator gives other observed start states, or a sharper measure of what is left: a fit
-    ends where its loss hardly changes, which may be far from the rounding of the data.
+    Refits once if the start states of observed coordinates have changed, or if the scale of the residuals has fallen
+    much. With the larger scale, a fit stops early: its loss hardly changes although the residual is far above rounding.
     """
     posed = state.posed_at(state.fit.effects)
     rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
@@ -34,7 +34,7 @@ def rescale(state: SearchState) -> SearchState:
 def _refitted(state: SearchState, *, again: bool) -> Fit:
     """Refits the effects found.
 
-    Contacts make the residual jump, and jumps within the small differences can hide where the loss falls.
+    Contacts make the residual discontinuous, so small finite differences may miss the descent direction.
 
     Args:
         state: effects found.

@@ -36,7 +36,8 @@ def with_most_usual_set(
         The state with the most usual set, unchanged if that is the one found, and the other sets, in ascending order of
         their surprise and loss.
     """
-    if not state.entries or (state.exact and len(state.entries) == 1):  # what equals a single effect is in its group
+    # the alternatives of a single exact effect are already in its group
+    if not state.entries or (state.exact and len(state.entries) == 1):
         return state, ()
     sets = rival_sets(state, advance)
     own_loss = float(state.selection_losses(state.fit.effects).mean())
@@ -51,9 +52,9 @@ def with_most_usual_set(
 def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None) -> tuple[RivalSet, ...]:
     """Sets of one to three effects whose loss is not significantly higher than that of the effects found.
 
-    Residuals are scaled by their size without effects, which favours no set. There, the noise of one quantity may hide
-    a difference in another. A set is therefore also ruled out if it is worse both with residuals scaled by what the
-    effects found leave and with residuals scaled by what the set itself leaves.
+    Residuals are scaled by their size without effects, which favours no set. With this scaling, the noise of one
+    quantity may hide a difference in another. A set is therefore also ruled out if it is worse both with residuals
+    scaled by what the effects found leave and with residuals scaled by what the set itself leaves.
     """
     rules = state.settings.trace
     state = state.rescaled(state.posed_at(()))
@@ -85,7 +86,7 @@ def _is_plausible(state: SearchState, fitted: Fit) -> bool:
 
 
 def _sketched_sets(state: SearchState, advance: Callable[[], object]) -> list[tuple[list[CatalogueEntry], Fit]]:
-    """The most promising sets of each size with a quick fit, those that reach a share of the gain."""
+    """The most promising sets of each size whose quick fit reaches the required share of the gain, with these fits."""
     rules, screened = state.settings.trace, state.windows.screened
     leads = screen(state.problem, (), state.catalogue, screened)
     among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]

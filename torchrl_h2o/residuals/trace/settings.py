@@ -17,7 +17,7 @@ class SignificanceSettings:
     blocks: int = 30
     """Blocks of neighbouring windows that are treated as independent."""
     max_odds: float = 100.0
-    """Largest factor that a single block may contribute to the payoff of the bet."""
+    """Largest factor that a single block may contribute to the heuristic statistic of the third test."""
     loss_floor: float = 1e-6
     """Smallest typical loss of a block, as a share of the mean loss."""
 

@@ -18,8 +18,8 @@ def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -
     """Simplifies the effects found one by one; the state's groups then hold the alternatives of each.
 
     The most unusual effect comes first, because it is the most likely one to stand in for another. Ends without groups
-    as soon as a better effect leaves only rounding: all alternatives depend on it. The alternatives of an effect beside
-    the same others as in an earlier round are not looked for again.
+    as soon as a better effect leaves only rounding, because the alternatives found so far depend on this. If an effect
+    was examined beside the same others in an earlier round, the alternatives of that round are used.
 
     Args:
         state: effects found.
@@ -38,7 +38,7 @@ def simplify(state: SearchState, advance: Callable[[], object] = lambda: None) -
 
 
 def _question(state: SearchState, index: int) -> Question:
-    """What the alternatives of an effect depend on."""
+    """Key under which the alternatives of an effect are stored."""
     return Question(state.entries[index].name, frozenset(entry.name for entry in state.entries), state.exact)
 
 
@@ -47,8 +47,8 @@ def simplify_one(
 ) -> tuple[SearchState, tuple[Attempt, ...]]:
     """Replaces one effect by the equivalent one with the fewest parameters, and among these by the most usual one.
 
-    What is usual on real machines decides where the data cannot: rotor inertia before a body with three times its
-    inertia, friction before a motor at 30 % of its gain.
+    Where the data do not decide, effects that are common on real machines are preferred: rotor inertia to a body with
+    three times its inertia, friction to a motor at 30 % of its gain.
 
     Args:
         state: effects found so far.
@@ -65,7 +65,8 @@ def simplify_one(
         return state, ()
     own_loss = float(state.selection_losses(state.fit.effects).mean())
     group = [Attempt(state.entries[index], state.fit, index, own_loss, 1.0), *as_good]
-    # the first of equals: the effect itself, so that a delay of the sensors and one of the motors do not take turns
+    # min() returns the first of equals, the effect itself;
+    # otherwise two equivalent delays would replace each other for ever
     simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), surprise(a.effect)))
     rest = tuple(attempt for attempt in group if attempt is not simplest)
     return _replaced(state, index, simplest), rest
@@ -93,10 +94,13 @@ def _with_better_alternative(
 def _compared_closely(
     state: SearchState, index: int, as_good: Sequence[Attempt]
 ) -> tuple[SearchState, tuple[Attempt, ...], list[Attempt]]:
-    """The state and the alternatives, refined; those that are not worse than the effect, and those that are better.
+    """Compares an effect with its alternatives, with residuals scaled by what each of them leaves.
 
-    An alternative that differs from the effect by rounding is equally good, and so are all where the effects leave only
-    rounding.
+    An alternative that differs from the effect by rounding is equally good; if the effects leave only rounding, all
+    alternatives are. If an alternative is already significantly better with the present scales, nothing is refined.
+
+    Returns:
+        The state, the alternatives that are not worse than the effect, and those that are better.
     """
     equal, differing = _divided_by_rounding(state, index, as_good)
     if state.exact or not differing:

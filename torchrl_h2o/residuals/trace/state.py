@@ -64,7 +64,7 @@ class SearchState:
         attempts: entries that were sketched in addition to the effects found, by name.
         rivals: all leads of the screening after which an entry was added, by the entry's name.
         groups: for each effect found, alternatives with an equivalent loss.
-        alternatives: the alternatives that were found so far, by question.
+        alternatives: the alternatives that were found so far, by :class:`Question`.
         exact: True if the residual is within the rounding of single-precision data.
     """
 

@@ -94,7 +94,7 @@ def _horizon(explanation: Explanation, settings: LoopSettings) -> int:
 def _candidates(
     simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
 ) -> list[_Candidate]:
-    """A force beside the effects found, and a force instead of them; only those that were found."""
+    """Candidates with a force beside the effects found and with a force instead of them, as far as forces are found."""
     parts, candidates, horizon = explanation.parts, [], _horizon(explanation, settings)
     mended = simulation.with_effects(*explanation.effects)
     if (beside := find_undeclared(mended, measured, horizon, settings=settings)) is not None:
@@ -129,8 +129,8 @@ def _with_least_noise(
 ) -> Problem:
     """The problem in which explanations are compared, posed with the explanation that leaves the least sensor noise.
 
-    Sensor noise under one explanation may be a force under another. Start states that are filtered with the first
-    explanation would favour it.
+    What one explanation treats as sensor noise, another may explain as a force. Start states that are filtered with the
+    first explanation would favour it.
     """
     mended = [simulation.with_effects(*(part.effect for part in parts)) for parts in explanations]
     spread = np.maximum(measured.observation.std(0), 1e-12)

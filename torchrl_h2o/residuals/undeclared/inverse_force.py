@@ -77,8 +77,8 @@ def force_response(
 ) -> np.ndarray:
     """Derivative of the observation after a control step by the generalised forces, (W, n, nv), per N or N·m.
 
-    Finite differences with steps of the size of the typical force, because a derivative at a point would be misleading
-    across dry friction and soft contacts.
+    Computed by finite differences with steps of a fixed share of the typical force (``settings.force_nudge``), because
+    the derivative at a point would be misleading near dry friction and soft contacts.
     """
     model, state_map = simulation.model, simulation.state_map
     states = start_states(simulation, measured, starts) if states is None else states

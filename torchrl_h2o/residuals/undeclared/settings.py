@@ -15,7 +15,7 @@ class UndeclaredSettings:
     min_gain: float = 0.01
     """Share of the held-out loss that all terms of the force must explain."""
     min_term_gain: float = 0.002
-    """Share of the loss that a round must explain, and by which removing a term may raise the loss."""
+    """Share of the loss that a round must explain; removing a term may cost this share of the explained loss."""
     rounds: int = 6
     """Largest number of rounds of adding terms."""
     further_steps: int = 5
