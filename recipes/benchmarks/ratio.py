@@ -129,7 +129,7 @@ def train_and_measure(cfg: DictConfig, case: dict, system: System, new: System) 
     loss = accelerate(make_loss(name, trained_on, cfg))
     train(loss, make_sampler(name, trained_on, rows), cfg, case["steps"])
     held = {key: float(value) for key, value in _accuracies(loss, name, new).items()}
-    return {**case, **held, **measure(loss, trained_on, new, rows)}
+    return {**case, "delayed": loss.delay_estimator, **held, **measure(loss, trained_on, new, rows)}
 
 
 @torch.no_grad()
@@ -172,7 +172,7 @@ def main(cfg: DictConfig) -> None:
                 lines.append(train_and_measure(cfg, case, system, new))
                 bar.update()
                 with whole_file(directory / "ratio.csv") as partial, partial.open("w", newline="") as file:
-                    writer = csv.DictWriter(file, [*case, *COLUMNS], extrasaction="ignore")
+                    writer = csv.DictWriter(file, [*case, "delayed", *COLUMNS], extrasaction="ignore")
                     writer.writeheader()
                     writer.writerows(lines)
     print_table(lines)
