@@ -158,7 +158,7 @@ def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> t
 
 def _intervals(judgement: Judgement) -> tuple[Interval, ...]:
     """The remaining disturbances with their times, in s."""
-    time = judgement.measured.time
+    time = judgement.measured.shown_time
     return tuple(
         Interval(float(time[found.start]), float(time[found.stop - 1]), found.stop - found.start, found.size, DISTURBED)
         for found in judgement.disturbed

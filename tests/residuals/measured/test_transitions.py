@@ -56,6 +56,14 @@ def test_runs_are_cut_where_observations_do_not_follow():
     assert of(data).runs == [slice(0, 100), slice(100, 300)]
 
 
+def test_the_shown_time_goes_on_where_the_stamps_of_another_log_begin_anew():
+    data = ted(6)
+    data["time"] = torch.tensor([0.5, 0.6, 0.9, 0.2, 0.3, 0.4])[:, None].double()
+    np.testing.assert_allclose(of(data).shown_time, [0.5, 0.6, 0.9, 1.0, 1.1, 1.2])
+    data["time"] = torch.tensor([0.5, 0.6, 0.9, 1.0, 1.1, 1.2])[:, None].double()
+    np.testing.assert_allclose(of(data).shown_time, data["time"].flatten().numpy())
+
+
 def test_runs_are_cut_where_an_episode_ends_though_observations_follow():
     data = ted()
     data["next", "truncated"][99] = data["next", "done"][99] = True

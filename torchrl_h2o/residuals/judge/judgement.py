@@ -211,7 +211,7 @@ def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measur
     rows = measured.windows(1)
     before, after = (residuals(which, measured, rows)[:, 0] for which in (simulation, mended))
     return ResidualTrace(
-        time=rows * simulation.control_step,
+        time=measured.shown_time[rows],
         names=simulation.state_map.names,
         units=simulation.state_map.units,
         before=before,

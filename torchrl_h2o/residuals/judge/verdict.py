@@ -187,8 +187,10 @@ def where_most(simulation: Simulation, measured: Measured, settings: LoopSetting
     dimension = int(size.mean(0).argmax())
     blocks = np.array_split(np.arange(len(rows)), settings.verdict.blocks)
     block = max(blocks, key=lambda part: size[part, dimension].mean() if len(part) else -1.0)
-    begin, end = (number(float(measured.time[rows[edge]]), 3) for edge in (block[0], block[-1]))
+    ends = rows[block[[0, -1]]]
+    begin, end = (number(float(measured.time[row]), 3) for row in ends)
+    run = f" (run {' to '.join(map(str, np.unique(measured.run[ends])))})" if measured.run[-1] > 0 else ""
     rules = settings.judge
     most = np.argsort(size[:, dimension])[-max(1, round(rules.separation_share * len(rows))) :]
     where = where_it_is_large(simulation, measured, rows, size[:, dimension], most, rules.separation_factor)
-    return f"most in {simulation.state_map.names[dimension]}, between {begin} and {end} s{where and ',' + where}"
+    return f"most in {simulation.state_map.names[dimension]}, between {begin} and {end} s{run}{where and ',' + where}"

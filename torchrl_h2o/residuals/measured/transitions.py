@@ -144,6 +144,14 @@ class Measured:
         starts, stops = [0, *edges.tolist()], [*edges.tolist(), len(self)]
         return [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
 
+    @property
+    def shown_time(self) -> np.ndarray:
+        """Time of each row, (T), in s, for plots: ``time``, but a log whose stamps begin anew follows the one before."""
+        steps = np.diff(self.time)
+        anew = steps < 0.0
+        usual = np.median(steps[~anew]) if (~anew).any() else 0.0
+        return self.time[0] + np.concatenate([[0.0], np.cumsum(np.where(anew, usual, steps))])
+
     def run_beginnings(self) -> np.ndarray:
         """Mask, (T), of the first ``settings.settling_steps`` rows of each run, at most a quarter of the run."""
         rows = np.zeros(len(self), bool)
