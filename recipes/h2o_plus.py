@@ -27,10 +27,11 @@ from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate, ma
 from torchrl_h2o.options import RunOptions
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.environments import sim_capacity_of
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.film import try_to_film
-from torchrl_h2o.training.judging import judge, run_settings, table_of_run
+from torchrl_h2o.training.judging import judge, run_settings, table_of_run, write_failure
 from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.methods.h2o_plus import make_value_loss
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
@@ -105,16 +106,11 @@ def train(cfg: DictConfig, folder: Path) -> None:
     value_loss = make_value_loss(cfg, observation_dim)  # with V; expectile, sparse or exponential
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay, delayed=True)
     pairs_replay = make_pairs(cfg, task, real, preprocessing, replay) or replay  # trains the discriminators
-    loss = H2OPlusLoss(
-        MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing),
-        value_loss,
-        ratio_loss,
-        weighted=cfg.ratio,
-        target_entropy=cfg.target_entropy,
-    )
+    bellman_loss = MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing)
+    loss = H2OPlusLoss(bellman_loss, value_loss, ratio_loss, weighted=cfg.ratio, target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     accelerate(loss)  # optional: computes the same losses faster
-    loss_fn = at_precision(loss, cfg.get("precision", "float32"))
+    loss_fn = at_precision(loss, cfg.precision)
     loss_fn = maybe_compiled(loss_fn, cfg.compiled, cfg.updates, parameters=loss.parameters())
 
     # Optimiser, target networks, and the collector of simulated transitions
@@ -136,46 +132,50 @@ def train(cfg: DictConfig, folder: Path) -> None:
     setup_s = time.perf_counter() - start
 
     # Training
-    for epoch, evaluating in training.epochs():
-        # Every epoch has its own random stream, so that a resumed run draws the same numbers as an uninterrupted one
-        seed = epoch_seed(cfg.seed, epoch)
-        torch.manual_seed(seed)
+    try:
+        for epoch, evaluating in training.epochs():
+            # Every epoch has its own random stream, so that a resumed run draws the numbers of an uninterrupted one
+            seed = epoch_seed(cfg.seed, epoch)
+            torch.manual_seed(seed)
 
-        # Collect
-        episodes.begin_epoch(epoch, seed)
-        collector.update_policy_weights_()
-        simulated = next(rollouts)
-        simulated["next", "reward"] = preprocessing.reward(simulated["next", "reward"])
-        replay.extend(simulated)
+            # Collect
+            episodes.begin_epoch(epoch, seed)
+            collector.update_policy_weights_()
+            simulated = next(rollouts)
+            simulated["next", "reward"] = preprocessing.reward(simulated["next", "reward"])
+            replay.extend(simulated)
 
-        # Update
-        for _ in training.epoch_updates():
-            batch = replay.sample(cfg.batch_size)
-            pairs = pairs_replay.sample(cfg.discriminator_batch_size)
-            losses = loss_fn(batch, pairs)
-            training.check(losses)  # a loss that is not finite ends the run, and the last checkpoint stays
-            optimiser.zero_grad()
-            total_loss(losses).backward()
-            optimiser.step()
-            targets.step()
-        schedule.step()
+            # Update
+            for _ in training.epoch_updates():
+                batch = replay.sample(cfg.batch_size)
+                pairs = pairs_replay.sample(cfg.discriminator_batch_size)
+                losses = loss_fn(batch, pairs)
+                training.check(losses)  # a loss that is not finite ends the run, and the last checkpoint stays
+                optimiser.zero_grad()
+                total_loss(losses).backward()
+                optimiser.step()
+                targets.step()
+            schedule.step()
 
-        # Evaluate
-        if evaluating:
-            training.evaluate(
-                evaluator,
-                actor,
-                epoch,
-                **({} if best is None else best.consider(actor, training.rows)),
-                ratio_of_sim=float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean()),
-                **{name: term.item() for name, term in losses.items()},
-            )
-    evaluator.close()
-    collector.shutdown()
+            # Evaluate
+            if evaluating:
+                training.evaluate(
+                    evaluator,
+                    actor,
+                    epoch,
+                    **({} if best is None else best.consider(actor, training.rows)),
+                    ratio_of_sim=float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean()),
+                    **{name: term.item() for name, term in losses.items()},
+                )
+    except DivergenceError as error:
+        write_failure(folder, error.failure, run_settings(cfg, real))
+        raise
+    finally:
+        evaluator.close()
+        collector.shutdown()
 
     # Results
     policy = actor if best is None else best.policy
-    settings = run_settings(cfg, real)
     in_reality = judge(
         task,
         final_reality,
@@ -185,7 +185,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
         behaviour,
         folder,
         episodes=cfg.final_episodes,
-        settings=settings,
+        settings=run_settings(cfg, real),
         wall_s=setup_s + training.progress["seconds"],
         preprocessing=preprocessing,
     )

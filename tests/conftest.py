@@ -4,11 +4,26 @@ import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # read when torch and NumPy load, here and in the processes that tests start
 
+import pytest
 import torch
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 pytest_plugins = ["tests.run_fixtures"]
 
 torch.set_num_threads(1)
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
+
+
+@pytest.fixture
+def saved_figures(monkeypatch):
+    """Matplotlib's figures in the order in which they are saved as files."""
+    figures, save = [], Figure.savefig
+
+    def saved(figure, *args, **kwargs):
+        figures.append(figure)
+        save(figure, *args, **kwargs)
+
+    monkeypatch.setattr(Figure, "savefig", saved)
+    return figures

@@ -7,6 +7,7 @@ from pathlib import Path
 import hydra
 import pytest
 import torch
+from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
 from omegaconf import OmegaConf, open_dict
 from pydantic import ValidationError
@@ -27,6 +28,7 @@ from torchrl_h2o.training.methods import METHODS
 GAPS = ", ".join(PAPER_GAPS)
 COUNT = "must be an integer of at least 1"
 NOWHERE = "there is no such file or folder"
+SHARED = "because all worlds share the steps equally"
 NOT_A_RUN = "it is not the folder of a run, which has a config.yaml"
 
 TRAIN = {
@@ -70,10 +72,12 @@ TRAIN = {
     "gap_strength=2": "gap_strength=2.0 belongs to a gap: name one, such as gap=gravity",
     "n_steps=500": "n_steps=500: must be from 1 to 499, less than the 500 steps of each world in an epoch "
     "(steps_per_epoch=2000 of num_worlds=4)",
-    "num_worlds=2001": "num_worlds=2001: must be at most steps_per_epoch=2000, which the worlds share",
+    "num_worlds=2001": f"num_worlds=2001: steps_per_epoch=2000 must be a multiple of 2001, {SHARED}",
+    "num_worlds=3 steps_per_epoch=1000": f"num_worlds=3: steps_per_epoch=1000 must be a multiple of 3, {SHARED}",
+    "collector=multi_sync collector.workers=3": "collector.workers=3 num_worlds=4: steps_per_epoch=2000 must be a "
+    f"multiple of 12, {SHARED}",
     "mend=posterior collector=multi_sync collector.workers=5 steps_per_epoch=2020": "collector.workers=5 "
-    "num_worlds=10: the worlds of all workers share the steps of an epoch equally; choose numbers such that "
-    "steps_per_epoch=2020 is a multiple of their product",
+    f"mend=posterior num_worlds=10: steps_per_epoch=2020 must be a multiple of 50, {SHARED}",
     "columns=nowhere.yaml": "columns=nowhere.yaml: there is no such file, and the library's layouts are "
     "double_pendulum, simple_pendulum, wheel_legged_moving_forward, wheel_legged_standing_still",
     "gap_fix=report.jsn": f"gap_fix=report.jsn: {NOWHERE}",
@@ -89,6 +93,11 @@ TRAIN = {
 }
 OTHERS = {
     ("h2o_plus", "tau=0"): "tau=0: must be a number above 0 and at most 1",
+    ("h2o_plus", "num_worlds=3 steps_per_epoch=1000"): "num_worlds=3: steps_per_epoch=1000 must be a multiple of 3, "
+    f"{SHARED}",
+    ("h2o_plus", "num_worlds=2001"): f"num_worlds=2001: steps_per_epoch=2000 must be a multiple of 2001, {SHARED}",
+    ("h2o_plus", "mend=posterior num_worlds=3 steps_per_epoch=1005"): "mend=posterior num_worlds=10: "
+    f"steps_per_epoch=1005 must be a multiple of 10, {SHARED}",
     ("torchrl_h2o.commands.evaluate", "checkpoint=nowhere"): f"checkpoint=nowhere: {NOT_A_RUN}",
     ("torchrl_h2o.commands.evaluate", ""): "checkpoint is missing: write checkpoint=..., the folder of a run",
     ("torchrl_h2o.commands.evaluate", "checkpoint=runs/firts in=realty"): "checkpoint=runs/firts: "
@@ -129,6 +138,7 @@ def refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.chdir(tmp_path)
+    Plugins.instance()  # whose configurations are registered once, at their import, and would be lost with the state
     before, state = sorted(tmp_path.rglob("*")), Singleton.get_state()
 
     def call(module, *overrides):
@@ -209,6 +219,13 @@ def test_the_options_that_ship_with_the_commands_pass(chosen, tmp_path):
 )
 def test_the_options_that_ship_with_the_benchmarks_pass(config, model):
     check_options(composed(f"{config}_benchmark"), getattr(importlib.import_module("options"), model))
+
+
+@pytest.mark.parametrize("config", ["h2o_plus", "train"])
+@pytest.mark.parametrize("chosen", [["num_worlds=8"], ["mend=posterior", "num_worlds=3"], ["mend=posterior"]])
+def test_worlds_that_share_the_steps_of_an_epoch_equally_pass(config, chosen):
+    model = {"h2o_plus": RunOptions, "train": TrainOptions}[config]
+    check_options(composed(config, "steps_per_epoch=2000", *chosen), model)
 
 
 def test_the_names_of_methods_are_those_that_there_are():

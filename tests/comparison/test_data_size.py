@@ -1,6 +1,5 @@
 """The figure of return against the amount of real data, and the tables with a number per seed."""
 
-import matplotlib.pyplot as plt
 import pytest
 
 from torchrl_h2o.comparison.data_size import FORWARD, POOR, REAL_LOG, STANDING, markdown, points_of
@@ -82,13 +81,11 @@ def test_a_cell_has_return_seconds_speed_and_number_of_seeds():
     assert "| SAC, mended simulator | 160,000 ± 0; 20.0 s (2) |" in text
 
 
-def test_the_picture_shows_means_of_seeds_as_shares_of_a_faultless_episode(tmp_path, monkeypatch):
-    figures = []
-    monkeypatch.setattr(plt, "close", figures.append)
+def test_the_picture_shows_means_of_seeds_as_shares_of_a_faultless_episode(tmp_path, saved_figures):
     rows = [*some_rows(), *(row("cql", seed, -900_000, "2.5") for seed in range(2))]
     draw_data_size(tmp_path / "drawn.png", points_of(rows), reps=50)
     assert (tmp_path / "drawn.png").stat().st_size > 10_000
-    axes = figures[0].axes
+    axes = saved_figures[0].axes
     assert [axis.get_title() for axis in axes] == [
         "standing still",
         "",

@@ -4,7 +4,6 @@ import json
 import math
 import shutil
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -51,13 +50,11 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
         assert (tmp_path / name).stat().st_size > 10_000
 
 
-def test_a_panel_a_method_and_a_cross_where_it_fell(tmp_path, monkeypatch):
-    figures = []
-    monkeypatch.setattr(plt, "close", figures.append)
+def test_a_panel_a_method_and_a_cross_where_it_fell(tmp_path, saved_figures):
     stands, falls = np.full((1, 150), 0.1), np.r_[np.full(20, 0.3), np.full(130, np.nan)][None]
     ways = {("standing_still", "sac"): [falls, stands], ("moving_forward", "h2o_plus"): [stands]}
     draw_trajectories(tmp_path / "drawn.png", ways)
-    axes = figures[0].axes
+    axes = saved_figures[0].axes
     titles = [axis.get_title().partition(",") for axis in axes]
     assert [title for title, *_ in titles[:2]] == [METHODS["sac"].title, METHODS["h2o_plus"].title]
     assert [runs.split()[0] for *_, runs in titles] == ["2", "0", "0", "1"]

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -110,12 +109,10 @@ def test_the_paper_s_figures_stand_beside_the_ablations_they_are_of(group, runs,
     assert theirs.keys() == table.keys()
 
 
-def test_curves_are_the_seeds_mean_and_their_range(tmp_path, monkeypatch):
-    figures = []
-    monkeypatch.setattr(plt, "close", figures.append)
+def test_curves_are_the_seeds_mean_and_their_range(tmp_path, saved_figures):
     rows = [row("sac", seed, seed * at, at=str(at)) for seed in (1, 2, 6) for at in (10, 20)]
     draw_curves(tmp_path / "curves.png", rows, {"h2o_plus": "H2O+", "sac": "SAC"})
-    (axis,) = figures[0].axes
+    (axis,) = saved_figures[0].axes
     (line,) = axis.lines
     assert line.get_xydata().tolist() == [[10.0, 30.0], [20.0, 60.0]]
     (band,) = axis.collections
@@ -124,7 +121,7 @@ def test_curves_are_the_seeds_mean_and_their_range(tmp_path, monkeypatch):
         (10.0, 60.0),
         (20.0, 120.0),
     ]
-    assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["SAC"]
+    assert [text.get_text() for text in saved_figures[0].legends[0].get_texts()] == ["SAC"]
 
 
 def test_how_long_episodes_last_is_told_where_some_end_early():

@@ -157,6 +157,12 @@ def test_gains_that_are_best_in_the_simulator_alone_fall_in_reality():
         assert data["next", "terminated"].any().item() is falls
 
 
+def test_a_recording_leaves_the_state_of_torch_s_cpu_generator():
+    before = torch.get_rng_state()
+    record(WheelLeggedEnv(), noisy_balance_controller("standing_still"), 10, seed=0, progress=False)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_recording_is_a_chain_of_transitions_broken_only_where_episodes_end():
     env = WheelLeggedEnv(max_episode_steps=20)
     data = record(env, BalanceController(), 50, seed=0, progress=False)

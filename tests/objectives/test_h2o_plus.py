@@ -260,11 +260,17 @@ def test_one_classifier_trained_on_pairs_takes_the_place_of_two(parts, batch):
     assert all(p.grad.any() for p in loss.ratio_loss.parameters())
 
 
-def losses_and_gradients(loss, batch):
+def losses_and_gradients(loss, batch, compiled=True):
     torch.manual_seed(3)
-    terms = torch.compile(loss, fullgraph=True, backend="eager")(batch)
+    terms = (torch.compile(loss, fullgraph=True, backend="eager") if compiled else loss)(batch)
     total_loss(terms).backward()
     return terms.detach(), {name: p.grad for name, p in loss.named_parameters() if p.grad is not None}
+
+
+@pytest.fixture
+def as_compiled(monkeypatch):
+    """Compute what a compiled loss computes, without the seconds of a compilation."""
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
 
 
 def test_a_compiled_loss_that_knows_where_the_real_rows_are_is_the_same():
@@ -275,10 +281,78 @@ def test_a_compiled_loss_that_knows_where_the_real_rows_are_is_the_same():
     torch.testing.assert_close(gradients, expected[1])
 
 
-@pytest.mark.parametrize("num_real", [3, 5])
-def test_real_rows_elsewhere_than_promised_give_no_number(num_real):
-    losses, _ = losses_and_gradients(Parts().h2o_plus(num_real=num_real), make_batch(4, 3))
-    assert losses["loss_value"].isnan()
+def without_v(parts, **kwargs):
+    """The losses of SAC and of the discriminators, which weight the simulated rows."""
+    bellman = MixedBellmanLoss(parts.actor, parts.qvalues, mixing=0.0)
+    return H2OPlusLoss(bellman, ratio_loss=DynamicsRatioLoss(parts.estimator), **kwargs)
+
+
+@pytest.mark.parametrize("build", [Parts.h2o_plus, without_v])
+def test_compiled_losses_are_nan_if_the_real_rows_are_elsewhere_than_promised(build):
+    losses, _ = losses_and_gradients(build(Parts(), num_real=5), make_batch(4, 3))
+    assert all(losses[name].isnan() for name in losses.keys() if name.startswith("loss_"))
+
+
+@pytest.mark.parametrize("num_real", [0, 3, 5])
+@pytest.mark.parametrize("build", [Parts.h2o_plus, without_v])
+def test_neither_a_smaller_nor_a_larger_number_of_real_rows_goes_unnoticed(as_compiled, build, num_real):
+    losses, _ = losses_and_gradients(build(Parts(), num_real=num_real), make_batch(4, 3), compiled=False)
+    assert all(losses[name].isnan() for name in losses.keys() if name.startswith("loss_"))
+
+
+@pytest.mark.parametrize("num_real", [0, 4, 7, 9])
+def test_a_promise_that_holds_changes_no_loss_also_if_a_stream_has_no_rows(monkeypatch, num_real):
+    batch = make_batch(min(num_real, 7), 7 - min(num_real, 7))
+    expected = losses_and_gradients(Parts().h2o_plus(), batch, compiled=False)
+    for compiled in (False, True):
+        monkeypatch.setattr(torch.compiler, "is_compiling", lambda compiled=compiled: compiled)
+        loss = Parts().h2o_plus(num_real=num_real)
+        torch.testing.assert_close(losses_and_gradients(loss, batch, compiled=False), expected)
+
+
+@pytest.mark.parametrize(
+    ("real", "num_real", "said"),
+    [
+        ([1, 1, 1, 1, 0, 0, 0], 5, "rows 0 to 3 of 7 are real"),
+        ([1, 1, 1, 1, 0, 0, 0], 3, "rows 0 to 3 of 7 are real"),
+        ([0, 1, 0, 1, 1, 0, 1], 4, "rows 1, 3 to 4 and 6 of 7 are real"),
+        ([0, 1, 0, 0, 0, 0, 0], 4, "row 1 of 7 is real"),
+        ([0, 0, 0, 0, 0, 0, 0], 4, "none of 7 rows is real"),
+        ([1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0], 6, "rows 0, 2, 4, 6 and 2 more of 12 are real"),
+    ],
+)
+def test_a_broken_promise_is_refused_with_the_rows_that_are_real(real, num_real, said):
+    loss, batch = Parts().h2o_plus(num_real=num_real), make_batch(len(real), 0)
+    batch["real"] = torch.tensor(real, dtype=torch.bool)
+    with pytest.raises(ValueError, match=rf"num_real={num_real} .*{said}.*sort the rows .*or leave num_real out"):
+        loss(batch)
+
+
+def test_rows_that_the_loss_leaves_out_break_no_promise():
+    loss, batch = Parts().h2o_plus(num_real=4), make_batch(4, 3)
+    loss.loss_mask_key = "mask"
+    batch["real"][-1], batch["mask"] = True, torch.arange(7) < 6
+    assert loss(batch)["loss_qvalue"].isfinite()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_promise_about_rows_is_for_batches_of_one_dimension(monkeypatch, compiled):
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: compiled)
+    loss = Parts().h2o_plus(num_real=2)
+    with pytest.raises(ValueError, match=r"num_real=2 .* one dimension, and this batch has the shape \[2, 4\]"):
+        loss(make_batch(4, 4).reshape(2, 4))
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_promise_holds_for_tensors_as_arguments_too(monkeypatch, parts, batch, compiled):
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: compiled)
+    loss, batch = parts.h2o_plus(num_real=4), batch.exclude(("next", "truncated"), ("next", "done"))
+    tensors = {"_".join(key) if isinstance(key, tuple) else key: value for key, value in batch.items(True, True)}
+    torch.manual_seed(3)
+    expected = loss(batch.copy())
+    torch.manual_seed(3)
+    got = dict(zip(loss.out_keys, loss(**tensors), strict=True))
+    torch.testing.assert_close(got["loss_value"], expected["loss_value"])
 
 
 def test_the_target_networks_of_q_and_of_a_delayed_ratio_are_updated_together(parts, batch):

@@ -1,5 +1,6 @@
 """The main job as a command: its files, and its resumption after an interruption."""
 
+import importlib
 import json
 import os
 import signal
@@ -8,9 +9,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, rows, run, trained
+from torchrl_h2o.training.config_file import ADDED
+from torchrl_h2o.training.divergence import DivergenceError
+from torchrl_h2o.training.progress import Training
 
 DATA = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", ROOT.parent / "shared" / "data"))
 
@@ -95,6 +100,67 @@ def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, i
     run(command("resume=broken", *(["overlap=false"] if options else [])))
     assert trained(broken) == trained(tmp_path / "unbroken")
     assert rows(broken) == rows(tmp_path / "unbroken")
+
+
+@pytest.fixture
+def failing(compose, tmp_path, monkeypatch):
+    """Train by the recipe until its first update raises an error; return what it has ended by then."""
+    recipe, ended = importlib.import_module("h2o_plus"), []
+
+    def noting(make, method, name):
+        def made(*args, **kwargs):
+            part = make(*args, **kwargs)
+            monkeypatch.setattr(part, method, lambda: ended.append(name))
+            return part
+
+        return made
+
+    for maker, method in {"evaluator_of": "close", "simulated_transitions": "shutdown"}.items():
+        monkeypatch.setattr(recipe, maker, noting(getattr(recipe, maker), method, maker))
+
+    def train(error):
+        def fails(training, losses):
+            raise error
+
+        monkeypatch.setattr(Training, "check", fails)
+        with pytest.raises(type(error)):
+            recipe.train(compose("keep=last", config="h2o_plus")[0], tmp_path)
+        return sorted(ended)
+
+    return train
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("of any kind"), DivergenceError("", "why", 0)])
+def test_a_training_that_fails_ends_what_it_has_started(failing, error):
+    assert failing(error) == ["evaluator_of", "simulated_transitions"]
+
+
+def test_a_training_that_diverges_leaves_the_reason(failing, tmp_path):
+    failing(DivergenceError("long message", "loss_qvalue is nan at update 4", 3))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    told = {"updates": 3, "return_real": None, "failure": "loss_qvalue is nan at update 4", "seed": 0}
+    assert {key: summary[key] for key in told} == told
+
+
+def test_a_training_that_fails_in_another_way_can_be_resumed_and_has_no_summary(failing, tmp_path):
+    failing(RuntimeError("of any kind"))
+    assert not (tmp_path / "summary.json").exists()
+
+
+@pytest.mark.slow
+def test_a_folder_of_an_earlier_version_is_resumed_with_what_that_version_did(command, tmp_path):
+    early = [f"{name}={'null' if value is None else value}" for name, value in ADDED.items()]
+    run(command(*[option for option in SMALL if not option.startswith("n_steps")], *ROBOT, *early, "hydra.run.dir=out"))
+    before, written = trained(tmp_path / "out"), json.loads((tmp_path / "out" / "summary.json").read_text())
+    cfg = OmegaConf.load(tmp_path / "out" / "config.yaml")
+    for name in ADDED:
+        del cfg[name]
+    OmegaConf.save(cfg, tmp_path / "out" / "config.yaml")
+    (tmp_path / "out" / "summary.json").unlink()
+    run(command("resume=out"))
+    assert trained(tmp_path / "out") == before
+    resumed = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert resumed["return_real"] == written["return_real"]
 
 
 @pytest.mark.slow

@@ -86,6 +86,16 @@ def test_known_gradients_are_those_of_the_sum():
         (terms["loss_1"] + 2.0 * terms["loss_2"]).backward()
 
 
+@torch.compiler.set_stance("force_eager")
+def test_known_gradients_are_added_once():
+    weight = torch.nn.Parameter(torch.tensor(2.0))
+    loss = total_loss(OneGraph(lambda batch: {"loss_1": weight * batch}, [weight])(torch.tensor(3.0)))
+    loss.backward(retain_graph=True)
+    with pytest.raises(RuntimeError, match=r"differentiated a second time.*compute the losses again"):
+        loss.backward()
+    assert weight.grad == 3.0
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
 def test_what_one_start_compiles_the_next_one_finds():

@@ -108,9 +108,9 @@ def test_a_run_that_diverges_ends_with_one_line_and_status_1(command, tmp_path, 
     assert "Traceback" not in done.stdout
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("DivergenceError: ")]
     assert "is kept; resume=out would repeat" in line
-    if script == "train.py":
-        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-        assert summary["failure"] in line
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["failure"] in line
+    assert summary["return_real"] is None
     replayed = subprocess.run(
         **command("checkpoint=out", "episodes=1", "film=null", *(["method=SAC in the simulator"] * bool(options)),
                   script="evaluate.py"), text=True, check=False,

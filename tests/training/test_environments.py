@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModule
 from torchrl_h2o.data import episodes
 from torchrl_h2o.objectives import make_actor
 from torchrl_h2o.training.environments import as_observed, make_reality, measure_observation_norm, preprocessing_of
+from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import SEED, evaluate
 
 CONFIG = Path(__file__).parents[2] / "recipes" / "config"
@@ -56,6 +57,33 @@ def test_without_stacking_the_latest_observation_is_shown(cfg):
     torch.testing.assert_close(
         as_observed(cfg, raw)["observation"], rollout(make_reality(cfg))["observation"], atol=1e-5, rtol=1e-4
     )
+
+
+def observed(*columns):
+    observation = torch.stack([torch.as_tensor(column, dtype=torch.float32).expand(1000) for column in columns], -1)
+    return TensorDict(observation=observation, next=TensorDict(observation=observation, reward=torch.zeros(1000, 1)))
+
+
+def test_entries_that_vary_have_unit_variance_whatever_their_unit():
+    noise = torch.randn(1000, generator=torch.Generator().manual_seed(0))
+    real = observed(noise, 5.0 + 1e-3 * noise, 1e-9 * noise)
+    shown = Preprocessing.fit(real, normalise=True).apply(real.auto_batch_size_(1))["observation"]
+    torch.testing.assert_close(shown.std(0), torch.ones(3), atol=1e-2, rtol=0.0)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.1, -9.81, 1e4, 1e-9])
+def test_an_entry_that_is_constant_in_the_data_keeps_its_unit(value):
+    rounded = torch.tensor(value).repeat(1000)
+    rounded[::2] = torch.nextafter(rounded[0], torch.tensor(torch.inf))
+    real = observed(value, rounded)
+    norm = Preprocessing.fit(real.auto_batch_size_(1), normalise=True).norm
+    assert norm["scale"] == [1.0, 1.0]
+    assert norm["loc"] == pytest.approx([value, value], rel=1e-5, abs=1e-30)
+
+
+def test_a_normalisation_that_is_stored_is_used_as_it_is():
+    stored = {"loc": [0.5], "scale": [1e-6]}  # of a constant entry, as earlier versions wrote it
+    assert Preprocessing.fit(observed(0.5).auto_batch_size_(1), normalise=True, norm=stored).norm == stored
 
 
 @pytest.fixture
@@ -108,6 +136,12 @@ def test_an_evaluation_measures_observations_in_physical_units(cfg, worlds, past
     told = measured.observed(["theta", "theta_dot", "x", "v"])["v"]
     assert told["mean"] == pytest.approx(float(measured.mean_observation[:, 3].mean()))
     assert told["max_abs"] == pytest.approx(float(measured.max_observation[:, 3].max()))
+
+
+def test_an_evaluation_leaves_the_state_of_torch_s_cpu_generator(cfg, actor):
+    before = torch.get_rng_state()
+    evaluate(make_reality(cfg), actor, episodes=1)
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_an_evaluation_that_measures_nothing_has_no_statistics(cfg, actor):

@@ -4,12 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from torchrl_h2o.comparison.aggregates import Interval, mean_of_runs
 from torchrl_h2o.comparison.data_size import FAULTLESS, FORWARD, POOR, REAL_LOG, STANDING, TITLES, Points, Run
@@ -36,7 +33,7 @@ def draw_data_size(path: Path, points: Points, reps: int) -> None:
     """
     lines, dots = [name for name in LINES if name in points], [name for name in DOTS if name in points]
     widths = [*(WIDTHS[name] for name in lines), *[2.2] * bool(dots)]
-    figure = plt.figure(figsize=(1.9 * sum(widths) + 0.6, 7.2), layout="constrained")
+    figure = Figure((1.9 * sum(widths) + 0.6, 7.2), layout="constrained")
     grid = figure.add_gridspec(2, len(widths), width_ratios=widths)
     for column, panel in enumerate(lines):
         value, seconds = figure.add_subplot(grid[0, column]), figure.add_subplot(grid[1, column])
@@ -57,7 +54,6 @@ def draw_data_size(path: Path, points: Points, reps: int) -> None:
     figure.suptitle(title, fontsize=9)
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=130)
-    plt.close(figure)
 
 
 def _share(run: Run, panel: str) -> float:

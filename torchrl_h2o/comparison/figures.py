@@ -5,10 +5,6 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -31,14 +27,10 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
     curves = _curves(rows)
     tasks = sorted({task for task, _ in curves})
     columns = min(4, len(tasks))
-    figure, axes = plt.subplots(
-        math.ceil(len(tasks) / columns),
-        columns,
-        figsize=(4.2 * columns, 3.2 * math.ceil(len(tasks) / columns)),
-        layout="constrained",
-        squeeze=False,
-        sharey=len({task[0] for task in tasks}) == 1,  # returns of different environments have different scales
-    )
+    lines = math.ceil(len(tasks) / columns)
+    figure = Figure((4.2 * columns, 3.2 * lines), layout="constrained")
+    sharey = len({task[0] for task in tasks}) == 1  # returns of different environments have different scales
+    axes = figure.subplots(lines, columns, squeeze=False, sharey=sharey)
     for axis, task in zip(axes.flat, tasks, strict=False):
         for name in titles:
             if (task, name) in curves:
@@ -95,7 +87,8 @@ def draw_aggregates(
         titles: titles of the methods, from top to bottom.
         note: title of the figure, with its tasks and seeds.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 0.45 * len(means) + 1.6), layout="constrained")
+    figure = Figure((9, 0.45 * len(means) + 1.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
     _draw_intervals(left, means, titles)
     left.set(xlabel="interquartile mean of the normalised score", xlim=(min(0.0, left.get_xlim()[0]), None))
     _draw_intervals(right, better, titles)
@@ -119,4 +112,3 @@ def _draw_intervals(axis: Axes, intervals: Mapping[str, Interval], titles: Mappi
 def _save(figure: Figure, path: Path) -> None:
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=130)
-    plt.close(figure)

@@ -4,10 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -48,8 +44,8 @@ def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray
     """
     tasks = [task for task in SHOWN if any(key[0] == task for key in ways)]
     methods = [name for name in METHODS if any(key[1] == name for key in ways)]
-    size = {"figsize": (2.6 * len(methods) + 0.8, 2.8 * len(tasks) + 0.3), "layout": "constrained", "squeeze": False}
-    figure, axes = plt.subplots(len(tasks), len(methods), sharex=True, sharey="row", **size)
+    figure = Figure((2.6 * len(methods) + 0.8, 2.8 * len(tasks) + 0.3), layout="constrained")
+    axes = figure.subplots(len(tasks), len(methods), sharex=True, sharey="row", squeeze=False)
     for row, task in zip(axes, tasks, strict=True):
         for axis, method in zip(row, methods, strict=True):
             runs = ways.get((task, method), [])
@@ -85,8 +81,8 @@ def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]
         states: histograms ``[pitch, pitch rate]`` of each run, by task and method.
     """
     tasks = [task for task in SHOWN if any(key[0] == task for key in states)]
-    size = {"figsize": (9, 3.6 * len(tasks)), "layout": "constrained", "squeeze": False}
-    figure, axes = plt.subplots(len(tasks), len(COMPARED), sharex=True, sharey=True, **size)
+    figure = Figure((9, 3.6 * len(tasks)), layout="constrained")
+    axes = figure.subplots(len(tasks), len(COMPARED), sharex=True, sharey=True, squeeze=False)
     most = max(cast(np.ndarray, sum(runs)).max() for runs in states.values())
     for row, task in zip(axes, tasks, strict=True):
         for axis, method in zip(row, COMPARED, strict=True):
@@ -107,4 +103,3 @@ def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]
 def _save(figure: Figure, path: Path) -> None:
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=130)
-    plt.close(figure)

@@ -81,7 +81,7 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     """Read pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
-    replay = make_replay(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds")))
+    replay = make_replay(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.data_seconds))
     title = METHODS[cfg.method].title
     latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
     load_checkpoint(cast(Path, latest), Checkpoint(replay=replay))  # a run with a summary has one

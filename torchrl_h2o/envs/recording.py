@@ -25,8 +25,8 @@ def record(
     """Records transitions in temporal order, over as many episodes as needed.
 
     The last transition is marked as truncated. The policy runs with ``ExplorationType.RANDOM``; ``is_init``
-    in its input marks the start of an episode. The same seed gives the same data. torch's global random state is
-    restored.
+    in its input marks the start of an episode. The same seed gives the same data. The state of torch's global CPU
+    generator is restored; generators of other devices are seeded too, and their earlier states are not restored.
 
     Args:
         env: the env, not batched; it is reset first and stays open.

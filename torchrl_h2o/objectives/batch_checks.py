@@ -174,6 +174,33 @@ def require_rows(value: Tensor, reader: str) -> None:
         raise ValueError(f"{reader}: the batch has the shape {list(value.shape)}, so it is empty: give at least a row.")
 
 
+def rows_in_words(mask: Tensor, longest: int = 4) -> str:
+    """Name the rows of a mask ``[B]``, with a verb, for a message.
+
+    Args:
+        mask: True for the rows to name.
+        longest: number of groups of successive rows that are named; the further rows are counted.
+
+    Examples:
+        >>> rows_in_words(torch.tensor([True, True, True, False, True]))
+        'rows 0 to 2 and 4 of 5 are'
+    """
+    chosen = mask.nonzero().flatten().tolist()
+    if not chosen:
+        return f"none of {len(mask)} rows is"
+    groups: list[list[int]] = []
+    for row in chosen:
+        if groups and row == groups[-1][-1] + 1:
+            groups[-1].append(row)
+        else:
+            groups.append([row])
+    named = [str(rows[0]) if len(rows) == 1 else f"{rows[0]} to {rows[-1]}" for rows in groups[:longest]]
+    if more := sum(map(len, groups[longest:])):
+        named.append(f"{more} more")
+    words = " and ".join(filter(None, [", ".join(named[:-1]), named[-1]]))
+    return f"row{'s' * (len(chosen) != 1)} {words} of {len(mask)} {'is' if len(chosen) == 1 else 'are'}"
+
+
 def _fits(value: Tensor, dtype: torch.dtype | None) -> bool:
     if dtype is None or torch.is_autocast_enabled(value.device.type):
         return value.is_floating_point()

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives import LossModule
 
+from torchrl_h2o.objectives.batch_checks import rows_in_words
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss, action_dim_of
 from torchrl_h2o.objectives.hybrid_loss import Rows
 from torchrl_h2o.objectives.loss_wrapper import LossWrapper
@@ -42,9 +43,11 @@ class H2OPlusLoss(LossWrapper):
         fixed_alpha (bool, optional): whether β stays constant. Defaults to ``False``.
         target_entropy (float or "auto", optional): in nats. ``"auto"``, the default, is -dim(A), from the actor's
             spec.
-        num_real (int, optional): a promise that the first ``num_real`` rows of each batch are all its real rows, as in
-            :class:`~torchrl_h2o.data.HybridReplayBuffer`'s batches. The compiled loss then computes V on the real rows
-            only, and the ratio on the simulated rows only; the losses stay the same to rounding. Defaults to ``None``.
+        num_real (int, optional): a promise that the first ``num_real`` rows of each batch ``[B]`` are all its real
+            rows, as in :class:`~torchrl_h2o.data.HybridReplayBuffer`'s batches. The compiled loss then computes V on
+            the real rows only, and the ratio on the simulated rows only; the losses stay the same to rounding. For a
+            batch that breaks the promise, the compiled losses are NaN, and the uncompiled loss raises a ValueError.
+            Defaults to ``None``.
 
     Raises:
         ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if their reductions differ, or if the target
@@ -57,9 +60,10 @@ class H2OPlusLoss(LossWrapper):
     ``unclamped_ratio``, the mean ratio without clamp (1 for a correct ratio), and ``effective_sample_size``, (Σ w)² /
     Σ w² of the weights w as a fraction of the rows.
 
-    The ratio is computed with the discriminators' parameters before this step's update, so that all losses share one
-    backward pass and compile to one graph. The authors' code computes it after the discriminators' update. To reproduce
-    that order, omit ``ratio_loss`` here, take the step of a separate :class:`DynamicsRatioLoss` first, and write the
+    The ratio is computed before this step's update, so that all losses share one backward pass and compile to one
+    graph. It is that of the discriminators' present parameters or, if ``ratio_loss`` has ``delay_estimator=True``, of
+    their averaged target networks. The authors' code computes it after the discriminators' update. To reproduce that
+    order, omit ``ratio_loss`` here, take the step of a separate :class:`DynamicsRatioLoss` first, and write the
     estimator's ``dynamics_ratio`` into the batch.
 
     Source:
@@ -211,11 +215,17 @@ class H2OPlusLoss(LossWrapper):
         """Compute all losses.
 
         Args:
-            tensordict: transitions of both streams, ``[*B]``. Its td error is written into it.
+            tensordict: transitions of both streams, ``[*B]``; ``[B]`` with ``num_real``. Its td error is written into
+                it.
             pairs: transitions for the discriminators, ``[*C]``. Defaults to ``tensordict``.
+
+        Raises:
+            ValueError: with ``num_real``, for a batch of another number of dimensions and, uncompiled, for one whose
+                real rows are elsewhere.
         """
         bellman, batch = self.bellman_loss, tensordict.copy()
         rows = bellman._rows(batch)
+        misplaced = self._misplaced(rows)
         ratio_terms = self._ratio_terms(batch, rows, pairs)
         loss_qvalue = bellman.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
@@ -228,6 +238,9 @@ class H2OPlusLoss(LossWrapper):
             "loss_alpha": self.alpha_loss(log_prob, rows),
             **ratio_terms,
         }
+        if misplaced is not None:  # terms that are computed on the rows of one stream would be wrong
+            for name in [name for name in terms if name.startswith("loss_")]:
+                terms[name] = terms[name].masked_fill(misplaced, torch.nan)
         if self.reduction != "none":
             terms |= {"alpha": self.alpha, "entropy": self._metric(-log_prob, rows)}
         return self._output(terms, tensordict)
@@ -276,15 +289,36 @@ class H2OPlusLoss(LossWrapper):
         value_loss = self.value_loss
         if value_loss is None:
             return {}
-        whole = rows
         if self._splits:
             batch = cast(TensorDictBase, batch[: self.num_real])
             rows = self.bellman_loss._rows(batch)
         batch.set(value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
-        loss = value_loss.value_loss(batch, rows)
-        if self._splits:  # NaN if real rows are not where num_real says, because the loss would be wrong
-            loss = loss.masked_fill(rows.sim.any() | whole.real[self.num_real :].any(), torch.nan)
-        return {"loss_value": loss}
+        return {"loss_value": value_loss.value_loss(batch, rows)}
+
+    def _misplaced(self, rows: Rows) -> Tensor | None:
+        """Whether the compiled loss has real rows elsewhere than ``num_real`` says, ``[]``; None if that is excluded.
+
+        Raises:
+            ValueError: uncompiled, for such rows, and for a batch that has not one dimension.
+        """
+        if self.num_real is None:
+            return None
+        real, name = rows.real, f"{type(self).__name__}: num_real={self.num_real}"
+        if real.ndim != 1:
+            raise ValueError(
+                f"{name} is for batches of one dimension, and this batch has the shape {list(real.shape)}: flatten it "
+                "with batch.reshape(-1) and put the real rows first, or leave num_real out."
+            )
+        misplaced = rows.sim[: self.num_real].any() | real[self.num_real :].any()
+        if torch.compiler.is_compiling():  # a graph cannot raise an error that depends on values
+            return misplaced
+        if misplaced:
+            raise ValueError(
+                f"{name} promises that the first {self.num_real} rows of a batch are all its real rows, and "
+                f"{rows_in_words(real)} real: sort the rows such that the real ones come first, give their number, or "
+                "leave num_real out."
+            )
+        return None
 
     @property
     def _splits(self) -> bool:

@@ -162,16 +162,21 @@ class RunOptions(ExperimentOptions):
         """Number of worlds that share the steps of an epoch."""
         return self.worlds
 
+    @property
+    def _typed_streams(self) -> str:
+        """The options that determine ``streams``, as typed on the command line."""
+        return f"{'mend=posterior ' * (self.mend == 'posterior')}num_worlds={self.worlds}"
+
     def _check_gap(self) -> None:
         if self.gap is None and self.gap_strength is not None:
             raise ValueError(f"gap_strength={self.gap_strength} belongs to a gap: name one, such as gap=gravity")
 
     def _check_steps(self) -> None:
-        per_world = self.steps_per_epoch // self.streams
-        if not per_world:
+        per_world, rest = divmod(self.steps_per_epoch, self.streams)
+        if rest:  # the collector would round up
             raise ValueError(
-                f"num_worlds={self.streams}: must be at most steps_per_epoch={self.steps_per_epoch}, which the "
-                "worlds share"
+                f"{self._typed_streams}: steps_per_epoch={self.steps_per_epoch} must be a multiple of {self.streams}, "
+                "because all worlds share the steps equally"
             )
         if not self.n_steps < max(2, per_world):
             raise ValueError(
@@ -193,16 +198,9 @@ class RunOptions(ExperimentOptions):
                 f"gap_fix={self.gap_fix} mend={str(self.mend).lower()}: gap_fix takes the effects from a report, mend "
                 "searches for them in the run's own data; leave one of them out"
             )
-        if self.mend != "posterior":
-            return
-        if not self.env.batched:
+        if self.mend == "posterior" and not self.env.batched:
             raise ValueError(
                 "mend=posterior gives each world of a batched simulator its own effects, and "
                 f"env={self.env.name} is not batched: use mend=true, or set env.batched=true for a Gymnasium MuJoCo "
                 "task"
-            )
-        if self.steps_per_epoch % self.worlds:
-            raise ValueError(
-                f"mend=posterior num_worlds={self.worlds}: the worlds share the steps of an epoch equally; make "
-                f"steps_per_epoch={self.steps_per_epoch} a multiple of {self.worlds}"
             )

@@ -94,6 +94,7 @@ class TrainOptions(AnyMethodOptions, RunOptions):
 
     @model_validator(mode="after")
     def _fit_the_method(self) -> TrainOptions:
+        self._check_collector()
         self._check_population()
         return self
 
@@ -102,15 +103,14 @@ class TrainOptions(AnyMethodOptions, RunOptions):
         """Number of worlds of all workers, which share the steps of an epoch."""
         return self.worlds * self.collector.workers
 
+    @property
+    def _typed_streams(self) -> str:
+        workers = self.collector.workers
+        return f"collector.workers={workers} " * (workers > 1) + super()._typed_streams
+
     def _check_gap(self) -> None:
         if self.gaps is None:
             super()._check_gap()
-
-    def _check_steps(self) -> None:
-        if self.collector.workers > 1:  # says more than a bound on num_worlds
-            self._check_collector()
-        super()._check_steps()
-        self._check_collector()
 
     def _check_precision(self) -> None:
         others = {self.method, *self.baselines} - {"h2o_plus", "rlpd"}
@@ -149,10 +149,3 @@ class TrainOptions(AnyMethodOptions, RunOptions):
     def _check_collector(self) -> None:
         if self.collector.backend == "ray" and find_spec("ray") is None:
             raise ValueError("collector=ray needs Ray: pip install 'torchrl_h2o[ray]', here and where workers run")
-        workers = self.collector.workers
-        if self.steps_per_epoch % (workers * self.worlds):
-            raise ValueError(
-                f"collector.workers={workers} num_worlds={self.worlds}: the worlds of all workers share the steps "
-                f"of an epoch equally; choose numbers such that steps_per_epoch={self.steps_per_epoch} is a multiple "
-                "of their product"
-            )

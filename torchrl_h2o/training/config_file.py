@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
@@ -19,6 +19,30 @@ DEEPEST = 40  # levels of nested lists and mappings; a run's configuration has a
 _EVENTS = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _LAYOUT = {"env": dict, "env.name": str, "env.make": dict, "env.simulator": list, "env.reality": list}
 _REMEDY = "give the folder of a run, with the config.yaml that the run wrote"
+# options that the first version did not have, with the values for what versions without them did
+ADDED = {
+    "gap_fix": None,
+    "mend": None,
+    "mended": None,
+    "data_seconds": None,
+    "ratio_estimator": "paper",
+    "change_noise": 0.05,
+    "ratio_weight_penalty": 2e-3,
+    "ratio_logit_bound": None,
+    "num_worlds": 1,
+    "sim_capacity_min": 1,
+    "n_steps": 1,
+    "layer_norm": False,
+    "num_qvalue_nets": 2,
+    "lr_end_factor": 1.0,
+    "compiled": False,
+    "precision": "float32",
+    "reward_offset": 0.0,
+    "frames": 1,
+    "action_history": 0,
+    "overlap": False,
+    "keep": "last",
+}
 
 
 def save_config(cfg: DictConfig, directory: Path) -> None:
@@ -30,6 +54,8 @@ def load_config(
     directory: str | Path, *, trust: bool | str | Iterable[str] | None = None, typed: DictConfig | None = None
 ) -> DictConfig:
     """Reads the configuration of a run. It may come from somebody else, so what it can build is limited.
+
+    Options that the version of the run did not have get the values for what that version did.
 
     Args:
         directory: the run's folder.
@@ -57,7 +83,7 @@ def load_config(
     if not saved.exists():
         raise FileNotFoundError(f"{directory} is not the folder of a run: it has no {FILE}")
     cfg = _read(saved)
-    entries = OmegaConf.to_container(cfg, resolve=False)
+    entries = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=False))
     for name, kind in _LAYOUT.items():
         value = entries
         for key in name.split("."):
@@ -65,6 +91,7 @@ def load_config(
         if not isinstance(value, kind):
             raise DataError(f"the entry is {value!r}, not a {kind.__name__}", _REMEDY, source=saved, column=name)
     require_known_targets(cfg, saved, trust=trust, typed=typed)
+    cfg.update({name: value for name, value in ADDED.items() if name not in entries})
     return cfg
 
 

@@ -16,8 +16,7 @@ from torchrl_h2o.training.task import Task
 
 def task_of(cfg: DictConfig) -> Task:
     """Builds the task of a run; raises the errors of :meth:`Task.from_config`."""
-    # cfg.get, because configurations of earlier versions have no gap_fix and no mended.
-    found = {"gap_fix": cfg.get("gap_fix"), "mended": cfg.get("mended")}
+    found = {"gap_fix": cfg.gap_fix, "mended": cfg.mended}
     return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, **found)
 
 
@@ -27,8 +26,8 @@ def preprocessing_of(cfg: DictConfig) -> Preprocessing:
     return Preprocessing(
         loc=None if norm is None else tuple(norm.loc),
         scale=None if norm is None else tuple(norm.scale),
-        frames=cfg.get("frames", 1),  # configurations of earlier versions have no such entries
-        action_history=cfg.get("action_history", 0),
+        frames=cfg.frames,
+        action_history=cfg.action_history,
         reward_scale=cfg.reward_scale,
         reward_offset=cfg.reward_offset,
     )
@@ -64,8 +63,7 @@ def simulator_maker(cfg: DictConfig) -> Callable[[], EnvBase]:
 
 def sim_capacity_of(cfg: DictConfig, num_real: int) -> int:
     """Largest number of simulated transitions in the replay buffer of a run with ``num_real`` real transitions."""
-    # cfg.get, because configurations of earlier versions have no such entry.
-    return max(cfg.get("sim_capacity_min", 1), int(cfg.sim_capacity * num_real))
+    return max(cfg.sim_capacity_min, int(cfg.sim_capacity * num_real))
 
 
 def as_observed(cfg: DictConfig, real: TensorDictBase) -> TensorDictBase:
@@ -84,6 +82,6 @@ def make_replay(cfg: DictConfig, real: TensorDictBase) -> HybridReplayBuffer:
         as_observed(cfg, real),
         sim_capacity=sim_capacity_of(cfg, len(real)),
         batch_size=cfg.batch_size,
-        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
+        n_steps=cfg.n_steps,
         gamma=cfg.gamma,
     )

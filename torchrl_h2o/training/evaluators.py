@@ -56,8 +56,7 @@ def evaluator_of(cfg: DictConfig, task: Task, preprocessing: Preprocessing) -> E
         preprocessing: preprocessing of the observations.
     """
     make_env = partial(task.make_reality, cfg.eval_episodes, preprocessing)
-    # cfg.get, because configurations of earlier versions have no such entry.
-    return (_SecondProcess if cfg.get("overlap", False) else _ThisProcess)(make_env, cfg.eval_episodes)
+    return (_SecondProcess if cfg.overlap else _ThisProcess)(make_env, cfg.eval_episodes)
 
 
 class _ThisProcess:

@@ -66,7 +66,7 @@ def prepare(cfg: DictConfig, directory: Path) -> TensorDictBase:
     """Validates gap and report, loads the real data, and saves the configuration with the normalisation."""
     task = task_of(cfg)
     task.make_simulator()
-    real = task.read_real_data(cfg.data, cfg.columns, cfg.get("data_seconds"))
+    real = task.read_real_data(cfg.data, cfg.columns, cfg.data_seconds)
     measure_observation_norm(cfg, real)
     save_config(cfg, directory)
     return real

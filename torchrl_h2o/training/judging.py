@@ -100,10 +100,10 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
     return {
         "env": cfg.env.name,
         "gap": cfg.gap,
-        "gap_fix": cfg.get("gap_fix"),
-        "mend": cfg.get("mend"),
+        "gap_fix": cfg.gap_fix,
+        "mend": cfg.mend,
         "data": cfg.data if isinstance(cfg.data, str) else list(cfg.data),
-        "data_seconds": cfg.get("data_seconds"),
+        "data_seconds": cfg.data_seconds,
         "transitions": len(real),
         **({key: cfg[key] for key in of_h2o_plus} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
         "seed": cfg.seed,
@@ -124,10 +124,12 @@ def write_summary(directory: Path, summary: dict) -> None:
 
 
 def _commit() -> dict[str, str]:
-    """Commit of the library, if it runs from a repository, marked -dirty if files outside recipes/results changed."""
-    git = ["git", "-C", str(Path(__file__).parent)]
-    try:
-        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    """Commit of the library, if it runs from its repository, marked -dirty if files outside recipes/results changed."""
+    git, own = ["git", "-C", str(Path(__file__).parent)], Path(__file__).name
+    told: dict[str, Any] = {"capture_output": True, "text": True, "check": True}
+    try:  # an installed library may be inside a repository of the user, which does not track it
+        subprocess.run([*git, "ls-files", "--error-unmatch", own], **told)
+        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], **told)
     except (OSError, subprocess.CalledProcessError):
         return {}
     unchanged = [*git, "diff", "--quiet", "HEAD", "--", ":/", ":(exclude,top)recipes/results"]

@@ -92,8 +92,7 @@ def make_networks(
     """Builds the policy and the Q networks. Their initial weights depend on the run's seed, not on the method."""
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
-    # cfg.get, because configurations of earlier versions have no such entries.
-    options = {"layer_norm": cfg.get("layer_norm", False), "ensemble": cfg.get("num_qvalue_nets", 2)}
+    options = {"layer_norm": cfg.layer_norm, "ensemble": cfg.num_qvalue_nets}
     return actor, make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells, **options)
 
 

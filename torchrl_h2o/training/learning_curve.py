@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from torchrl_h2o.training.returns import Evaluation
 from torchrl_h2o.training.task import Task
@@ -51,7 +49,8 @@ def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour:
         behaviour: returns of the episodes in the data.
         task: the task, for the title and the length of episodes.
     """
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained", width_ratios=(3, 2))
+    figure = Figure((11, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     for name, training in trainings.items():
         updates, mean, std = (
             [row[key] for row in training.rows] for key in ("updates", "return_real", "return_real_std")
@@ -66,8 +65,8 @@ def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour:
             lw=0,
         )
     top = max([*(max(row["return_real"] for row in t.rows) for t in trainings.values()), behaviour.mean])
-    if left.get_ylim()[0] < -abs(top):  # very negative returns would compress all other curves
-        left.set_ylim(-0.25 * abs(top), 1.1 * top)
+    if 0 < top < -left.get_ylim()[0]:  # very negative returns would compress all other curves
+        left.set_ylim(-0.25 * top, 1.1 * top)
         left.text(0.01, 0.01, "lower returns are cut off", transform=left.transAxes, fontsize=8, color="0.4")
     left.axhline(behaviour.mean, color="0.4", ls="--", lw=1, label=_label_of(behaviour, task))
     gap = f", simulator with {task.gap}" if task.gap else ""
@@ -78,9 +77,10 @@ def draw_learning_curve(path: Path, trainings: Mapping[str, Trained], behaviour:
     for axis in (left, right):
         axis.spines[["top", "right"]].set_visible(False)
         axis.grid(alpha=0.3)
+        axis.xaxis.set_major_locator(MaxNLocator(5))
+        axis.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=150)
-    plt.close(figure)
 
 
 def _label_of(behaviour: Evaluation, task: Task) -> str:

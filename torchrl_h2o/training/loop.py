@@ -149,12 +149,10 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     learner = trainee.learner
     if learner.trains_discriminators:
         learner.pairs = trainee.make_pairs(real)
-    # cfg.get, because configurations of earlier versions have no such entries.
-    learner.terms_of = at_precision(learner.terms_of, cfg.get("precision", "float32"))
-    compiled = cfg.get("compiled", False)
+    learner.terms_of = at_precision(learner.terms_of, cfg.precision)
     parameters = learner.parameters if learner.one_graph else None
     learner.terms_of = maybe_compiled(
-        learner.terms_of, compiled, cfg.updates, parameters=parameters, pays=learner.pays_to_compile
+        learner.terms_of, cfg.compiled, cfg.updates, parameters=parameters, pays=learner.pays_to_compile
     )
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
     training = Training(method.title, directory, budget, **trainee.components, schedule=schedule)

@@ -54,6 +54,7 @@ class OneGraph:
 
         Raises:
             ValueError: by ``backward``, if the terms named ``loss_*`` have unequal weights in what is differentiated.
+            RuntimeError: by a second ``backward`` on the same terms.
         """
         with torch._dynamo.config.patch(trace_autograd_ops=True):  # torch.autograd.grad becomes a part of the graph
             terms, gradients = self._compiled(*batches, **noise)
@@ -79,6 +80,11 @@ class _Differentiated(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *weights: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.gradients is None:
+            raise RuntimeError(
+                "these losses are differentiated a second time, and their gradients are not kept after the first: "
+                "compute the losses again, or use compiled=false with backward(retain_graph=True)"
+            )
         first, *others = weights[0].tolist()
         if any(other != first for other in others):
             raise ValueError(

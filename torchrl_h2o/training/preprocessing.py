@@ -44,6 +44,8 @@ class Preprocessing:
     ) -> Preprocessing:
         """Builds a preprocessing with the mean and standard deviation of the real observations.
 
+        The scale of an entry that does not vary in the data, beyond the rounding of float32, is 1.
+
         Args:
             real: the measured transitions, ``[T]``.
             normalise: whether observations are normalised.
@@ -55,7 +57,10 @@ class Preprocessing:
         if not normalise:
             return cls(**options)
         observation = real["observation"]
-        scale = observation.std(0).clamp_min(1e-6)
+        scale = observation.std(0)
+        float32 = torch.finfo(torch.float32)
+        rounding = 4 * float32.eps * observation.abs().amax(0) + float32.tiny
+        scale = torch.where(scale > rounding, scale, 1.0)
         return cls(tuple(observation.mean(0).tolist()), tuple(scale.tolist()), **options)
 
     @property

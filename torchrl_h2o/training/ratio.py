@@ -23,12 +23,12 @@ CHANGE_NOISE = {CHANGE: 1.0, PAIRS: 0.05}  # change_noise=auto
 
 
 def ratio_estimator_of(cfg: DictConfig) -> str:
-    """Returns ``ratio_estimator``; the paper's for configurations of earlier versions.
+    """Returns ``ratio_estimator``.
 
     Raises:
         ValueError: for an unknown name.
     """
-    name = cfg.get("ratio_estimator", PAPER)
+    name = cfg.ratio_estimator
     if name not in (PAPER, CHANGE, PAIRS):
         raise ValueError(f"ratio_estimator={name}: choose {PAPER}, {CHANGE} or {PAIRS}")
     return name

@@ -76,13 +76,14 @@ def evaluate(
     seed: int = SEED,
     physical: Callable[[torch.Tensor], torch.Tensor] | None = None,
 ) -> Evaluation:
-    """Runs complete episodes without changing the state of torch's global generator.
+    """Runs complete episodes without changing the state of torch's global CPU generator.
 
     Args:
         env: one env ``[]``, which runs one episode after another, or N worlds ``[N]``, which run one episode each.
         policy: writes ``action``.
         episodes: number of episodes.
-        seed: seed of the env and, during the evaluation, of torch.
+        seed: seed of the env and, during the evaluation, of torch. Generators of other devices are seeded too, and
+            their earlier states are not restored.
         physical: function from the env's observations to the quantities to measure, such as
             :meth:`~torchrl_h2o.training.preprocessing.Preprocessing.physical`; None measures nothing but returns.
     """

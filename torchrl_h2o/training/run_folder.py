@@ -142,7 +142,7 @@ def uninterrupted() -> Iterator[None]:
 
 def keeps_best(cfg: DictConfig) -> bool:
     """Whether the run returns the policy that was best in the simulator instead of the last one."""
-    return cfg.get("keep", "last") == "best_in_simulator"  # configurations of earlier versions have no such entry
+    return cfg.keep == "best_in_simulator"
 
 
 def checkpoint_folder(directory: str | Path, name: str) -> Path:

@@ -146,7 +146,7 @@ class Measured:
 
     @property
     def shown_time(self) -> np.ndarray:
-        """Time of each row, (T), in s, for plots: ``time``, but a log whose stamps begin anew follows the one before."""
+        """Time of each row, (T), in s, for plots: ``time``, but logs whose stamps begin anew follow one another."""
         steps = np.diff(self.time)
         anew = steps < 0.0
         usual = np.median(steps[~anew]) if (~anew).any() else 0.0

@@ -87,9 +87,10 @@ class Report(ReportContents):
         """Draws lists of effects from what the data leave open, for domain randomisation.
 
         Each draw chooses an explanation: the effects found, those with one of them replaced by an alternative, as they
-        were fitted together, or another set of effects. All explanations have the same weight, because the search's test found none of them
-        worse than the first at its level; a likelihood computed from their errors would treat successive rows as
-        independent and decide by differences that are smaller than the scatter between blocks of the data. Then each
+        were fitted together, or another set of effects. All explanations have the same weight, because the search's
+        test found none of them worse than the first at its level; a likelihood computed from their errors would treat
+        successive rows as independent and decide by differences that are smaller than the scatter between blocks of
+        the data. Then each
         parameter with a 95 % interval is drawn from a normal distribution around the fitted value with this interval,
         truncated to the parameter's bounds. Parameters are drawn independently, because a report has no covariances; a
         parameter without an interval keeps its value.

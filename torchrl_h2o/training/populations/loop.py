@@ -122,7 +122,7 @@ def train_population(
         capacity,
         cfg.batch_size,
         len(members),
-        n_steps=cfg.get("n_steps", 1),  # configurations of earlier versions have no such entry
+        n_steps=cfg.n_steps,
         gamma=cfg.gamma,
         device=cfg.device,
     )
@@ -137,7 +137,7 @@ def train_population(
         trainees[name].learner.pairs = pairs[own.gap]
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
     # pays=False: on a CPU, compiled losses of stacked networks are slower.
-    learner.losses_of = maybe_compiled(learner.losses_of, cfg.get("compiled", False), cfg.updates, pays=False)
+    learner.losses_of = maybe_compiled(learner.losses_of, cfg.compiled, cfg.updates, pays=False)
     budget = Budget.from_config(cfg)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
     training = PopulationTraining("H2O+", directory, budget, **_components(trainees, learner), schedule=schedule)
