@@ -67,7 +67,7 @@ def test_a_second_process_that_is_gone_is_named_with_what_to_do(evaluators):
 
 def refuse_with_a_lambda(observation):
     error = ValueError("no action")
-    error.why = lambda: "what cannot be pickled"
+    error.why = lambda: "a function, which pickle refuses"
     raise error
 
 
