@@ -77,6 +77,31 @@ def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_b
     assert stats.binomtest(significant, 200, 0.02, alternative="greater").pvalue > 0.01
 
 
+def concentrated(rng, dimensions):
+    """Residuals that are large in about every seventh block, and constant within it."""
+    size = np.where(rng.random((30, 1)) < 0.15, 10.0, 1e-4)
+    return lambda: np.repeat(size * rng.standard_normal((30, dimensions)), 10, axis=0)
+
+
+def rare(rng, dimensions):
+    """Residuals that are large in one of a hundred windows."""
+    size = np.where(rng.random((300, 1)) < 0.01, 10.0, 1e-4)
+    return lambda: size * rng.standard_normal((300, dimensions))
+
+
+@pytest.mark.parametrize("residuals", [concentrated, rare])
+@pytest.mark.parametrize("dimensions", [1, 3])
+@pytest.mark.parametrize("change", [0.1, 0.5, 1.0])
+def test_rare_residuals_that_change_by_chance_are_no_evidence(residuals, dimensions, change):
+    """Where residuals are large, the change that an effect makes is large too, but it points anywhere."""
+    significant = 0
+    for seed in range(400):
+        draw = residuals(np.random.default_rng(seed), dimensions)
+        residual, moved = draw(), draw()
+        significant += p_value_of_losses(robust(residual), robust(residual + change * moved)) < 0.02
+    assert stats.binomtest(significant, 400, 0.02, alternative="greater").pvalue > 0.01
+
+
 def test_what_vanishes_now_and_then_is_seen():
     """The loss becomes zero in three blocks of thirty, which are too few for tests on means."""
     before, after = np.full(300, 1e-9), np.full(300, 1e-9)

@@ -16,8 +16,8 @@ class SignificanceSettings:
     """Significance level of a whole search; a search over a catalogue divides it by the number of entries."""
     blocks: int = 30
     """Blocks of neighbouring windows that are treated as independent."""
-    max_odds: float = 100.0
-    """Largest factor that a single block may contribute to the heuristic statistic of the third test."""
+    max_ratio: float = 100.0
+    """Largest factor that a single block may contribute to the third test's likelihood ratio."""
     loss_floor: float = 1e-6
     """Smallest typical loss of a block, as a share of the mean loss."""
 
