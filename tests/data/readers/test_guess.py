@@ -5,6 +5,7 @@ import pytest
 
 from torchrl_h2o.data import LogColumns, load
 from torchrl_h2o.data.readers.guess import guess_layout
+from torchrl_h2o.data.readers.guess.layout_text import Coordinates
 from torchrl_h2o.data.readers.guess.roles import guess_columns
 
 
@@ -42,3 +43,27 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
 def test_kinds_and_units_by_name(name, kind, unit):
     (guess,) = guess_columns({name: 0.01 * np.arange(10.0)})
     assert (guess.kind, guess.unit) == (kind, unit)
+
+
+def test_names_of_the_model_say_what_a_column_is(tmp_path):
+    """None of these words is known: without the model they are left out."""
+    units = {"cart": "m", "pole": "rad", "cart_velocity": "m/s", "pole_velocity": "rad/s"}
+    rows = np.cumsum(np.ones((20, 6)), axis=0) * [0.01, 0.1, 0.2, 0.1, 0.2, 1.0]
+    np.savetxt(
+        tmp_path / "log.csv",
+        rows,
+        delimiter=",",
+        header="time,cart,Pole_deg,cart_velocity,pole_velocity,drive",
+        comments="",
+    )
+    text = guess_layout(tmp_path / "log.csv", Coordinates(units, ["drive"])).text
+    for line in (
+        '"cart", role: observation, unit: "m"',
+        '"Pole_deg", role: observation, unit: "deg"',
+        '"cart_velocity", role: observation, unit: "m/s"',
+        '"pole_velocity", role: observation, unit: "rad/s"',
+        '"drive", role: action',
+    ):
+        assert line in text
+    assert "role: ignore" not in text
+    assert "ignore" in guess_layout(tmp_path / "log.csv").text

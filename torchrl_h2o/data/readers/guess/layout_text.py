@@ -25,6 +25,14 @@ class Coordinates:
     units: Mapping[str, str]
     actuators: Sequence[str]
 
+    @property
+    def quantities(self) -> dict[str, tuple[str, str | None]]:
+        """Kind and unit of each name, None for actuators; a name of a joint and an actuator is the joint's."""
+        actions: dict[str, tuple[str, str | None]] = dict.fromkeys(self.actuators, ("action", None))
+        return actions | {
+            name: ("velocity" if name.endswith("_velocity") else "position", unit) for name, unit in self.units.items()
+        }
+
 
 @dataclass(frozen=True)
 class GuessedLayout:
@@ -63,7 +71,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         <BLANKLINE>
     """
     contents = read_contents(path)
-    columns = _one_set(guess_columns(contents.values))
+    columns = _one_set(guess_columns(contents.values, None if model is None else model.quantities))
     if model is not None and not contents.named:
         columns = _by_order(columns, model)
     pairs = _pairs(columns)
@@ -165,7 +173,7 @@ def _checked(
 
 def _time(contents: Contents) -> np.ndarray | None:
     """The time column in s."""
-    for guess in guess_columns(contents.values):
+    for guess in guess_columns(contents.values):  # a model has no name for the time
         values = contents.values[guess.name]
         if guess.kind == "time" and values is not None:
             return values * to_si(guess.unit)[1]

@@ -62,11 +62,15 @@ class Guess:
     note: str = ""
 
 
-def guess_columns(values: Mapping[str, np.ndarray | None]) -> list[Guess]:
+def guess_columns(
+    values: Mapping[str, np.ndarray | None], model_names: Mapping[str, tuple[str, str | None]] | None = None
+) -> list[Guess]:
     """Guess the kind and unit of each column; at most one is the time.
 
     Args:
         values: the numbers of each column by name; None for a column that is not numbers.
+        model_names: kind and SI unit (None if not known) of the names in the user's model. A column with such a name,
+            apart from case, signs and its own unit, is that quantity, whatever its words mean elsewhere.
 
     Example:
         >>> import numpy as np
@@ -75,7 +79,8 @@ def guess_columns(values: Mapping[str, np.ndarray | None]) -> list[Guess]:
         >>> [(column.kind, column.unit) for column in found]
         [('time', 'ms'), ('velocity', 'deg/s'), ('unknown', '1')]
     """
-    found = [_guess(name, numbers) for name, numbers in values.items()]
+    known = {_letters(name): quantity for name, quantity in (model_names or {}).items()}
+    found = [_guess(name, numbers, known) for name, numbers in values.items()]
     for kind in ("time", "done", "reward"):
         same = [i for i, guess in enumerate(found) if guess.kind == kind]
         for i in same[1:]:
@@ -83,18 +88,18 @@ def guess_columns(values: Mapping[str, np.ndarray | None]) -> list[Guess]:
     return found
 
 
-def _guess(name: str, numbers: np.ndarray | None) -> Guess:
+def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str, str | None]]) -> Guess:
     if numbers is None:
         return Guess(name, "unknown", note="not numbers")
     plain, unit = _without_unit(name)
     words = _words(plain)
-    kind = _kind(words, numbers)
+    kind, si = known.get(_letters(plain), (_kind(words, numbers), None))
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
     if kind == "time":
         return Guess(name, kind, *_unit_of_time(numbers, unit))
     if unit is not None:
         return Guess(name, kind, unit, stem)
-    unit, note = _unit_of(kind, words, numbers)
+    unit, note = _unit_of(kind, si, words, numbers)
     return Guess(name, kind, unit, stem, note)
 
 
@@ -110,6 +115,10 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
 def _words(name: str) -> list[str]:
     """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2."""
     return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+
+
+def _letters(name: str) -> str:
+    return "".join(re.findall(r"[a-z0-9]", name.lower()))
 
 
 def _without_unit(name: str) -> tuple[str, str | None]:
@@ -138,13 +147,15 @@ def _unit_of_time(numbers: np.ndarray, unit: str | None) -> tuple[str, str, str]
     return unit, "", f"check: the median step is {step:.4g}, which is {seconds:.4g} s{rate}"
 
 
-def _unit_of(kind: str, words: Iterable[str], numbers: np.ndarray) -> tuple[str, str]:
-    unit, largest = _SI.get(kind, "1"), float(np.abs(numbers).max())
+def _unit_of(kind: str, si: str | None, words: Iterable[str], numbers: np.ndarray) -> tuple[str, str]:
+    unit, largest = si or _SI.get(kind, "1"), float(np.abs(numbers).max())
+    if si is not None and (kind != "position" or si != "rad"):
+        return unit, f"check the unit: the largest value is {largest:.3g}"
     if kind == "action":
         unit = "A" if "current" in words else "N" if "force" in words else "N·m"
     elif kind not in ("position", "velocity"):
         return unit, ""
-    elif any(word in _LENGTHS for word in words):
+    elif si is None and any(word in _LENGTHS for word in words):
         unit = unit.replace("rad", "m")
     elif kind == "position" and largest > _LARGEST_ANGLE:
         return "deg", f"check the unit: the largest value is {largest:.3g}, which is much for rad"
