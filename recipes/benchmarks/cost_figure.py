@@ -2,10 +2,7 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from torchrl_h2o.whole_file import whole_file
 
@@ -31,9 +28,8 @@ def draw_scaling(path: Path, costs: list[dict]) -> None:
         costs: entries of scaling.json: the factor, its size, seconds and bytes.
     """
     columns = list(dict.fromkeys(cost["grows"] for cost in costs))
-    figure, axes = plt.subplots(
-        2, len(columns), figsize=(4 * len(columns), 6), sharex="col", sharey="row", squeeze=False, layout="constrained"
-    )
+    figure = Figure((4 * len(columns), 6), layout="constrained")
+    axes = figure.subplots(2, len(columns), sharex="col", sharey="row", squeeze=False)
     for column, grows in enumerate(columns):
         seconds, memory = axes[:, column]
         for storage, colour in COLOURS.items():
@@ -58,7 +54,6 @@ def draw_scaling(path: Path, costs: list[dict]) -> None:
         axis.grid(alpha=0.3)
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=150)
-    plt.close(figure)
 
 
 def draw_growth(path: Path, rates: list[dict], pays_until: dict[str, int]) -> None:
@@ -70,7 +65,8 @@ def draw_growth(path: Path, rates: list[dict], pays_until: dict[str, int]) -> No
         pays_until: by factor, the last size that pays; without those whose largest size still pays.
     """
     factors = [grows for grows in GROWTH if any(rate["grows"] == grows for rate in rates)]
-    figure, axes = plt.subplots(1, len(factors), figsize=(4 * len(factors), 3.2), squeeze=False, layout="constrained")
+    figure = Figure((4 * len(factors), 3.2), layout="constrained")
+    axes = figure.subplots(1, len(factors), squeeze=False)
     for axis, grows in zip(axes.flat, factors, strict=True):
         sizes, per_second = zip(*((r["size"], r["per_second"]) for r in rates if r["grows"] == grows), strict=True)
         what, unit = GROWTH[grows]
@@ -85,4 +81,3 @@ def draw_growth(path: Path, rates: list[dict], pays_until: dict[str, int]) -> No
         axis.grid(alpha=0.3)
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=150)
-    plt.close(figure)
