@@ -60,6 +60,16 @@ def test_a_first_layout_is_written_and_can_be_read(folder, capsys, monkeypatch):
     assert "the median step is 4, which is 0.004 s, 250 Hz" in text
 
 
+def test_desired_positions_are_the_actions_of_servos(folder):
+    (folder / "servo.xml").write_text(MODEL.replace("<motor", '<position kp="30"'))
+    columns = {"t": T, "slider_pos": np.sin(T), "hip_pos": np.cos(T), "hip_tau": T, "slider_pos_des": np.sin(T)}
+    np.savetxt("servo.csv", np.stack(list(columns.values()), 1), delimiter=",", header=",".join(columns), comments="")
+    guess_columns(["--guess", "data=servo.csv", "simulator=servo.xml"])
+    assert LogColumns.load("servo.yaml").action == ("slider_pos_des",)
+    guess_columns(["--guess", "data=servo.csv", "simulator=robot.xml", "columns=motor.yaml"])
+    assert LogColumns.load("motor.yaml").action == ("hip_tau",)
+
+
 def test_a_file_is_never_overwritten(folder):
     guess_columns(["--guess", "data=log.csv", "columns=mine.yaml"])
     (folder / "mine.yaml").write_text("corrected")

@@ -57,8 +57,11 @@ def _coordinates_of(simulator: str) -> Coordinates:
     except ValueError as error:
         raise ValueError(f"simulator={simulator} is not an MJCF file that MuJoCo reads: {error}") from None
     names, units = coordinate_names(model)
+    servo = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 1] != 0.0)
     return Coordinates(
-        dict(zip(names, units, strict=True)), [model.actuator(i).name or str(i) for i in range(model.nu)]
+        dict(zip(names, units, strict=True)),
+        [model.actuator(i).name or str(i) for i in range(model.nu)],
+        servos=bool(model.nu and servo.all()),
     )
 
 

@@ -20,10 +20,12 @@ class Coordinates:
     Args:
         units: the unit of each coordinate by its name, positions before velocities; velocities end in ``_velocity``.
         actuators: the actuators' names.
+        servos: whether all actuators are position servos, whose commands are desired positions.
     """
 
     units: Mapping[str, str]
     actuators: Sequence[str]
+    servos: bool = False
 
     @property
     def quantities(self) -> dict[str, tuple[str, str | None]]:
@@ -71,7 +73,8 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         <BLANKLINE>
     """
     contents = read_contents(path)
-    columns = _one_set(guess_columns(contents.values, None if model is None else model.quantities))
+    columns = guess_columns(contents.values, None if model is None else model.quantities)
+    columns = _one_set(_servo_commands(columns) if model is not None and model.servos else columns)
     if model is not None and not contents.named:
         columns = _by_order(columns, model)
     pairs = _pairs(columns)
@@ -94,6 +97,22 @@ def _one_set(columns: Sequence[Guess]) -> list[Guess]:
         if column.kind in ("action", "position", "velocity") and digits and kept.setdefault(key, rest) != rest:
             note = f"looks like another {column.kind}; swap the roles if this is the one to use"
             column = replace(column, kind="unknown", note=note)
+        result.append(column)
+    return result
+
+
+def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
+    """Desired positions as the actions of servos, and no torques beside them."""
+    if not any(column.kind == "desired position" for column in columns):
+        return list(columns)
+    result = []
+    for column in columns:
+        if column.kind == "desired position":
+            column = replace(
+                column, kind="action", note=f"the model's actuators are servos; {column.note}".rstrip("; ")
+            )
+        elif column.kind == "action":
+            column = replace(column, kind="unknown", note="the model's actuators are servos, which take positions")
         result.append(column)
     return result
 
@@ -205,8 +224,8 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
     for column in columns:
         role = {"position": "observation", "velocity": "observation"}.get(column.kind, column.kind)
         note = column.note
-        if role == "desired":
-            role, note = "ignore", "a desired value; the role is action if the model's actuators are servos"
+        if role.startswith("desired"):
+            role, note = "ignore", f"a {role}; the role is action if the model's actuators are servos"
         elif role == "unknown":
             role, note = "ignore", note or "not recognised: observation, action or ignore?"
         unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""

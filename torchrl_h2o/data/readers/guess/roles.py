@@ -39,7 +39,7 @@ _WORDS = {
 }
 _WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
-_SI = {"position": "rad", "velocity": "rad/s"}
+_SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
 _LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 
 
@@ -49,7 +49,7 @@ class Guess:
 
     Args:
         name: the column.
-        kind: one of time, done, reward, position, velocity, action, desired, or unknown.
+        kind: one of time, done, reward, position, velocity, action, desired position, desired velocity, or unknown.
         unit: its unit.
         stem: the name without the words of its kind and its unit, by which positions and velocities are paired.
         note: what the user should check; empty if nothing is doubtful.
@@ -108,7 +108,7 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
     if "time" in fits and not ((np.diff(numbers) >= 0).mean() > 0.9 and np.ptp(numbers) > 0):
         fits.remove("time")
     if fits & {"desired", "command"}:
-        return "desired" if fits & {"position", "velocity"} else "action"
+        return next((f"desired {kind}" for kind in ("velocity", "position") if kind in fits), "action")
     return next((kind for kind in _WORDS if kind in fits), "unknown")
 
 
@@ -153,10 +153,10 @@ def _unit_of(kind: str, si: str | None, words: Iterable[str], numbers: np.ndarra
         return unit, f"check the unit: the largest value is {largest:.3g}"
     if kind == "action":
         unit = "A" if "current" in words else "N" if "force" in words else "N·m"
-    elif kind not in ("position", "velocity"):
+    elif kind not in _SI:
         return unit, ""
     elif si is None and any(word in _LENGTHS for word in words):
         unit = unit.replace("rad", "m")
-    elif kind == "position" and largest > _LARGEST_ANGLE:
+    elif kind.endswith("position") and largest > _LARGEST_ANGLE:
         return "deg", f"check the unit: the largest value is {largest:.3g}, which is much for rad"
     return unit, f"check the unit: the largest value is {largest:.3g}"
