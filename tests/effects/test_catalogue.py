@@ -19,6 +19,7 @@ from torchrl_h2o.effects import (
     JointRange,
     JointStiffness,
     ModelEffect,
+    ObservationDelay,
     ObservationGain,
     catalogue,
     compile_model,
@@ -151,6 +152,16 @@ def test_sensors_are_left_out_where_nothing_is_observed():
     assert not [e for e in entries_of("Hopper", num_observations=0) if type(e.effect).__name__.startswith("Obs")]
     single = [e.effect for e in entries_of("Hopper", num_observations=1) if isinstance(e.effect, ObservationGain)]
     assert single == [ObservationGain()]
+
+
+def test_velocities_may_be_late_together():
+    def delays(velocities):
+        entries = catalogue(spec("Hopper"), num_observations=4, dt=0.01, velocities=velocities)
+        return [entry.effect.entries for entry in entries if isinstance(entry.effect, ObservationDelay)]
+
+    assert delays(()) == [None]
+    assert delays((2, 3)) == [None, (2, 3)]
+    assert delays((0, 1, 2, 3)) == [None]  # the same as all entries
 
 
 @pytest.mark.parametrize(("dt", "num", "complaint"), [(0.0, 3, "not positive"), (0.01, -1, "is negative")])

@@ -11,6 +11,7 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointFrictionLoss,
     ObservationDelay,
+    ObservationGain,
 )
 from torchrl_h2o.residuals.judge.held_out_error import error_summary
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
@@ -72,6 +73,21 @@ def test_an_effect_that_does_not_lower_the_error_is_not_recommended():
     assert wrong.kind == NOT_EXPLAINED
     assert not wrong.recommended
     assert "do not lower the error" in wrong.reasons[0]
+
+
+def test_effects_that_make_a_quantity_worse_are_said_to_be_wrong():
+    """Gravity is right, but no reading is scaled: the sum of all errors falls, that of the position rises."""
+    wrong = verdict((Gravity(1.5),), (Gravity(1.5), ObservationGain(1.3, (1,))))
+    assert wrong.kind != EXPLAINED
+    (reason,) = [reason for reason in wrong.reasons if "is wrong: they raise" in reason]
+    assert "error of elbow 100 ms ahead: 24 → 30 mrad (+25 %)" in reason
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_right_effects_make_nothing_worse(noise):
+    truth = (Gravity(1.3), JointFrictionLoss(0.05))
+    right = verdict(truth, truth, noise)
+    assert (right.kind, right.reasons) == (EXPLAINED, ())
 
 
 def test_a_value_beyond_belief_is_not_recommended():

@@ -5,7 +5,7 @@ it changes the model. The trial values are proportional to the model's own masse
 written where their entry is defined; only the factors that several entries share are settings.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
 import numpy as np
@@ -31,7 +31,12 @@ from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
 
 
 def catalogue(
-    spec: mujoco.MjSpec, *, num_observations: int, dt: float, settings: EffectSettings = EFFECT_SETTINGS
+    spec: mujoco.MjSpec,
+    *,
+    num_observations: int,
+    dt: float,
+    velocities: Sequence[int] = (),
+    settings: EffectSettings = EFFECT_SETTINGS,
 ) -> tuple[CatalogueEntry, ...]:
     """Returns the effects that a simulator of a model may lack, with initial values for their fits.
 
@@ -39,6 +44,8 @@ def catalogue(
         spec: the model's specification, which is not changed.
         num_observations: number of entries of the observation; 0 omits sensor effects.
         dt: the control step, in s.
+        velocities: entries of the observation that are velocities. They may be late together: many machines compute
+            them from positions, with a filter.
         settings: sizes of the trials.
 
     Returns:
@@ -67,7 +74,7 @@ def catalogue(
         *geom_entries(mechanism, spec),
         *force_entries(mechanism),
         *_action_entries(mechanism, dt),
-        *_observation_entries(num_observations, dt),
+        *_observation_entries(num_observations, dt, tuple(velocities)),
     ]
     unchanged = _bytes(model)
     return tuple(entry for entry in entries if _changes_something(entry, spec, unchanged))
@@ -113,12 +120,13 @@ def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]
     yield from entries_of(ActionNoise, "actuators", indexed_choices(labels, singles=False), shares("std", 0.1, 0.5))
 
 
-def _observation_entries(num: int, dt: float) -> Iterator[CatalogueEntry]:
+def _observation_entries(num: int, dt: float, velocities: tuple[int, ...]) -> Iterator[CatalogueEntry]:
     together = indexed_choices([""] * num, singles=False)
+    late = together | ({velocities: velocities} if 0 < len(velocities) < num else {})
     single = {chosen: entries for chosen, entries in indexed_choices([""] * num).items() if len(entries) == 1}
     yield from entries_of(ObservationGain, "entries", single, lambda _: each("scale", 0.8, 1.25))
     yield from entries_of(ObservationBias, "entries", single, lambda _: each("bias", 0.1, -0.1))
-    yield from entries_of(ObservationDelay, "entries", together, lambda _: each("delay", 0.3 * dt, dt, 2.0 * dt))
+    yield from entries_of(ObservationDelay, "entries", late, lambda _: each("delay", 0.3 * dt, dt, 2.0 * dt))
     yield from entries_of(ObservationNoise, "entries", together, lambda _: each("std", 0.01, 0.1))
 
 

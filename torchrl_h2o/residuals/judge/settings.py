@@ -79,7 +79,11 @@ class VerdictSettings:
     small_rest: float = 0.02
     """Share of the error ahead below which the remaining error is not reported as a missing effect."""
     level: float = 0.01
-    """Significance level of the decrease of the error on the report's data."""
+    """Significance level of a change of the error on the report's data."""
+    worse: float = 1.1
+    """Factor on the median error of a quantity above which the effects make it worse."""
+    worse_negligible: float = 0.001
+    """Median error, in spreads, below which a rise does not count."""
     auc_near_one: float = 0.95
     """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
     much_lower: float = 0.5

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
@@ -59,6 +60,9 @@ def reach_verdict(
         if not signs:
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
+    if error.headline is not None:
+        steps = max(1, round(error.headline.seconds / simulation.control_step))
+        signs = (*made_worse(simulation, mended, measured, steps, settings), *signs)
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
     small = error.headline is not None and error.headline.after < rules.small_rest * error.headline.before
     if signs and not small:

@@ -17,6 +17,7 @@ import numpy as np
 from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
+from torchrl_h2o.data.audit.log import find_pairs
 from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
 from torchrl_h2o.effects.effect import BatchedForce
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
@@ -154,7 +155,8 @@ class Simulation:
         """Returns candidate effects that the simulator may lack, sized by the model with the present effects."""
         spec = self.spec()
         self.pipeline.edit(spec)
-        return catalogue(spec, num_observations=len(self.state_map.names), dt=self.control_step)
+        velocities = sorted(pair.velocity for pair in find_pairs(self.state_map, self.model))
+        return catalogue(spec, num_observations=len(self.state_map.names), dt=self.control_step, velocities=velocities)
 
     def with_effects(self, *effects: Effect) -> Simulation:
         """Returns the simulation with more effects, appended to the present ones."""

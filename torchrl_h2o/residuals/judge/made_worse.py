@@ -1,0 +1,50 @@
+"""Measured quantities that a simulator predicts worse with the effects found than without them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.report.errors import HeadlineError
+from torchrl_h2o.residuals.report.sentence import headline_words
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+
+
+def made_worse(
+    simulation: Simulation, mended: Simulation, measured: Measured, steps: int, settings: LoopSettings = DEFAULTS
+) -> tuple[str, ...]:
+    """Names the quantity whose error the effects raise most, as evidence that one of them is wrong.
+
+    A fit lowers the sum over all quantities. A wrong effect can lower it, if what one quantity gains exceeds what
+    another one loses; a right one lowers all errors, or leaves them as they are.
+
+    Args:
+        simulation: the simulator before effects are put in.
+        mended: the simulator with them.
+        measured: the data, of which the part for the report is used.
+        steps: control steps ahead at which the errors are compared.
+        settings: smallest rise of the median error, and significance level.
+
+    Returns:
+        One clause, or nothing if no error rises by enough and significantly.
+    """
+    starts = measured.reported_on(steps)
+    if len(starts) < settings.verdict.far_windows:
+        return ()
+    names, units = simulation.state_map.names, simulation.state_map.units
+    worst = settings.residual.worst * np.maximum(measured.observation.std(0), 1e-12)
+    before, after = (
+        np.fmin(np.abs(residuals(which, measured, starts, steps)[:, -1]), worst) for which in (simulation, mended)
+    )
+    medians = np.median(before, axis=0), np.median(after, axis=0)
+    rise = medians[1] / np.maximum(medians[0], settings.verdict.worse_negligible * worst / settings.residual.worst)
+    index = int(rise.argmax())
+    p = p_value_of_losses(after[:, index], before[:, index], settings.significance)
+    if rise[index] <= settings.verdict.worse or p >= settings.verdict.level / len(names):
+        return ()
+    old, new = (float(median[index]) for median in medians)
+    rose = HeadlineError(names[index], units[index], steps * simulation.control_step, old, new)
+    return (f"at least one of these effects is wrong: they raise the error of {headline_words(rose)}",)
