@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import mannwhitneyu
@@ -10,6 +11,7 @@ from scipy.stats import mannwhitneyu
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
+from torchrl_h2o.residuals.judge.short_delays import short_delays
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -53,6 +55,19 @@ def reach_verdict(
         two_sample: AUC of the classifier before and after.
         settings: thresholds.
     """
+    verdict = _verdict(simulation, mended, measured, effects, error, two_sample, settings)
+    return replace(verdict, caveats=short_delays(effects, measured, simulation.control_step))
+
+
+def _verdict(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    effects: Sequence[Effect],
+    error: ErrorSummary,
+    two_sample: TwoSample,
+    settings: LoopSettings,
+) -> Verdict:
     rules = settings.verdict
     with_noise = simulation.with_effects(*effects)
     signs = signs_of_something_missing(with_noise, measured, error, two_sample, settings)

@@ -151,6 +151,7 @@ class Verdict:
         reasons: figures that the kind follows from, in words.
         recommended: whether the effects should be put into a simulator for training.
         where: when and at which states the unexplained part is largest; empty if nothing is unexplained.
+        caveats: sentences on effects that may have another cause than the one they are named after.
 
     Raises:
         ValueError: for an unknown kind.
@@ -160,6 +161,7 @@ class Verdict:
     reasons: tuple[str, ...] = ()
     recommended: bool = True
     where: str = ""
+    caveats: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.kind not in VERDICTS:

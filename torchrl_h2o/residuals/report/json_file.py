@@ -266,7 +266,7 @@ def _other(entry: Mapping[str, Any]) -> OtherExplanation:
 
 
 def _verdict(entry: Mapping[str, Any]) -> Verdict:
-    return _read(Verdict, entry, reasons=tuple(entry["reasons"]))
+    return _read(Verdict, entry, reasons=tuple(entry["reasons"]), caveats=tuple(entry.get("caveats", ())))
 
 
 def _window(entry: Mapping[str, Any]) -> ShownWindow:

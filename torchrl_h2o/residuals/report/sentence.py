@@ -23,8 +23,8 @@ def sentences(report: ReportContents) -> list[str]:
     """The result in words, and what qualifies it.
 
     Returns:
-        The result; other effects that these data cannot rule out; what the effects found do not explain; and severe
-        faults of the data. Those that do not apply are left out.
+        The result; other effects that these data cannot rule out; effects that may have another cause; what the effects
+        found do not explain; and severe faults of the data. Those that do not apply are left out.
     """
     words = _verdict_words(report)
     if report.audit is not None and report.audit.severe:
@@ -49,7 +49,8 @@ def _verdict_words(report: ReportContents) -> list[str]:
         return [f"Something is missing that {NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."]
     if report.found:
         rest = [f"Something else is missing that {NOT_IN_CATALOGUE}: {unknown}."] if unknown else []
-        return [f"Your simulator lacks: {_joined(words, error)}.", *_alternatives_words(report), *rest]
+        caveats = report.verdict.caveats if report.verdict is not None else ()
+        return [f"Your simulator lacks: {_joined(words, error)}.", *_alternatives_words(report), *caveats, *rest]
     return [f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."]
 
 
