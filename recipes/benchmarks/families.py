@@ -7,6 +7,7 @@ from types import MappingProxyType
 from cases import Family
 from drawn_cases import DECOY, JOINT_BY_JOINT, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
 from log_cases import log_families
+from machine_cases import MACHINE
 from paper_cases import PAPER, PAPER_WITH_NOISE
 from robot_cases import ROBOT
 
@@ -21,6 +22,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "slow": SLOW,
         "joints": JOINT_BY_JOINT,
         "robot": ROBOT,
+        "machines": MACHINE,
     }
 )
 

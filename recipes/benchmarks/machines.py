@@ -141,6 +141,12 @@ def _shoulder_friction(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.array([-0.2 * dry(v[0]), 0.0])
 
 
+def _weak_servos(spec: mujoco.MjSpec) -> None:
+    for servo in spec.actuators:
+        servo.gainprm[0] *= 0.7
+        servo.biasprm[1] *= 0.7
+
+
 def _small_losses(spec: mujoco.MjSpec) -> None:
     spec.joint("arm").armature, spec.joint("arm").damping = 4e-5, [5e-4, 0.0, 0.0]
     spec.joint("pendulum").damping = [5e-5, 0.0, 0.0]
@@ -173,7 +179,7 @@ MACHINES: Mapping[str, Machine] = MappingProxyType(
             delay=0.008,
         ),
         "links with weak servos": Machine(
-            model="servo_links", step=0.005, command=(0.5, 0.5), torque=_shoulder_friction, gain=(1.0, 1.0)
+            model="servo_links", step=0.005, command=(0.5, 0.5), change=_weak_servos, torque=_shoulder_friction
         ),
         "rotary pendulum": Machine(
             model="rotary_pendulum",

@@ -21,6 +21,7 @@ from torchrl_h2o.effects import (
     ModelEffect,
     ObservationDelay,
     ObservationGain,
+    ServoStiffness,
     catalogue,
     compile_model,
     paper_gap,
@@ -152,6 +153,21 @@ def test_sensors_are_left_out_where_nothing_is_observed():
     assert not [e for e in entries_of("Hopper", num_observations=0) if type(e.effect).__name__.startswith("Obs")]
     single = [e.effect for e in entries_of("Hopper", num_observations=1) if isinstance(e.effect, ObservationGain)]
     assert single == [ObservationGain()]
+
+
+def test_servos_may_be_stiffer_or_weaker():
+    arm = """<mujoco><worldbody><body><joint name="a"/><geom size=".1"/><body><joint name="b"/><geom size=".1"/></body>
+      </body></worldbody><actuator>{}</actuator></mujoco>"""
+    servos = '<position joint="a" kp="9"/><position joint="b" kp="9"/>'
+
+    def stiffness(actuators):
+        entries = catalogue(mujoco.MjSpec.from_string(arm.format(actuators)), num_observations=0, dt=0.01)
+        return [entry.effect.actuators for entry in entries if isinstance(entry.effect, ServoStiffness)]
+
+    assert stiffness(servos) == [(0,), (1,), None]
+    assert stiffness(servos + '<motor joint="a"/>') == [(0,), (1,), None]
+    assert stiffness('<position joint="a" kp="9"/>') == [None]
+    assert stiffness('<motor joint="a"/>') == []
 
 
 def test_velocities_may_be_late_together():

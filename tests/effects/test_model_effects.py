@@ -26,6 +26,7 @@ from torchrl_h2o.effects import (
     JointStiffness,
     Payload,
     RollingResistance,
+    ServoStiffness,
     Timestep,
     compile_model,
 )
@@ -175,3 +176,36 @@ def test_edits_are_made_in_their_order():
     assert doubled.body_mass.sum() == pytest.approx(28.0)
     model = compile_model(spec(CART), [GeomFriction(0.5), GeomFriction(0.5)])
     np.testing.assert_array_equal(model.geom("rod").friction, [0.25, 0.00125, 0.000025])
+
+
+SERVO = """<mujoco>
+  <worldbody>
+    <body><joint name="hip"/><geom size=".1"/><body><joint name="knee"/><geom size=".1"/></body></body>
+  </worldbody>
+  <actuator>
+    <motor joint="hip"/><position joint="hip" kp="30" kv="1"/><position joint="knee" kp="10"/>
+  </actuator>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(("actuators", "stiffness"), [(None, (21.0, 7.0)), ((2,), (30.0, 7.0))])
+def test_servo_stiffness_scales_servos_and_leaves_motors_and_damping(actuators, stiffness):
+    before = compile_model(mujoco.MjSpec.from_string(SERVO))
+    after = compile_model(mujoco.MjSpec.from_string(SERVO), [ServoStiffness(0.7, actuators)])
+    np.testing.assert_allclose(after.actuator_gainprm[1:, 0], stiffness)
+    np.testing.assert_allclose(after.actuator_biasprm[1:, 1], np.negative(stiffness))
+    np.testing.assert_array_equal(after.actuator_biasprm[:, 2], before.actuator_biasprm[:, 2])
+    np.testing.assert_array_equal(after.actuator_gainprm[0], before.actuator_gainprm[0])
+
+
+@pytest.mark.parametrize(
+    ("actuators", "complaint"), [((0,), "is a position servo"), ((3,), "not all indices of 3 actuators")]
+)
+def test_servo_stiffness_needs_a_servo(actuators, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        compile_model(mujoco.MjSpec.from_string(SERVO), [ServoStiffness(0.7, actuators)])
+
+
+def test_neutral_servo_stiffness_leaves_the_model_bit_identical():
+    plain, neutral = (compile_model(mujoco.MjSpec.from_string(SERVO), given) for given in ([], [ServoStiffness()]))
+    assert as_bytes(plain) == as_bytes(neutral)

@@ -19,7 +19,7 @@ ESTIMATED = replace(MEASURED, estimated_std=np.array([0.0, 0.1]))
 def test_filtered_and_estimated_velocities_can_cause_a_short_delay(short):
     (words,) = short_delays((Gravity(1.1), FILTERED, short), MEASURED, STEP)
     assert words.startswith("Filtered velocities, too, can look like this: all")
-    assert "0.005 s." in words
+    assert "0.005 s; better have them estimated" in words
     assert short_delays((short,), ESTIMATED, STEP)[0].startswith("Estimated velocities")
 
 

@@ -163,7 +163,7 @@ def _lag(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Find
             "warning" if abs(lag) >= settings.lag_warning else "note",
             f"{late}({1e3 * abs(lag) * log.dt:.3g} ms) against the derivative of {pair.name}, as a filtered velocity",
             None,
-            "log the velocity without its filter, or shift its column; a search may add ObservationDelay",
+            "log the velocity without its filter, or leave it out: derivative_of estimates it from the position",
         )
     ]
 

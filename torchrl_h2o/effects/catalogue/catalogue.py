@@ -18,8 +18,10 @@ from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, en
 from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.effects.catalogue.model_entries import body_entries, force_entries, geom_entries, joint_entries
 from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.indices import Indices
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
+from torchrl_h2o.effects.model.servo import ServoStiffness, is_servo
 from torchrl_h2o.effects.model.timestep import Timestep
 from torchrl_h2o.effects.observation.sensor import (
     ObservationBias,
@@ -73,6 +75,7 @@ def catalogue(
         *joint_entries(mechanism),
         *geom_entries(mechanism, spec),
         *force_entries(mechanism),
+        *_servo_entries(mechanism, spec),
         *_action_entries(mechanism, dt),
         *_observation_entries(num_observations, dt, tuple(velocities)),
     ]
@@ -88,6 +91,14 @@ def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         spatial = tuple({"pitch": pitch, "roll": roll} for pitch in (0.1, -0.1) for roll in (0.1, -0.1))
         yield CatalogueEntry(GravityTilt(), each("pitch", 0.1, -0.1) if planar else spatial)
     yield CatalogueEntry(Timestep(), each("scale", 0.8, 1.25))
+
+
+def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
+    servos = tuple(index for index, actuator in enumerate(spec.actuators) if is_servo(actuator))
+    choices: dict[Indices, tuple[int, ...]] = {(index,): (index,) for index in servos} if len(servos) > 1 else {}
+    if servos:
+        choices[None] = servos
+    yield from entries_of(ServoStiffness, "actuators", choices, lambda _: each("scale", *mechanism.settings.factors))
 
 
 def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]:

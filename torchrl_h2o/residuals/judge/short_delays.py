@@ -28,8 +28,10 @@ def short_delays(effects: Sequence[Effect], measured: Measured, control_step: fl
     short = [effect for effect in effects if 0.0 < _time(effect) < control_step]
     if not short or not (estimated or filtered):
         return ()
-    how = "Estimated" if estimated else "Filtered"
-    return (f"{how} velocities, too, can look like this: {' and '.join(map(effect_words, short))}.",)
+    words = " and ".join(map(effect_words, short))
+    if estimated:
+        return (f"Estimated velocities, too, can look like this: {words}.",)
+    return (f"Filtered velocities, too, can look like this: {words}; better have them estimated (derivative_of).",)
 
 
 def _time(effect: Effect) -> float:

@@ -1,0 +1,51 @@
+"""Effect on the position servos of a model."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+
+from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.indices import Indices
+from torchrl_h2o.effects.parameter import parameter
+
+
+@dataclass(frozen=True)
+class ServoStiffness(ModelEffect):
+    """Scales the stiffness of position servos: their torque per radian between the command and the position.
+
+    The damping of the servos stays as it is, unless the model gives it as a damping ratio.
+
+    Args:
+        scale: factor on the stiffness, which MJCF calls ``kp``.
+        actuators: indices of the actuators; all by default. Actuators that are not position servos are skipped.
+
+    Raises:
+        ValueError: when put into a model that has no such actuator.
+
+    Examples:
+        >>> ServoStiffness(0.7).describe()
+        'stiffness of the servos of all actuators × 0.7'
+    """
+
+    wording: ClassVar[str] = "stiffness of the servos of {actuators} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=1.0)
+    actuators: Indices = None
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        count = len(spec.actuators)
+        chosen = range(count) if self.actuators is None else self.actuators
+        if any(index >= count for index in chosen):
+            raise ValueError(f"{chosen} are not all indices of {count} actuators")
+        servos = [spec.actuators[index] for index in chosen if is_servo(spec.actuators[index])]
+        if not servos:
+            raise ValueError("none of the actuators is a position servo, whose stiffness could be scaled")
+        for servo in servos:
+            servo.gainprm[0] *= self.scale
+            servo.biasprm[1] *= self.scale
+
+
+def is_servo(actuator: mujoco.MjsActuator) -> bool:
+    """Whether the force of an actuator is proportional to the difference of its command and its position."""
+    affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    return bool(affine and actuator.biasprm[1] != 0.0 and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED)
