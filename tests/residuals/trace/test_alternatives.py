@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import ActionDelay, CatalogueEntry, ObservationDelay
-from torchrl_h2o.residuals.trace.alternatives import _is_equivalent, _sketched_rivals
+from torchrl_h2o.effects import ActionDelay, CatalogueEntry, ObservationBias, ObservationDelay
+from torchrl_h2o.residuals.trace.alternatives import _is_equivalent, _rivals, _sketched_rivals
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import Lead
@@ -43,3 +43,22 @@ def test_an_entry_with_the_effects_parameters_starts_from_the_effects_values(sta
     ((_, sketch),) = _sketched_rivals(state, 0)
     assert sketch is not None
     assert sketch.effects[0].parameters["delay"].value == pytest.approx(0.013, rel=1e-4)
+
+
+def test_entries_that_change_the_residual_alike_are_alternatives_whatever_they_promise(state):
+    """The inertia of a body that turns about one axis is the rotor inertia of its joint, but its trials are smaller."""
+    rules = state.settings.trace
+    rng = np.random.default_rng(0)
+    change = rng.standard_normal(50)
+    own = Lead(LATE, ActionDelay(0.01), promise=0.5, trial={"delay": 0.01}, change=change)
+    alike = Lead(SENSORS, ObservationDelay(0.01), promise=0.01, trial={"delay": 0.01}, change=-0.1 * change)
+    others = []
+    for index, promise in enumerate(np.linspace(0.9, 0.4, rules.nearest_rivals + rules.top_rivals)):
+        entry = CatalogueEntry(ObservationBias(entries=(index,)), ({"bias": 1.0},))
+        others.append(Lead(entry, ObservationBias(1.0), float(promise), {}, rng.standard_normal(50)))
+
+    def tried(lead):
+        return {rival.entry.name for rival in _rivals(replace(state, rivals={LATE.name: [*others, own, lead]}), 0)}
+
+    assert SENSORS.name in tried(alike)
+    assert SENSORS.name not in tried(replace(alike, change=rng.standard_normal(50)))

@@ -59,14 +59,27 @@ def p_value_between(state: SearchState, problem: Problem, worse: Fit, better: Fi
 
 
 def _rivals(state: SearchState, index: int) -> list[Lead]:
-    """Leads whose promise was highest, or closest to the effect's own, when the effect was added."""
+    """Leads whose promise was highest, or closest to the effect's own, or that change the residual as it does.
+
+    All of the screening after which the effect was added. A lead with the same change may have another promise, because
+    the promise is limited by the size of the trials.
+    """
     rules, own = state.settings.trace, state.entries[index].name
     leads = state.rivals[own]
     names = {entry.name for entry in state.entries}
-    promise = next((lead.promise for lead in leads if lead.entry.name == own), 0.0)
+    effect = next((lead for lead in leads if lead.entry.name == own), None)
+    promise = 0.0 if effect is None else effect.promise
     others = [lead for lead in leads if lead.entry.name not in names and not _repeats(state, index, lead.entry)]
     nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[: rules.nearest_rivals]
-    return list({lead.entry.name: lead for lead in (*nearest, *others[: rules.top_rivals])}.values())
+    same = [] if effect is None else [lead for lead in others if _same_change(lead, effect, rules.same_change)]
+    chosen = (*nearest, *others[: rules.top_rivals], *same[: rules.top_rivals])
+    return list({lead.entry.name: lead for lead in chosen}.values())
+
+
+def _same_change(one: Lead, other: Lead, same: float) -> bool:
+    """Whether two entries change the residual in the same way, up to a factor."""
+    sizes = float(np.linalg.norm(one.change)) * float(np.linalg.norm(other.change))
+    return sizes > 0.0 and abs(float(one.change @ other.change)) >= same * sizes
 
 
 def _repeats(state: SearchState, index: int, entry: CatalogueEntry) -> bool:
