@@ -23,6 +23,7 @@ from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
+from torchrl_h2o.residuals.offered import offered_entries
 from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -53,7 +54,8 @@ def close_the_loop(
     Args:
         simulator: a TorchRL env of a Gymnasium MuJoCo task, with its gaps, or a :class:`Simulation`.
         data: transitions (T,) in TED, as the readers of :mod:`torchrl_h2o.data` return them, or :class:`Measured`.
-        catalogue: effects to try; those of :meth:`Simulation.catalogue` by default.
+        catalogue: effects to try; by default those of :meth:`Simulation.catalogue`, with a delay of the velocities only
+            if they are late against their positions.
         source: name of the data in the report.
         held_out: share of the transitions, taken from the end, on which errors are reported, or the indices of the
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
@@ -87,7 +89,7 @@ def close_the_loop(
     measured = read_measured(data, simulation, source, held_out, settings)
     if (reason := why_no_conclusion(simulation, measured)) is not None:
         return inconclusive_report(simulation, measured, reason, audit)
-    entries = simulation.catalogue() if catalogue is None else catalogue
+    entries = offered_entries(simulation, measured) if catalogue is None else catalogue
     with LoopBar(disable=not progress) as bar:
         evidence = gather_evidence(simulation, measured, settings, audit=audit)
         explanation = explain(
