@@ -38,11 +38,16 @@ class AuditedSimulation(Protocol):
 class AuditedTransitions(Protocol):
     """Transitions as arrays; ``torchrl_h2o.residuals.Measured`` provides them."""
 
-    observation: np.ndarray
-    action: np.ndarray
-    following: np.ndarray
-    run: np.ndarray
-    time: np.ndarray
+    @property
+    def observation(self) -> np.ndarray: ...
+    @property
+    def action(self) -> np.ndarray: ...
+    @property
+    def following(self) -> np.ndarray: ...
+    @property
+    def run(self) -> np.ndarray: ...
+    @property
+    def time(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
