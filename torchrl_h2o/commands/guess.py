@@ -11,6 +11,7 @@ import mujoco
 from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.layout_text import Coordinates, guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
+from torchrl_h2o.effects.model.servo import is_servo
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names
 from torchrl_h2o.whole_file import write_text
 
@@ -53,15 +54,15 @@ def guess_columns(arguments: Sequence[str]) -> None:
 
 def _coordinates_of(simulator: str) -> Coordinates:
     try:
-        model = mujoco.MjModel.from_xml_path(simulator)
+        spec = mujoco.MjSpec.from_file(simulator)
+        model = spec.compile()
     except ValueError as error:
         raise ValueError(f"simulator={simulator} is not an MJCF file that MuJoCo reads: {error}") from None
     names, units = coordinate_names(model)
-    servo = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (model.actuator_biasprm[:, 1] != 0.0)
     return Coordinates(
         dict(zip(names, units, strict=True)),
         [model.actuator(i).name or str(i) for i in range(model.nu)],
-        servos=bool(model.nu and servo.all()),
+        servos=model.nu > 0 and all(map(is_servo, spec.actuators)),
     )
 
 

@@ -38,7 +38,6 @@ from torchrl_h2o.effects import (
     GeomSize,
     Gravity,
     JointSpring,
-    ObservationDelay,
     ObservationNoise,
     ResidualForce,
 )
@@ -382,21 +381,3 @@ def seeded(*envs):
     for env in envs:
         env.set_seed(0)
     return envs
-
-
-@pytest.mark.parametrize("number", [0, 2, 8, 10])
-def test_the_faults_of_a_machine_explain_its_log(number):
-    """100 ms ahead, with the true faults and the filter's delay; the library did not simulate the log."""
-    case = draw_case(FAMILIES, "machines", number, SEED)
-    simulation = case.simulation()
-    measured = Measured.from_ted(case.measure(), simulation)
-    joints = len(case.joints)
-    late = ObservationDelay(case.machine.filter_time, tuple(range(joints, 2 * joints)))
-    steps = round(0.1 / case.machine.step)
-    starts = measured.windows(steps, steps)
-    before, after = (
-        np.median(np.abs(residuals(which, measured, starts, steps)[:, -1, :joints]), axis=0)
-        for which in (simulation.with_effects(late), simulation.with_effects(*case.truth, late))
-    )
-    assert (after < 0.5 * before).any()
-    assert (after < 1.05 * before).all()

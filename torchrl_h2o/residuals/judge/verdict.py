@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.stats import mannwhitneyu
@@ -55,19 +54,6 @@ def reach_verdict(
         two_sample: AUC of the classifier before and after.
         settings: thresholds.
     """
-    verdict = _verdict(simulation, mended, measured, effects, error, two_sample, settings)
-    return replace(verdict, caveats=short_delays(effects, measured, simulation.control_step))
-
-
-def _verdict(
-    simulation: Simulation,
-    mended: Simulation,
-    measured: Measured,
-    effects: Sequence[Effect],
-    error: ErrorSummary,
-    two_sample: TwoSample,
-    settings: LoopSettings,
-) -> Verdict:
     rules = settings.verdict
     with_noise = simulation.with_effects(*effects)
     signs = signs_of_something_missing(with_noise, measured, error, two_sample, settings)
@@ -79,12 +65,13 @@ def _verdict(
         steps = max(1, round(error.headline.seconds / simulation.control_step))
         signs = (*made_worse(simulation, mended, measured, steps, settings), *signs)
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
+    caveats = short_delays(effects, measured, simulation.control_step)
     small = error.headline is not None and error.headline.after < rules.small_rest * error.headline.before
     if signs and not small:
         where = where_most(mended, measured, settings)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
-        return Verdict(kind, (*against, *signs), recommended=not against, where=where)
-    return Verdict(NOT_EXPLAINED if against else EXPLAINED, against, recommended=not against)
+        return Verdict(kind, (*against, *signs), recommended=not against, where=where, caveats=caveats)
+    return Verdict(NOT_EXPLAINED if against else EXPLAINED, against, recommended=not against, caveats=caveats)
 
 
 def signs_of_something_missing(
