@@ -121,6 +121,15 @@ def test_filtered_velocity(good, simulation):
     assert "shoulder_velocity is late by 3." in warned(changed(good, late), simulation, "kinematics")
 
 
+@pytest.mark.parametrize("lag", [0, 2])
+def test_late_velocities_are_no_lag_of_the_actions(good, simulation, lag):
+    rows = rows_of(good)
+    rows[3:, 2:] = rows[:-3, 2:].copy()
+    data = measured(rows[:-3], np.vstack([good.action[lag:], good.action[:lag]])[:-3])
+    found = " ".join(str(finding) for finding in audit(data, simulation).findings if finding.check == "actions")
+    assert found == "" if lag == 0 else "2 rows (20 ms) later" in found
+
+
 def test_noise(good, simulation):
     noise = 0.3 * rows_of(good).std(0) * np.random.default_rng(0).standard_normal(rows_of(good).shape)
     found = audit(changed(good, lambda rows: rows + noise), simulation)

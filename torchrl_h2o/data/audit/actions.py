@@ -16,7 +16,9 @@ from torchrl_h2o.data.audit.settings import AuditSettings
 CHECK = "actions"
 
 
-def check_actions(log: Log, response: Response | None, settings: AuditSettings) -> list[Finding]:
+def check_actions(
+    log: Log, response: Response | None, settings: AuditSettings, *, lateness: float = 0.0
+) -> list[Finding]:
     """Compares the measured accelerations with those that the actions cause in the simulator.
 
     The change of the velocities within a window is fitted by the actions' responses, at every lag, beside dry and
@@ -26,11 +28,13 @@ def check_actions(log: Log, response: Response | None, settings: AuditSettings) 
         log: the data.
         response: simulated windows; None if the simulator cannot be consulted, which leaves the plain checks.
         settings: thresholds.
+        lateness: rows by which the velocities are late against their positions; the accelerations are as late, which
+            is no lag of the actions.
     """
     found = _plain(log, response, settings)
     if response is None or not log.action.shape[1] or not np.ptp(log.action, axis=0).any():
         return found
-    return [*found, *_against_accelerations(response, settings)]
+    return [*found, *_against_accelerations(response, settings, lateness)]
 
 
 def _plain(log: Log, response: Response | None, settings: AuditSettings) -> list[Finding]:
@@ -84,7 +88,7 @@ def _beyond_range(log: Log, response: Response, settings: AuditSettings) -> list
     return found
 
 
-def _against_accelerations(response: Response, settings: AuditSettings) -> list[Finding]:
+def _against_accelerations(response: Response, settings: AuditSettings, lateness: float) -> list[Finding]:
     reversed_ones = _reversed(response, settings)
     if reversed_ones:
         return reversed_ones
@@ -110,13 +114,13 @@ def _against_accelerations(response: Response, settings: AuditSettings) -> list[
     sharp = 0 if gained else lag_of_events(response, settings)
     if sharp >= settings.clear_lag and explained[sharp - lags[0]] > settings.unrelated:
         best = int(sharp - lags[0])
-        found += _late(response, sharp, settings)
+        found += _late(response, sharp, settings, lateness)
     elif gained and lag != 0:
         if best in (0, len(lags) - 1):
             return [] if response.drowned else [_out_of_step(lag)]
         few = response.for_hypotheses()
         lag = min((lag, lag - 1, lag + 1), key=few.misfit_at_lag)  # windows blur the lag by a row
-        found += _late(response, lag, settings) if lag else []
+        found += _late(response, lag, settings, lateness)
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)
@@ -208,7 +212,11 @@ def _out_of_step(lag: int) -> Finding:
     return Finding(CHECK, "severe", words, None, "pair the log with its own actions")
 
 
-def _late(response: Response, lag: int, settings: AuditSettings) -> list[Finding]:
+def _late(response: Response, lag: int, settings: AuditSettings, lateness: float) -> list[Finding]:
+    if lag > 0:
+        lag = max(0, lag - round(lateness))
+    if lag == 0:
+        return []
     seconds = lag * response.log.dt
     words = f"the actions act {abs(lag)} rows ({1e3 * abs(seconds):.3g} ms) {'later' if lag > 0 else 'earlier'} than "
     words += "their rows say"

@@ -10,7 +10,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_h2o.data.audit.actions import check_actions
-from torchrl_h2o.data.audit.derivative import Derivative, deviation, fit_derivative, roughness
+from torchrl_h2o.data.audit.derivative import Derivative, deviation, fit_derivative, lateness, roughness
 from torchrl_h2o.data.audit.excitation import check_excitation
 from torchrl_h2o.data.audit.finding import SEVERITIES, Finding
 from torchrl_h2o.data.audit.kinematics import check_kinematics
@@ -112,7 +112,7 @@ def audit(
         return ordered([*found, Finding("model", "note", words), *check_actions(log, None, settings)])
     found += check_model(response, settings)
     if not any(finding.severity == "severe" for finding in found):
-        found += check_actions(log, response, settings)
+        found += check_actions(log, response, settings, lateness=lateness(derivatives))
     if not any(finding.severity == "severe" for finding in found):
         found += check_belonging(response, settings)
         found += check_excitation(response, settings)

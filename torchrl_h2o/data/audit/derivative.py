@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,11 @@ def fit_derivative(log: Log, pair: Pair, settings: AuditSettings) -> Derivative:
         min(usual / np.sqrt(2.0), roughness(log, pair.position)),
         min(usual * np.sqrt(2.0) / log.dt, roughness(log, pair.velocity), spread),
     )
+
+
+def lateness(derivatives: Sequence[Derivative]) -> float:
+    """Rows by which the velocities are late against their positions, the median over the pairs; at least 0."""
+    return max(0.0, float(np.median([derivative.lag for derivative in derivatives]))) if derivatives else 0.0
 
 
 def steps_of(log: Log, position: int, velocity: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
