@@ -7,6 +7,7 @@ from torchrl_h2o.effects import (
     ActionGain,
     ActionNoise,
     ActionSaturation,
+    Armature,
     Gravity,
     JointDamping,
     JointFrictionLoss,
@@ -94,6 +95,15 @@ def test_a_value_beyond_belief_is_not_recommended():
     unbelievable = verdict((Gravity(0.02),), (Gravity(0.02),), noise=0.0)
     assert not unbelievable.recommended
     assert "implausibly far" in unbelievable.reasons[0]
+
+
+def test_a_joint_that_hardly_moves_explains_no_friction():
+    """The joint is slow because of its damping. A rotor of 30 kg·m² keeps it slow too, and lowers all errors."""
+    frozen = verdict((JointDamping(3.0),), (Armature(30.0),), noise=0.0)
+    assert (frozen.kind, frozen.recommended) == (NOT_EXPLAINED, False)
+    (reason,) = [reason for reason in frozen.reasons if "every velocity stays as it is" in reason]
+    assert "elbow 100 ms ahead: " in reason
+    assert verdict((JointDamping(3.0),), (JointDamping(3.0),), noise=0.0).kind == EXPLAINED
 
 
 @pytest.mark.parametrize(("delay", "named"), [(1.0, True), (0.9995, True), (0.9, False), (0.02, False)])

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
 from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.judge.short_delays import short_delays
@@ -137,6 +138,8 @@ def reasons_against(
     if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
+    if acting and head is not None:
+        reasons += no_better_than_constant_velocity(mended, measured, head, settings)
     halved = head is not None and head.after < rules.much_lower * head.before
     if auc is not None and auc > rules.auc_near_one and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")
