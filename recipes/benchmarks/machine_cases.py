@@ -34,6 +34,7 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import EXPLAINED_IN_PART, NOT_EXPLAINED
 
+ARM = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")  # joints of the arm
 WITHIN = 0.15  # relative error of a parameter
 #: the faults of each machine that a catalogue has
 TRUTH: Mapping[str, tuple[Effect, ...]] = MappingProxyType(
@@ -45,6 +46,11 @@ TRUTH: Mapping[str, tuple[Effect, ...]] = MappingProxyType(
         # the cable is slack at 0.3 rad: a spring about 0 rad, and the torque 0.8 N·m/rad × 0.3 rad
         "leg with a cable": (JointSpring(0.8, "knee"), JointForce(0.24, "knee")),
         "rotary pendulum": (Armature(4e-5, "arm"), JointDamping(5e-4, "arm"), JointDamping(5e-5, "pendulum")),
+        "six-joint arm": (
+            *(JointFrictionLoss(size, joint) for joint, size in zip(ARM, (6.0, 7.0, 5.0, 1.2, 1.0, 0.8), strict=True)),
+            *(JointDamping(size, joint) for joint, size in zip(ARM, (4.0, 5.0, 3.0, 0.6, 0.5, 0.4), strict=True)),
+            Payload(1.2, y=0.12, z=0.03, bodies="wrist_3"),
+        ),
     }
 )
 #: machines with a fault that a catalogue does not have: friction that depends on the position

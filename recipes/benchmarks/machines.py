@@ -152,6 +152,17 @@ def _small_losses(spec: mujoco.MjSpec) -> None:
     spec.joint("pendulum").damping = [5e-5, 0.0, 0.0]
 
 
+def _arm_friction(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    dry_friction, viscous = np.array([6.0, 7.0, 5.0, 1.2, 1.0, 0.8]), np.array([4.0, 5.0, 3.0, 0.6, 0.5, 0.4])
+    return -dry_friction * dry(v) - viscous * v
+
+
+def _tool(spec: mujoco.MjSpec) -> None:
+    spec.body("wrist_3").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0.12, 0.03], size=[0.03, 0, 0], mass=1.2, contype=0, conaffinity=0
+    )
+
+
 LINKS = {"step": 0.005, "command": (4.0, 1.2), "hold": (3.0, 1.0)}
 MACHINES: Mapping[str, Machine] = MappingProxyType(
     {
@@ -194,6 +205,18 @@ MACHINES: Mapping[str, Machine] = MappingProxyType(
         ),
         "geared arm": Machine(
             model="geared_arm", step=0.005, command=(3.0,), memory=0.3, hold=(1.0,), brake=(0.1,), torque=_geared_arm
+        ),
+        "six-joint arm": Machine(
+            model="six_joint_arm",
+            step=0.008,
+            command=(20.0, 40.0, 20.0, 5.0, 4.0, 2.0),
+            memory=1.0,
+            hold=(40.0, 200.0, 60.0, 12.0, 8.0, 3.0),
+            brake=(5.0, 20.0, 5.0, 0.5, 0.5, 0.2),
+            encoder=(2.0 * np.pi / 2**15,) * 6,
+            filter_time=0.004,
+            change=_tool,
+            torque=_arm_friction,
         ),
     }
 )

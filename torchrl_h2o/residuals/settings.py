@@ -7,7 +7,13 @@ from dataclasses import dataclass, field
 from torchrl_h2o.residuals.judge.settings import JudgeSettings, VerdictSettings
 from torchrl_h2o.residuals.measured.settings import MeasuredSettings, OutsideSettings, ResidualSettings
 from torchrl_h2o.residuals.noise.settings import NoiseSettings
-from torchrl_h2o.residuals.trace.settings import FitSettings, HorizonSettings, SignificanceSettings, TraceSettings
+from torchrl_h2o.residuals.trace.settings import (
+    FitSettings,
+    HorizonSettings,
+    InverseDynamicsSettings,
+    SignificanceSettings,
+    TraceSettings,
+)
 from torchrl_h2o.residuals.undeclared.settings import RegressionSettings, UndeclaredSettings
 
 
@@ -36,6 +42,8 @@ class LoopSettings:
     """Choice of the window length."""
     trace: TraceSettings = field(default_factory=TraceSettings)
     """Search over the catalogue."""
+    inverse_dynamics: InverseDynamicsSettings = field(default_factory=InverseDynamicsSettings)
+    """Regression of missing forces."""
     undeclared: UndeclaredSettings = field(default_factory=UndeclaredSettings)
     """Search for a force outside the catalogue."""
     regression: RegressionSettings = field(default_factory=RegressionSettings)

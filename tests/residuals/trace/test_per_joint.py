@@ -7,7 +7,6 @@ from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import Armature, CatalogueEntry, JointFrictionLoss
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.per_joint import entries_of_elements
 
 SIMULATION = double_pendulum()
 TRIALS = ({"torque": 0.02}, {"torque": 0.1})
@@ -52,9 +51,3 @@ def test_an_effect_that_is_only_possible_beside_another_does_not_end_the_search(
         trace = trace_effects(SIMULATION, measured, catalogue, known=known, rng=rng, progress=progress)
     model = SIMULATION.with_effects(*trace.fit.effects).model
     assert model.dof_armature == pytest.approx([0.012, 0.009], rel=0.15)
-
-
-def test_elements_of_an_effect_on_several_joints():
-    assert entries_of_elements(ALL, CATALOGUE, SIMULATION) == (SHOULDER, ELBOW)
-    assert entries_of_elements(ALL, (SHOULDER, ALL), SIMULATION) == ()
-    assert entries_of_elements(ELBOW, CATALOGUE, SIMULATION) == ()

@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.report.errors import HeadlineError
 from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-_VELOCITY = ("rad/s", "m/s")
+VELOCITY_UNITS = ("rad/s", "m/s")
 
 
 def headline_horizon(
@@ -57,7 +57,7 @@ def headline_error(simulation: Simulation, mended: Simulation, measured: Measure
     before, after = (_median(which, measured, starts, steps) for which in (simulation, mended))
     names, units = simulation.state_map.names, simulation.state_map.units
     spread = np.maximum(measured.observation.std(0), 1e-12)
-    positions = np.array([unit not in _VELOCITY for unit in units])
+    positions = np.array([unit not in VELOCITY_UNITS for unit in units])
     if not positions.any():
         positions[:] = True
     index = int(np.where(positions, before / spread, -1.0).argmax())

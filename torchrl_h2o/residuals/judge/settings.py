@@ -85,7 +85,7 @@ class VerdictSettings:
     worse_negligible: float = 0.001
     """Median error, in spreads, below which a rise does not count."""
     better_than_guess: float = 0.8
-    """Error ahead, in errors of the guess that every velocity stays as it is, up to which the effects explain motion."""
+    """Median error ahead up to which effects explain the motion, in errors of the guess of constant velocities."""
     auc_near_one: float = 0.95
     """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
     much_lower: float = 0.5

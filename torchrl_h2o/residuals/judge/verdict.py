@@ -138,8 +138,8 @@ def reasons_against(
     if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
-    if acting and head is not None:
-        reasons += no_better_than_constant_velocity(mended, measured, head, settings)
+    if acting:
+        reasons += no_better_than_constant_velocity(mended, measured, settings)
     halved = head is not None and head.after < rules.much_lower * head.before
     if auc is not None and auc > rules.auc_near_one and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")

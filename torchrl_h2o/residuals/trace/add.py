@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.outcome import Attempt
@@ -90,7 +91,7 @@ def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generato
     left = state.first.selection_loss(state.fit.effects)
     for size, count in rules.set_sizes:
         enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
-        if len(among) < size or len(state.entries) + size > rules.max_effects or not enough_left:
+        if len(among) < size or number_of_effects(state) + size > rules.max_effects or not enough_left:
             break
         sketches = _sketches(state, leads, among, size, count)
         if size == 1:

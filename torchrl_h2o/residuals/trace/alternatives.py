@@ -9,9 +9,9 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
+from torchrl_h2o.residuals.trace.families import elements
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
-from torchrl_h2o.residuals.trace.per_joint import elements
 from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.screening import Lead, are_possible_alone, free_parameters, is_possible
 from torchrl_h2o.residuals.trace.state import SearchState

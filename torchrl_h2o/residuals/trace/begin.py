@@ -1,13 +1,23 @@
-"""Begins a search with effects that are known already, such as those of an unfinished run."""
+"""Begins a search with known effects, or anew where it has found only effects that keep the joints still."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.measured.constant_velocity import explains_motion, shares_of_guess
+from torchrl_h2o.residuals.measured.transitions import Split
+from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
+from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
+from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
+
+PROPOSAL = 0.1  # share by which a regression, and the fit of what it proposes, bring the bar closer to the stage's end
 
 
 def begin_with(state: SearchState, known: Sequence[Effect]) -> SearchState:
@@ -30,6 +40,55 @@ def begin_with(state: SearchState, known: Sequence[Effect]) -> SearchState:
         candidates = [one for one in state.catalogue if one is entry or one not in entries]
         rivals[entry.name] = screen(state.problem, others, candidates, state.windows.screened)
     return replace(state, rivals=rivals).with_found(entries, state.refitted(entries, effects))
+
+
+def begin_anew(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
+) -> SearchState | None:
+    """Begins another search if the first one explains no motion: with longer windows, and proposed effects.
+
+    Windows of one control step are too short where the motion in them is smaller than the sensors' noise: a joint that
+    keeps its velocity is then as good as the right effects.
+
+    Args:
+        state: what the first search has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+        progress: bar that shows how far the search is.
+
+    Returns:
+        The state with the proposed effects; None if the effects found explain motion, or the proposed
+        ones do not.
+    """
+    simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
+    if not state.entries or _explains_motion(state):
+        return None
+    effects = propose_effects(
+        simulation, measured, catalogue, lambda: progress.closer(PROPOSAL / len(catalogue)), settings.inverse_dynamics
+    )
+    lengths = possible_horizons(simulation, measured, settings.horizon)
+    long_enough = [steps for steps in lengths if steps * simulation.control_step >= settings.inverse_dynamics.window]
+    horizon = min(long_enough, default=lengths[-1])
+    problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+    other = SearchState.begin(problem, catalogue, rng, settings)
+    pairs = [(entry_of(effect, catalogue), effect) for effect in effects]
+    possible = [(entry, effect) for entry, effect in pairs if entry is not None and is_possible(problem, [effect])]
+    if not possible or not is_possible(problem, [effect for _, effect in possible]):
+        return None
+    entries, start = zip(*possible, strict=True)
+    proposed = other.with_found(entries, other.refitted(entries, start))
+    progress.closer(PROPOSAL)
+    return begin_with(other, proposed.fit.effects) if _explains_motion(proposed) else None
+
+
+def _explains_motion(state: SearchState) -> bool:
+    """Whether the effects found predict the selection windows better than the guess of constant velocities."""
+    mended = state.first.simulation.with_effects(*state.fit.effects)
+    rules = state.settings.judge
+    shares = shares_of_guess(
+        mended, state.first.measured, Split.SELECTION, rules.headline_seconds, rules.headline_windows
+    )
+    return explains_motion(shares, state.settings.verdict.better_than_guess)
 
 
 def entry_of(effect: Effect, catalogue: Sequence[CatalogueEntry]) -> CatalogueEntry | None:

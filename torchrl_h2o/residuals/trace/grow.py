@@ -17,6 +17,7 @@ from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import Additions, additions, distinct
 from torchrl_h2o.residuals.trace.eliminate import eliminate
+from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.problem import matters
@@ -88,7 +89,7 @@ class _Beam:
 
     def _with_one_more(self, state: SearchState) -> list[SearchState]:
         """The states with one set of effects more; empty if the list is complete."""
-        if state.exact or len(state.entries) >= state.settings.trace.max_effects:
+        if state.exact or number_of_effects(state) >= state.settings.trace.max_effects:
             return []
         one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
         leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)

@@ -9,6 +9,7 @@ from operator import itemgetter
 import numpy as np
 
 from torchrl_h2o.residuals.trace.add import Addition, Additions, distinct, sketched_set, tested
+from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import Lead, along
 
@@ -34,7 +35,7 @@ def pairs_by_prediction(
         The pairs that pass the tests of an addition.
     """
     state, rules = singles.state, singles.state.settings.trace
-    if len(state.entries) + PAIR > rules.max_effects:
+    if number_of_effects(state) + PAIR > rules.max_effects:
         return Additions(state, singles.leads)
     quick = (
         (leads, sketched_set(state, [*single.fit.effects, leads[-1].effect], leads))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry, Effect, selection
-from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.residuals.trace.families import entries_of_elements
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import are_possible_alone, free_parameters, is_possible
@@ -34,34 +33,6 @@ def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchSta
         state, before = next((divided for divided in divisions if _pays(state, divided, rng)), state), state
         if state is before:
             return state
-
-
-def entries_of_elements(
-    entry: CatalogueEntry, catalogue: Sequence[CatalogueEntry], simulation: Simulation
-) -> tuple[CatalogueEntry, ...]:
-    """The entries with the same effect on each of the joints or motors of an entry; empty if it acts on fewer than two.
-
-    Args:
-        entry: an entry of the catalogue.
-        catalogue: all entries.
-        simulation: simulator, for the names of its joints and motors.
-    """
-    own = elements(entry.effect, simulation)
-    if len(own) < 2:
-        return ()
-    alike = [other for other in catalogue if type(other.effect) is type(entry.effect)]
-    alone = {acted_on[0]: other for other in alike if len(acted_on := elements(other.effect, simulation)) == 1}
-    return tuple(alone[one] for one in own) if alone.keys() >= set(own) else ()
-
-
-def elements(effect: Effect, simulation: Simulation) -> tuple[str | int, ...]:
-    """Names of the joints, or indices of the motors, that an effect acts on; empty for other effects."""
-    if (joints := getattr(effect, "joints", None)) is not None:
-        return tuple(joint.name for joint in selection.joints(simulation.spec(), joints))
-    if hasattr(effect, "actuators"):
-        chosen = getattr(effect, "actuators", None)
-        return tuple(range(simulation.model.nu)) if chosen is None else chosen
-    return ()
 
 
 def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:

@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.begin import begin_with
+from torchrl_h2o.residuals.trace.begin import begin_anew, begin_with
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.grow import grow
@@ -59,8 +59,15 @@ def trace_effects(
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
     found(_outcome(state))
-    for _ in range(settings.trace.rounds):
-        state = grow(state, rng, progress, lambda grown: found(_outcome(grown)))
+
+    def report(grown: SearchState) -> None:
+        found(_outcome(grown))
+
+    for attempt in range(settings.trace.rounds):
+        state = grow(state, rng, progress, report)
+        if attempt == 0 and (other := begin_anew(state, catalogue, rng, progress)) is not None:
+            report(other)
+            state = grow(other, rng, progress, report)
         if not state.entries:
             break
         progress.stage(OTHERS)

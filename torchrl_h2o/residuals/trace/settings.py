@@ -84,7 +84,7 @@ class TraceSettings:
     surely_beyond_noise: float = 0.5
     """Share of the held-out loss; an addition that explains more passes without a test against synthetic noise."""
     max_effects: int = 6
-    """Largest number of effects in one explanation."""
+    """Largest number of effects in one explanation; the same effect on each of several joints counts as one."""
     rounds: int = 3
     """Largest number of rounds of growing and simplifying."""
     screened_steps: int = 400
@@ -141,3 +141,19 @@ class TraceSettings:
     """Loss difference between alternatives, as a share of the effect's gain, that counts as rounding."""
     alike_loss: float = 0.1
     """Loss difference, as a share of the effect's gain, beyond which an alternative is ruled out."""
+
+
+@dataclass(frozen=True)
+class InverseDynamicsSettings:
+    """The regression of missing forces, for a search that has found nothing but effects that keep joints still."""
+
+    half_width: float = 0.025
+    """Time before and after a row, in s, over which its velocity and acceleration are averaged."""
+    rows: int = 1500
+    """Largest number of rows in the regression."""
+    least_rows: int = 200
+    """Smallest number of rows."""
+    more_left: float = 1.2
+    """Multiple of the loss with all entries up to which entries are left out."""
+    window: float = 0.1
+    """Length of the windows with which the search begins anew, in s, if the data hold enough of them."""

@@ -1,0 +1,52 @@
+"""Families: the same effect on each of several joints or motors, such as the friction of every joint of an arm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchrl_h2o.effects import CatalogueEntry, Effect, selection
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.state import SearchState
+
+
+def entries_of_elements(
+    entry: CatalogueEntry, catalogue: Sequence[CatalogueEntry], simulation: Simulation
+) -> tuple[CatalogueEntry, ...]:
+    """The entries with the same effect on each of the joints or motors of an entry; empty if it acts on fewer than two.
+
+    Args:
+        entry: an entry of the catalogue.
+        catalogue: all entries.
+        simulation: simulator, for the names of its joints and motors.
+    """
+    own = elements(entry.effect, simulation)
+    if len(own) < 2:
+        return ()
+    alike = [other for other in catalogue if type(other.effect) is type(entry.effect)]
+    alone = {acted_on[0]: other for other in alike if len(acted_on := elements(other.effect, simulation)) == 1}
+    return tuple(alone[one] for one in own) if alone.keys() >= set(own) else ()
+
+
+def elements(effect: Effect, simulation: Simulation) -> tuple[str | int, ...]:
+    """Names of the joints, or indices of the motors, that an effect acts on; empty for other effects."""
+    if (joints := getattr(effect, "joints", None)) is not None:
+        return tuple(joint.name for joint in selection.joints(simulation.spec(), joints))
+    if hasattr(effect, "actuators"):
+        chosen = getattr(effect, "actuators", None)
+        return tuple(range(simulation.model.nu)) if chosen is None else chosen
+    return ()
+
+
+def number_of_effects(state: SearchState) -> int:
+    """Number of effects found; the same effect on each of several joints or motors counts as one."""
+    simulation, number = state.problem.simulation, len(state.entries)
+    for kind in {type(entry.effect) for entry in state.entries}:
+        acting = [elements(entry.effect, simulation) for entry in state.entries if type(entry.effect) is kind]
+        alone = {acted_on[0] for acted_on in acting if len(acted_on) == 1}
+        if len(alone) < 2:
+            continue
+        together = [set(elements(entry.effect, simulation)) for entry in state.catalogue if type(entry.effect) is kind]
+        for family in sorted(together, key=len, reverse=True):
+            if len(family) > 1 and family <= alone:
+                alone, number = alone - family, number - len(family) + 1
+    return number
