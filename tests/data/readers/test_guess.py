@@ -34,6 +34,7 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
         ("i_q current", "action", "A"),
         ("tau_des", "action", "N·m"),
         ("pos_des", "desired position", "rad"),
+        ("target_moment_shoulder", "action", "N·m"),
         ("hip_vel_ref", "desired velocity", "rad/s"),
         ("q[1]", "position", "rad"),
         ("v (m/s)", "velocity", "m/s"),

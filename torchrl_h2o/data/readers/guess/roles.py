@@ -31,12 +31,13 @@ _WORDS = {
         "v",
         "w",
     ),
-    "action": ("tau", "torque", "torques", "u", "effort", "input", "action", "act", "force", "current"),
+    "action": ("tau", "torque", "torques", "u", "effort", "input", "action", "act", "force", "current", "moment"),
     "position": (
         *("pos", "position", "positions", "angle", "q", "theta", "phi", "psi", "roll", "pitch", "yaw", "alpha", "beta"),
         *("x", "y", "z", "height", "encoder", "enc", "joint", "hip", "knee", "ankle", "elbow", "shoulder", "wrist"),
     ),
 }
+_FORCES = ("tau", "torque", "torques", "effort", "force", "current", "moment")  # a commanded one is no desired position
 _WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
 _SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
@@ -108,7 +109,8 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
     if "time" in fits and not ((np.diff(numbers) >= 0).mean() > 0.9 and np.ptp(numbers) > 0):
         fits.remove("time")
     if fits & {"desired", "command"}:
-        return next((f"desired {kind}" for kind in ("velocity", "position") if kind in fits), "action")
+        motion = () if any(word in _FORCES for word in words) else ("velocity", "position")
+        return next((f"desired {kind}" for kind in motion if kind in fits), "action")
     return next((kind for kind in _WORDS if kind in fits), "unknown")
 
 
