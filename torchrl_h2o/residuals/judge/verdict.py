@@ -139,7 +139,7 @@ def reasons_against(
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
     if acting:
-        reasons += no_better_than_constant_velocity(mended, measured, settings)
+        reasons += no_better_than_constant_velocity(mended, measured, acting, settings)
     halved = head is not None and head.after < rules.much_lower * head.before
     if auc is not None and auc > rules.auc_near_one and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")

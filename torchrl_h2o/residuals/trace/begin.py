@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.measured.constant_velocity import explains_motion, sh
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
-from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
+from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -48,7 +48,8 @@ def begin_anew(
     """Begins another search if the first one explains no motion: with longer windows, and proposed effects.
 
     Windows of one control step are too short where the motion in them is smaller than the sensors' noise: a joint that
-    keeps its velocity is then as good as the right effects.
+    keeps its velocity is then as good as the right effects. The kinds of effects that have kept the joints still are
+    left out of the other search, unless the regression proposes them.
 
     Args:
         state: what the first search has found.
@@ -70,8 +71,12 @@ def begin_anew(
     long_enough = [steps for steps in lengths if steps * simulation.control_step >= settings.inverse_dynamics.window]
     horizon = min(long_enough, default=lengths[-1])
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
-    other = SearchState.begin(problem, catalogue, rng, settings)
     pairs = [(entry_of(effect, catalogue), effect) for effect in effects]
+    kept_still = {type(entry.effect) for entry in state.entries}.intersection(PROPOSED)
+    searched = [
+        entry for entry in catalogue if type(entry.effect) not in kept_still or any(entry is one for one, _ in pairs)
+    ]
+    other = SearchState.begin(problem, searched, rng, settings)
     possible = [(entry, effect) for entry, effect in pairs if entry is not None and is_possible(problem, [effect])]
     if not possible or not is_possible(problem, [effect for _, effect in possible]):
         return None
