@@ -1,17 +1,21 @@
 """Effects proposed by a regression of the missing forces, and a search that begins anew with them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import Armature, CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, Payload
+from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.begin import begin_anew, entry_of
 from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
 
-SIMULATION = double_pendulum()
+SIMULATION, JOINTS = double_pendulum(), ("shoulder", "elbow")
 FRICTION = (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"), JointDamping(0.1, "shoulder"))
 MEASURED = recorded(SIMULATION.with_effects(*FRICTION), 3000, noise=0.002)
 KINDS = (Armature, JointDamping, JointFrictionLoss, Gravity)
@@ -66,3 +70,16 @@ def test_a_search_that_has_found_only_heavy_rotors_begins_anew_and_finds_the_fri
 def test_a_search_that_explains_the_motion_goes_on():
     assert begun_anew(MEASURED, FRICTION) is None
     assert begun_anew(MEASURED, ()) is None
+
+
+def test_a_search_for_effects_begins_anew_after_its_first_growth():
+    """One effect is allowed, and the rotors from which the search begins are one."""
+    truth, rotors = (JointFrictionLoss(0.1, "shoulder"), JointDamping(1.0, "*")), Armature(30.0, "*")
+    slow = recorded(SIMULATION.with_effects(*truth), 700, noise=0.002)
+    few = [entry_of(effect, CATALOGUE) for effect in (rotors, truth[0], *(JointDamping(1.0, j) for j in JOINTS))]
+    one = replace(DEFAULTS, trace=replace(DEFAULTS.trace, max_effects=1, rounds=1))
+    with LoopBar(disable=True) as bar:
+        rng = np.random.default_rng(0)
+        trace = trace_effects(SIMULATION, slow, few, rng=rng, progress=bar, known=[rotors], settings=one)
+    assert JointFrictionLoss in map(type, trace.fit.effects)
+    assert Armature not in map(type, trace.fit.effects)
