@@ -124,7 +124,9 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)
-    return [*found, *(order or _gains(response, fits[best], settings))]
+    if order or friction_cancels(response, settings):
+        return [*found, *order]
+    return [*found, *_gains(response, fits[best], settings)]
 
 
 def _reversed(response: Response, settings: AuditSettings) -> list[Finding]:
@@ -167,6 +169,19 @@ def friction_responses(response: Response) -> np.ndarray:
     spread = np.maximum(velocity.std(0), 1e-12)
     terms = (np.tanh(velocity / (0.1 * spread)), velocity / spread, np.ones_like(velocity))
     return np.concatenate([response.by_force * term[:, None] for term in terms], axis=-1)
+
+
+def friction_cancels(response: Response, settings: AuditSettings) -> bool:
+    """Whether friction cancels most of what the actions do in the simulator, with the gains of its own motors.
+
+    This is usual in geared arms. What is left is then small beside the actions' effect, even if it is large beside the
+    motion, and a fit trades the gain of a motor against friction.
+    """
+    effect = (response.by_action * response.limited[response.rows].mean(1)[:, None]).sum(-1)
+    others = np.concatenate([friction_responses(response), response.by_zero], -1)
+    found = robust_fit(response.target - effect, others, response.scale, settings.robust)
+    left = np.nanmedian(np.abs(response.target - effect - others @ found.values), axis=0)
+    return bool(np.mean(left / np.maximum(np.nanmedian(np.abs(effect), axis=0), 1e-12)) < settings.cancelled)
 
 
 def _over_lags(
