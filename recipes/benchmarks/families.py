@@ -33,7 +33,7 @@ def all_families(logs: Path | None = None) -> dict[str, Family]:
 
 
 def choose_families(names: Iterable[str], logs: Path | None = None) -> dict[str, Family]:
-    """Select families by name, and those of the real logs if their folder is given.
+    """Select families by name; with the folder of the real logs, also theirs, unless some of these are named.
 
     Raises:
         ValueError: for an unknown name.
@@ -42,7 +42,9 @@ def choose_families(names: Iterable[str], logs: Path | None = None) -> dict[str,
     if logs is not None and not logs.is_dir():
         raise FileNotFoundError(f"logs={logs}: there is no such folder")
     there = all_families(logs)
-    names = [*names, *(there.keys() - FAMILIES.keys())]
+    names, logged = list(names), there.keys() - FAMILIES.keys()
+    if logged.isdisjoint(names):
+        names += logged
     for name in names:
         if name not in there:
             raise ValueError(f"cases={name}: choose from {', '.join(there)}")

@@ -362,6 +362,8 @@ def test_steps_are_counted_in_all_that_is_made_of_a_simulation():
 
 def test_families_are_chosen_by_name_and_logs_by_their_folder(tmp_path):
     assert list(choose_families(["nothing", "paper16"])) == ["paper16", "nothing"]
+    assert list(choose_families(["nothing"], tmp_path)) == ["nothing", "log_wheel_legged", "log_pendulum"]
+    assert list(choose_families(["log_pendulum"], tmp_path)) == ["log_pendulum"]
     with pytest.raises(ValueError, match="cases=paper: choose from paper16"):
         choose_families(["paper"])
     with pytest.raises(FileNotFoundError, match="no such folder"):
