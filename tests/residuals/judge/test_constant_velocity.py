@@ -1,8 +1,13 @@
 """Effects on single joints that predict their motion no better than the guess that velocities stay as they are."""
 
-from tests.residuals.pendulum import double_pendulum, recorded
-from torchrl_h2o.effects import Armature, JointDamping, JointForce
-from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
+from dataclasses import replace
+
+import mujoco
+
+from tests.residuals.pendulum import DOUBLE, double_pendulum, recorded
+from torchrl_h2o.effects import Armature, Gravity, JointDamping, JointForce
+from torchrl_h2o.residuals import Simulation, StateMap
+from torchrl_h2o.residuals.judge.constant_velocity import _quantities_of_joints, no_better_than_constant_velocity
 
 SIMULATION = double_pendulum()
 SLOW_ELBOW = (JointDamping(0.3, "shoulder"), JointDamping(1.0, "elbow"))
@@ -31,3 +36,14 @@ def test_nothing_is_said_of_motion_that_the_sensors_noise_hides():
 def test_an_effect_of_both_joints_is_judged_by_both():
     found = (*SLOW_ELBOW, JointForce(1e-6, "*"))
     assert against(SLOW_ELBOW, found) == ()
+
+
+def test_joints_without_names_and_with_several_coordinates_are_found():
+    nameless = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(DOUBLE.replace('name="elbow" ', "")))
+    assert _quantities_of_joints(nameless, Armature(0.1, "lower/*")) == [1, 3]
+    body = '<mujoco><worldbody><body><freejoint name="free"/><geom size="0.1"/></body></worldbody></mujoco>'
+    names = tuple(map(str, range(13)))
+    every = StateMap.of_coordinates(names, ("1",) * 13, range(13), num_states=13)
+    flying = Simulation(lambda: mujoco.MjSpec.from_string(body), 1, every)
+    assert _quantities_of_joints(flying, JointForce(0.1, "free")) == list(range(13))
+    assert _quantities_of_joints(flying, Gravity(0.5)) == []

@@ -31,9 +31,10 @@ def test_elements_of_an_effect_on_several_joints():
         ((SHOULDER, ROTOR), 2),
         ((SHOULDER, ELBOW, GRAVITY), 2),
         ((SHOULDER, ELBOW, ALL), 2),
+        ((SHOULDER, ELBOW, ROTOR), 2),
     ],
 )
-def test_the_same_effect_on_each_joint_counts_as_one(entries, number):
+def test_the_same_effect_on_single_joints_counts_as_one(entries, number):
     problem = Problem.pose(SIMULATION, recorded(SIMULATION, 600))
     state = SearchState.begin(problem, CATALOGUE, np.random.default_rng(0))
     assert number_of_effects(state.with_found(entries, state.fit)) == number

@@ -2,17 +2,29 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import double_pendulum, recorded
-from torchrl_h2o.effects import Armature, CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, Payload
-from torchrl_h2o.residuals import trace_effects
+from tests.residuals.pendulum import DOUBLE, double_pendulum, recorded
+from torchrl_h2o.effects import (
+    Armature,
+    BodyMass,
+    CatalogueEntry,
+    Gravity,
+    JointDamping,
+    JointForce,
+    JointFrictionLoss,
+    ObservationDelay,
+    Payload,
+)
+from torchrl_h2o.residuals import StateMap, trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.begin import begin_anew, entry_of
-from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
+from torchrl_h2o.residuals.trace.inverse_dynamics import _rows, propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION, JOINTS = double_pendulum(), ("shoulder", "elbow")
@@ -23,7 +35,8 @@ CATALOGUE = tuple(entry for entry in SIMULATION.catalogue() if isinstance(entry.
 
 
 def test_friction_of_each_joint_is_proposed():
-    proposed = {(type(effect), effect.joints): effect for effect in propose_effects(SIMULATION, MEASURED, CATALOGUE)}
+    found = propose_effects(SIMULATION, MEASURED, CATALOGUE)
+    proposed = {(type(effect), effect.joints): effect for _, effect in found}
     assert proposed.keys() == {(type(effect), effect.joints) for effect in FRICTION}
     for true in FRICTION:
         (name,) = true.parameters
@@ -34,7 +47,7 @@ def test_a_payload_is_proposed_with_its_mass():
     damped = SIMULATION.with_effects(JointDamping(1.0))
     measured = recorded(damped.with_effects(Payload(0.2, z=-0.15, bodies="lower")), 3000, noise=0.002)
     trials = ({"mass": 0.05, "x": 0.0, "z": -0.15},)
-    (payload,) = propose_effects(damped, measured, [CatalogueEntry(Payload(bodies="lower"), trials)])
+    ((_, payload),) = propose_effects(damped, measured, [CatalogueEntry(Payload(bodies="lower"), trials)])
     assert (payload.mass, payload.z) == pytest.approx((0.2, -0.15), rel=0.05)
 
 
@@ -83,3 +96,40 @@ def test_a_search_for_effects_begins_anew_after_its_first_growth():
         trace = trace_effects(SIMULATION, slow, few, rng=rng, progress=bar, known=[rotors], settings=one)
     assert JointFrictionLoss in map(type, trace.fit.effects)
     assert Armature not in map(type, trace.fit.effects)
+
+
+def test_friction_that_the_model_has_can_be_reduced_and_a_rotor_that_it_lacks_cannot():
+    """Without these bounds, the missing gravity and the light link would make the rotor's inertia negative."""
+    rough, smooth = (SIMULATION.with_effects(JointDamping(damping, "*")) for damping in (0.8, 0.5))
+    less = [effect.damping for _, effect in propose_effects(rough, recorded(smooth, 3000, noise=0.002), CATALOGUE)]
+    assert less == pytest.approx([-0.3, -0.3], rel=0.15)
+    light = (JointDamping(0.3, "*"), BodyMass(0.6, "lower"), Gravity(1.3))
+    found = propose_effects(SIMULATION, recorded(SIMULATION.with_effects(*light), 3000, noise=0.002), CATALOGUE)
+    assert found
+    assert is_possible(Problem.pose(SIMULATION, MEASURED), [effect for _, effect in found])
+
+
+def test_nothing_is_proposed_for_an_equal_simulator():
+    (elbow,) = (entry for entry in SIMULATION.catalogue() if entry.effect == JointForce(0.0, "elbow"))
+    assert propose_effects(SIMULATION, recorded(SIMULATION, 3000, noise=0.002), [elbow]) == ()
+
+
+def test_differences_do_not_cross_runs_nor_reach_unknown_states():
+    runs = replace(MEASURED, run=np.arange(3000) // 30)
+    half = 2
+    rows = _rows(runs, half, DEFAULTS.inverse_dynamics)
+    assert (runs.run[rows - half] == runs.run[rows + half]).all()
+    late = SIMULATION.with_effects(ObservationDelay(0.02, (2, 3)))
+    assert propose_effects(late, runs, CATALOGUE)
+
+
+def test_nothing_is_proposed_if_a_coordinate_is_not_observed_or_actuators_have_a_state():
+    slow = recorded(SIMULATION.with_effects(JointDamping(1.0, "*")), 3000, noise=0.002)
+    assert propose_effects(SIMULATION, slow, CATALOGUE)
+    without_shoulder = StateMap.of_coordinates(("e", "v", "w"), ("rad", "rad/s", "rad/s"), (1, 2, 3), num_states=4)
+    blind = replace(SIMULATION, state_map=without_shoulder)
+    columns = {name: getattr(slow, name)[:, 1:] for name in ("observation", "following")}
+    assert propose_effects(blind, replace(slow, **columns), CATALOGUE) == ()
+    filtered = DOUBLE.replace("<motor ", '<general dyntype="filter" dynprm="0.01" ')
+    slow_motors = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(filtered))
+    assert propose_effects(slow_motors, slow, slow_motors.catalogue()) == ()

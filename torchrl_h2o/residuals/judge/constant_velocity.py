@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.judge.headline import VELOCITY_UNITS
-from torchrl_h2o.residuals.measured.constant_velocity import explains_motion, median_errors, shares_of_guess
+from torchrl_h2o.residuals.measured.constant_velocity import ErrorsAhead, errors_ahead, explains_motion
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.words import duration, effect_words, quantity
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -33,35 +33,26 @@ def no_better_than_constant_velocity(
         One clause if most quantities are predicted no better at any time ahead. Otherwise one for each effect on
         joints all of whose quantities are predicted no better.
     """
-    rules, seconds = settings.judge, settings.judge.headline_seconds
-    shares = shares_of_guess(mended, measured, Split.REPORT, seconds, rules.headline_windows)
-    most = settings.verdict.better_than_guess
-    if not shares:
-        return ()
-    if not explains_motion(shares, most):
+    errors, most = errors_ahead(mended, measured, Split.REPORT, settings), settings.verdict.better_than_guess
+    if not explains_motion(errors, most):
         everything = range(len(mended.state_map.names))
-        return (f"they predict the motion {_hardly_better(mended, measured, shares, everything)}",)
+        return (f"they predict the motion {_hardly_better(mended, errors[0], everything)}",)
     clauses = []
     for effect in effects:
         own = _quantities_of_joints(mended, effect)
-        if own and min(float(share[own].min()) for share in shares.values()) > most:
+        if errors and own and min(float(error.relative[own].min()) for error in errors) > most:
             joints = f"with {effect_words(effect)}, the motion of these joints is predicted"
-            clauses.append(f"{joints} {_hardly_better(mended, measured, shares, own)}")
+            clauses.append(f"{joints} {_hardly_better(mended, errors[0], own)}")
     return tuple(clauses)
 
 
-def _hardly_better(
-    mended: Simulation, measured: Measured, shares: Mapping[int, np.ndarray], among: Sequence[int]
-) -> str:
-    """The end of a clause, with the errors of a usual one of these quantities."""
-    steps, share = min(shares.items())
-    names, units = mended.state_map.names, mended.state_map.units
-    # a position is easier to picture than a velocity
-    usual = np.median(share[among])
-    index = min(among, key=lambda i: (units[i] in VELOCITY_UNITS, abs(share[i] - usual)))
-    errors = median_errors(mended, measured, measured.reported_on(steps), steps)
-    missed, guessed = (quantity(float(error[index]), units[index], 2) for error in errors)
-    ahead = f"{names[index]} {duration(steps * mended.control_step)} ahead"
+def _hardly_better(mended: Simulation, error: ErrorsAhead, among: Sequence[int]) -> str:
+    """The end of a clause, with the errors of the quantity with the median relative error; positions come first."""
+    names, units, relative = mended.state_map.names, mended.state_map.units, error.relative
+    usual = np.median(relative[among])
+    index = min(among, key=lambda i: (units[i] in VELOCITY_UNITS, abs(relative[i] - usual)))
+    missed, guessed = (quantity(float(which[index]), units[index], 2) for which in (error.simulated, error.guessed))
+    ahead = f"{names[index]} {duration(error.steps * mended.control_step)} ahead"
     return f"hardly better than by the guess that every velocity stays as it is ({ahead}: {missed} against {guessed})"
 
 
@@ -70,9 +61,8 @@ def _quantities_of_joints(simulation: Simulation, effect: Effect) -> list[int]:
     if (chosen := getattr(effect, "joints", None)) is None:
         return []
     model, observe = simulation.model, simulation.state_map.observe
-    coordinates: list[int] = []
-    for joint in selection.joints(simulation.spec(), chosen):
-        at = model.joint(joint.name)
-        coordinates += range(at.qposadr[0], at.qposadr[0] + len(at.qpos0))
-        coordinates += range(model.nq + at.dofadr[0], model.nq + at.dofadr[0] + len(at.damping))
+    dofs = selection.joint_dofs(model, chosen)
+    ends = np.append(model.jnt_qposadr, model.nq)
+    positions = [at for joint in {model.dof_jntid[dof] for dof in dofs} for at in range(ends[joint], ends[joint + 1])]
+    coordinates = [*positions, *(model.nq + dof for dof in dofs)]
     return [int(i) for i in np.flatnonzero((observe[:, coordinates] != 0.0).any(1))]

@@ -2,35 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from torchrl_h2o.residuals.measured.residual import residuals, start_states
-from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
+from torchrl_h2o.residuals.measured.residual import residuals, start_states, undelayed_following
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
-def median_errors(
-    simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Median errors at the end of windows, of a simulator and of the guess that every velocity stays as it is.
+@dataclass(frozen=True, eq=False)
+class ErrorsAhead:
+    """Median errors at one time ahead, in the units of the observations.
+
+    Args:
+        steps: control steps ahead.
+        simulated: (n), errors of a simulator.
+        guessed: (n), errors of the guess that every velocity stays as it is.
+        negligible: (n), error of the guess up to which nothing moves.
+    """
+
+    steps: int
+    simulated: np.ndarray
+    guessed: np.ndarray
+    negligible: np.ndarray
+
+    @property
+    def relative(self) -> np.ndarray:
+        """(n), errors of the simulator in errors of the guess; infinite where the simulator diverges."""
+        return np.nan_to_num(self.simulated / np.maximum(self.guessed, self.negligible), nan=np.inf)
+
+
+def errors_ahead(
+    simulation: Simulation, measured: Measured, split: Split, settings: LoopSettings = DEFAULTS
+) -> list[ErrorsAhead]:
+    """Errors of a simulator and of the guess at the times ahead of the report's sentence, in ascending order.
 
     Args:
         simulation: the simulator.
         measured: the data.
-        starts: (W), first row of each window.
-        steps: control steps per window.
-
-    Returns:
-        Two arrays (n), in the units of the observations.
+        split: part of the data.
+        settings: times ahead, and the number of windows that a time needs.
     """
-    states = start_states(simulation, measured, starts)
-    missed = np.abs(residuals(simulation, measured, starts, steps, states=states)[:, -1])
-    guess = at_constant_velocity(simulation, states[starts], steps)
-    guessed = np.abs(measured.following[starts + steps - 1] - guess)
-    return np.nanmedian(missed, axis=0), np.nanmedian(guessed, axis=0)
+    rules, errors = settings.judge, []
+    states, following = start_states(simulation, measured), undelayed_following(simulation, measured)
+    negligible = settings.verdict.worse_negligible * np.maximum(measured.observation.std(0), 1e-12)
+    for steps in sorted({max(1, round(time / simulation.control_step)) for time in rules.headline_seconds}):
+        starts = measured.spread_windows(split, steps)
+        if len(starts) < rules.headline_windows:
+            continue
+        missed = residuals(simulation, measured, starts, steps, states=states)[:, -1]
+        wrong = following[starts + steps - 1] - at_constant_velocity(simulation, states[starts], steps)
+        simulated, guessed = (_median_size(error) for error in (missed, wrong))
+        errors.append(ErrorsAhead(steps, simulated, guessed, negligible))
+    return errors
 
 
 def at_constant_velocity(simulation: Simulation, states: np.ndarray, steps: int) -> np.ndarray:
@@ -42,40 +70,21 @@ def at_constant_velocity(simulation: Simulation, states: np.ndarray, steps: int)
     return simulation.observed(np.hstack([position, velocity])[:, None])[:, 0]
 
 
-def share_of_guess(simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:
-    """Median error of a simulator in median errors of the guess, (n); see :func:`median_errors`.
-
-    Errors of the guess below a thousandth of a quantity's spread count as this thousandth.
-    """
-    missed, guessed = median_errors(simulation, measured, starts, steps)
-    return missed / np.maximum(guessed, 1e-3 * np.maximum(measured.observation.std(0), 1e-12))
-
-
-def shares_of_guess(
-    simulation: Simulation, measured: Measured, split: Split, seconds: Sequence[float], least: int
-) -> dict[int, np.ndarray]:
-    """The shares (n) at several times ahead, by control steps; see :func:`share_of_guess`.
+def explains_motion(errors: Sequence[ErrorsAhead], most: float) -> bool:
+    """Whether most quantities are predicted better than by the guess, at one of the times ahead at least.
 
     Args:
-        simulation: the simulator.
-        measured: the data.
-        split: part of the data.
-        seconds: times ahead, in s.
-        least: smallest number of windows; times with fewer are left out.
+        errors: of :func:`errors_ahead`.
+        most: relative error up to which a prediction counts as better.
+
+    Returns:
+        The answer; True if the data hold enough windows for none of the times.
     """
-    shares = {}
-    for steps in sorted({max(1, round(time / simulation.control_step)) for time in seconds}):
-        starts = thinned(measured.windows(steps, steps, split=split), measured.settings.max_windows)
-        if len(starts) >= least:
-            shares[steps] = share_of_guess(simulation, measured, starts, steps)
-    return shares
+    return not errors or min(float(np.median(error.relative)) for error in errors) <= most
 
 
-def explains_motion(shares: Mapping[int, np.ndarray], most: float) -> bool:
-    """Whether most quantities are predicted better than by the guess at one of the times ahead; True without times.
-
-    Args:
-        shares: of :func:`shares_of_guess`.
-        most: share up to which a prediction counts as better.
-    """
-    return not shares or min(float(np.median(share)) for share in shares.values()) <= most
+def _median_size(error: np.ndarray) -> np.ndarray:
+    """Median size of errors (W, n), (n); NaN where more than half of the windows diverge."""
+    size = np.nan_to_num(np.abs(error), nan=np.inf)
+    median = np.median(size, axis=0)
+    return np.where(np.isfinite(median), median, np.nan)

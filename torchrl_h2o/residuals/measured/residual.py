@@ -39,7 +39,7 @@ def residuals(
     reached = simulation.rollout(
         states[starts], executed_actions(simulation, measured, rng)[rows], time=measured.time[starts], applied=applied
     )
-    return _undelayed(simulation, measured)[rows] - simulation.observed(reached)
+    return undelayed_following(simulation, measured)[rows] - simulation.observed(reached)
 
 
 def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | None = None) -> np.ndarray:
@@ -60,7 +60,7 @@ def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.
     return np.concatenate([simulation.executed(measured.action[run], rng) for run in measured.runs])
 
 
-def _undelayed(simulation: Simulation, measured: Measured) -> np.ndarray:
+def undelayed_following(simulation: Simulation, measured: Measured) -> np.ndarray:
     """Following observations, (T, n), with the delays of the sensors undone."""
     observation, following = measured.observation, measured.following
     return np.concatenate(

@@ -177,17 +177,18 @@ class Measured:
 
     def fitted(self, horizon: int = 1) -> np.ndarray:
         """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``settings.max_windows``."""
-        return self._thinned(Split.FIT, horizon)
+        return self.spread_windows(Split.FIT, horizon)
 
     def selected_on(self, horizon: int = 1) -> np.ndarray:
         """First rows, (W), of the windows by which effects are chosen, as :meth:`fitted`."""
-        return self._thinned(Split.SELECTION, horizon)
+        return self.spread_windows(Split.SELECTION, horizon)
 
     def reported_on(self, horizon: int = 1) -> np.ndarray:
         """First rows, (W), of the windows on which errors are reported, as :meth:`fitted`."""
-        return self._thinned(Split.REPORT, horizon)
+        return self.spread_windows(Split.REPORT, horizon)
 
-    def _thinned(self, split: Split, horizon: int) -> np.ndarray:
+    def spread_windows(self, split: Split, horizon: int) -> np.ndarray:
+        """First rows, (W), of a part's windows: not overlapping, evenly thinned to ``settings.max_windows``."""
         return thinned(self.windows(horizon, horizon, split=split), self.settings.max_windows, self.block)
 
     def part(self, rows: slice) -> Measured:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
-from torchrl_h2o.residuals.measured.constant_velocity import explains_motion, shares_of_guess
+from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
@@ -34,12 +34,17 @@ def begin_with(state: SearchState, known: Sequence[Effect]) -> SearchState:
     if not pairs or not is_possible(state.problem, [effect for _, effect in pairs]):
         return state
     entries, effects = zip(*pairs, strict=True)
+    return _with_rivals(state.with_found(entries, state.refitted(entries, effects)))
+
+
+def _with_rivals(state: SearchState, advance: Callable[[], object] = lambda: None) -> SearchState:
+    """The state with the leads that a screening without each of its effects gives; ``advance`` follows each entry."""
     rivals = {}
-    for entry, effect in pairs:
-        others = [other for other in effects if other is not effect]
-        candidates = [one for one in state.catalogue if one is entry or one not in entries]
-        rivals[entry.name] = screen(state.problem, others, candidates, state.windows.screened)
-    return replace(state, rivals=rivals).with_found(entries, state.refitted(entries, effects))
+    for entry, effect in zip(state.entries, state.fit.effects, strict=True):
+        others = [other for other in state.fit.effects if other is not effect]
+        candidates = [one for one in state.catalogue if one is entry or one not in state.entries]
+        rivals[entry.name] = screen(state.problem, others, candidates, state.windows.screened, advance)
+    return replace(state, rivals=rivals)
 
 
 def begin_anew(
@@ -48,8 +53,8 @@ def begin_anew(
     """Begins another search if the first one explains no motion: with longer windows, and proposed effects.
 
     Windows of one control step are too short where the motion in them is smaller than the sensors' noise: a joint that
-    keeps its velocity is then as good as the right effects. The kinds of effects that have kept the joints still are
-    left out of the other search, unless the regression proposes them.
+    keeps its velocity is then as good as the right effects. Properties of links and joints of the kinds that the first
+    search has found are left out of the other one, unless the regression proposes them.
 
     Args:
         state: what the first search has found.
@@ -64,36 +69,33 @@ def begin_anew(
     simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
     if not state.entries or _explains_motion(state):
         return None
-    effects = propose_effects(
+    pairs = propose_effects(
         simulation, measured, catalogue, lambda: progress.closer(PROPOSAL / len(catalogue)), settings.inverse_dynamics
     )
+    if not pairs:
+        return None
     lengths = possible_horizons(simulation, measured, settings.horizon)
     long_enough = [steps for steps in lengths if steps * simulation.control_step >= settings.inverse_dynamics.window]
     horizon = min(long_enough, default=lengths[-1])
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
-    pairs = [(entry_of(effect, catalogue), effect) for effect in effects]
     kept_still = {type(entry.effect) for entry in state.entries}.intersection(PROPOSED)
-    searched = [
-        entry for entry in catalogue if type(entry.effect) not in kept_still or any(entry is one for one, _ in pairs)
-    ]
-    other = SearchState.begin(problem, searched, rng, settings)
-    possible = [(entry, effect) for entry, effect in pairs if entry is not None and is_possible(problem, [effect])]
-    if not possible or not is_possible(problem, [effect for _, effect in possible]):
+    entries, effects = zip(*pairs, strict=True)
+    searched = [entry for entry in catalogue if entry in entries or type(entry.effect) not in kept_still]
+    if not is_possible(problem, effects):
         return None
-    entries, start = zip(*possible, strict=True)
-    proposed = other.with_found(entries, other.refitted(entries, start))
+    other = SearchState.begin(problem, searched, rng, settings)
+    proposed = other.with_found(entries, other.refitted(entries, effects))
     progress.closer(PROPOSAL)
-    return begin_with(other, proposed.fit.effects) if _explains_motion(proposed) else None
+    if not _explains_motion(proposed):
+        return None
+    return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / (len(entries) * len(searched))))
 
 
 def _explains_motion(state: SearchState) -> bool:
     """Whether the effects found predict the selection windows better than the guess of constant velocities."""
     mended = state.first.simulation.with_effects(*state.fit.effects)
-    rules = state.settings.judge
-    shares = shares_of_guess(
-        mended, state.first.measured, Split.SELECTION, rules.headline_seconds, rules.headline_windows
-    )
-    return explains_motion(shares, state.settings.verdict.better_than_guess)
+    errors = errors_ahead(mended, state.first.measured, Split.SELECTION, state.settings)
+    return explains_motion(errors, state.settings.verdict.better_than_guess)
 
 
 def entry_of(effect: Effect, catalogue: Sequence[CatalogueEntry]) -> CatalogueEntry | None:

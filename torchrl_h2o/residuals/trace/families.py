@@ -17,7 +17,7 @@ def entries_of_elements(
     Args:
         entry: an entry of the catalogue.
         catalogue: all entries.
-        simulation: simulator, for the names of its joints and motors.
+        simulation: simulator, for its joints and motors.
     """
     own = elements(entry.effect, simulation)
     if len(own) < 2:
@@ -27,10 +27,11 @@ def entries_of_elements(
     return tuple(alone[one] for one in own) if alone.keys() >= set(own) else ()
 
 
-def elements(effect: Effect, simulation: Simulation) -> tuple[str | int, ...]:
-    """Names of the joints, or indices of the motors, that an effect acts on; empty for other effects."""
+def elements(effect: Effect, simulation: Simulation) -> tuple[int, ...]:
+    """Indices in the model of the joints, or of the motors, that an effect acts on; empty for other effects."""
     if (joints := getattr(effect, "joints", None)) is not None:
-        return tuple(joint.name for joint in selection.joints(simulation.spec(), joints))
+        of_dof = simulation.model.dof_jntid
+        return tuple(dict.fromkeys(int(of_dof[dof]) for dof in selection.joint_dofs(simulation.model, joints)))
     if hasattr(effect, "actuators"):
         chosen = getattr(effect, "actuators", None)
         return tuple(range(simulation.model.nu)) if chosen is None else chosen
@@ -38,15 +39,7 @@ def elements(effect: Effect, simulation: Simulation) -> tuple[str | int, ...]:
 
 
 def number_of_effects(state: SearchState) -> int:
-    """Number of effects found; the same effect on each of several joints or motors counts as one."""
-    simulation, number = state.problem.simulation, len(state.entries)
-    for kind in {type(entry.effect) for entry in state.entries}:
-        acting = [elements(entry.effect, simulation) for entry in state.entries if type(entry.effect) is kind]
-        alone = {acted_on[0] for acted_on in acting if len(acted_on) == 1}
-        if len(alone) < 2:
-            continue
-        together = [set(elements(entry.effect, simulation)) for entry in state.catalogue if type(entry.effect) is kind]
-        for family in sorted(together, key=len, reverse=True):
-            if len(family) > 1 and family <= alone:
-                alone, number = alone - family, number - len(family) + 1
-    return number
+    """Number of effects found; the same effect on several single joints or motors counts as one."""
+    acting = [(type(entry.effect), elements(entry.effect, state.problem.simulation)) for entry in state.entries]
+    alone = [kind for kind, acted_on in acting if len(acted_on) == 1]
+    return len(acting) - len(alone) + len(set(alone))

@@ -10,8 +10,9 @@ Research 5(3), 101-119.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -38,6 +39,15 @@ from torchrl_h2o.residuals.trace.families import elements
 #: the properties of links and joints that are identified; the gain of a motor is not among them, because with a gain of
 #: zero and masses of zero no force would be missing
 PROPOSED = (JointFrictionLoss, JointDamping, JointSpring, JointForce, Armature, BodyMass, Payload)
+#: where the model holds a joint's own value, below which an effect cannot reduce it
+OWN_VALUES: Mapping[type[Effect], str] = MappingProxyType(
+    {
+        JointFrictionLoss: "dof_frictionloss",
+        JointDamping: "dof_damping",
+        Armature: "dof_armature",
+        JointSpring: "jnt_stiffness",
+    }
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +67,7 @@ def propose_effects(
     catalogue: Sequence[CatalogueEntry],
     advance: Callable[[], object] = lambda: None,
     settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
-) -> tuple[Effect, ...]:
+) -> tuple[tuple[CatalogueEntry, Effect], ...]:
     """The properties of single links and joints that together explain the missing force.
 
     All are fitted together, and then left out one by one, the one that is needed least first. Velocities and
@@ -72,13 +82,14 @@ def propose_effects(
         settings: rows, smoothing and the size of the set.
 
     Returns:
-        The effects with the values of the regression; none if coordinates are unobserved or the rows are too few.
+        The entries, each with its effect at the value of the regression. None if coordinates are unobserved, if
+        actuators have a state of their own, which is not measured, or if the rows are too few.
     """
     half = max(1, round(settings.half_width / simulation.control_step))
-    rows = _rows(measured, half, settings)
-    if simulation.state_map.hidden or len(rows) < settings.least_rows:
+    observed = (simulation.state_map.observe != 0.0).any(0)
+    motion = _motion(simulation, measured, _rows(measured, half, settings), half)
+    if not observed.all() or simulation.model.na or len(motion.time) < settings.least_rows:
         return ()
-    motion = _motion(simulation, measured, rows, half)
     missing = missing_force(simulation, motion)
     entries, columns = [], []
     for entry in catalogue:
@@ -90,9 +101,9 @@ def propose_effects(
         advance()
     if not entries:
         return ()
-    bounds = np.array([_bounds(entry) for entry in entries]).T
+    bounds = np.array([_bounds(entry, simulation.model) for entry in entries]).T
     shares = _needed(missing, np.stack(columns, axis=-1), bounds, settings)
-    return tuple(_at(entry, share) for entry, share in zip(entries, shares, strict=True) if share != 0.0)
+    return tuple((entry, _at(entry, share)) for entry, share in zip(entries, shares, strict=True) if share != 0.0)
 
 
 def missing_force(simulation: Simulation, motion: _Motion) -> np.ndarray:
@@ -112,12 +123,17 @@ def missing_force(simulation: Simulation, motion: _Motion) -> np.ndarray:
 
 def _rows(measured: Measured, half: int, settings: InverseDynamicsSettings) -> np.ndarray:
     """Rows for fits, evenly spread, with ``half`` rows of their run on both sides."""
-    return thinned(measured.windows(2 * half, split=Split.FIT), settings.rows) + half
+    return thinned(measured.windows(2 * half + 1, split=Split.FIT), settings.rows) + half
 
 
 def _motion(simulation: Simulation, measured: Measured, rows: np.ndarray, half: int) -> _Motion:
-    """The motion from differences over ``half`` rows on both sides, which average the sensors' noise."""
+    """The motion from differences over ``half`` rows on both sides, which average the sensors' noise.
+
+    Rows next to unknown states, as those at the ends of a run with late sensors, are left out.
+    """
     states, model = start_states(simulation, measured), simulation.model
+    known = np.isfinite(states).all(1)
+    rows = rows[known[rows - half] & known[rows] & known[rows + half]]
     seconds, before, after = 2.0 * half * simulation.control_step, states[rows - half], states[rows + half]
     velocity = np.empty((len(rows), model.nv))
     for found, one, other in zip(velocity, before, after, strict=True):
@@ -161,7 +177,7 @@ def _needed(
     """
     kept = np.arange(changes.shape[-1])
     whole = found = _Regression.fit(missing, changes, bounds)
-    while len(kept) > 1:
+    while len(kept):
         fewer = np.delete(kept, found.least_needed)
         smaller = _Regression.fit(missing, changes[..., fewer], bounds[:, fewer])
         if smaller.loss(whole.scale) > settings.more_left * whole.loss(whole.scale):
@@ -180,7 +196,8 @@ class _Regression:
         shares: coefficients, (P).
         left: (W, nv), forces that are left.
         scale: (nv), usual size of what is left.
-        least_needed: index of the coefficient without which the weighted square of what is left rises least.
+        least_needed: index of the coefficient without which the weighted square of what is left rises least; 0 if there
+            is no coefficient.
     """
 
     shares: np.ndarray
@@ -191,8 +208,8 @@ class _Regression:
     @classmethod
     def fit(cls, missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, rounds: int = 6) -> _Regression:
         """Least squares with weights for the usual size of each force, and less weight for unusually large ones."""
-        left = missing
-        for _ in range(rounds):
+        left, shares, cost = missing, np.zeros(0), np.zeros(1)
+        for _ in range(rounds if changes.shape[-1] else 0):
             scale = _usual(left)
             root = 1.0 / (scale * np.sqrt(np.maximum(1.0, np.abs(left / scale) / 2.0)))
             shares, cost = _least_squares((missing * root).ravel(), changes * root[..., None], bounds)
@@ -225,14 +242,24 @@ def _scaled(entry: CatalogueEntry) -> tuple[str, ...]:
     return ("mass",) if isinstance(entry.effect, Payload) else tuple(moved)
 
 
-def _bounds(entry: CatalogueEntry) -> tuple[float, float]:
-    """Smallest and largest share of an entry's first trial that its bounds allow."""
-    lowest, highest = -np.inf, np.inf
+def _bounds(entry: CatalogueEntry, model: mujoco.MjModel) -> tuple[float, float]:
+    """Smallest and largest share of an entry's first trial that its bounds and the model allow."""
+    lowest, highest, least = -np.inf, np.inf, -_own_value(entry.effect, model)
     for name in _scaled(entry):
         parameter, trial = entry.effect.parameters[name], entry.trials[0][name]
-        ends = sorted((bound - parameter.neutral) / (trial - parameter.neutral) for bound in parameter.bounds)
+        allowed = (max(parameter.bounds[0], least), parameter.bounds[1])
+        ends = sorted((bound - parameter.neutral) / (trial - parameter.neutral) for bound in allowed)
         lowest, highest = max(lowest, ends[0]), min(highest, ends[1])
     return lowest, highest
+
+
+def _own_value(effect: Effect, model: mujoco.MjModel) -> float:
+    """The model's friction, damping, armature or stiffness of an effect's joint; infinite for other effects."""
+    if (field := OWN_VALUES.get(type(effect))) is None:
+        return np.inf
+    dof = selection.joint_dofs(model, getattr(effect, "joints", "*"))[0]
+    place = model.dof_jntid[dof] if field.startswith("jnt") else dof
+    return float(np.ravel(getattr(model, field)[place])[0])
 
 
 def _at(entry: CatalogueEntry, share: float) -> Effect:

@@ -47,7 +47,8 @@ def trace_effects(
         rng: generator for screened windows and synthetic noise.
         progress: bar that shows how far the search is.
         known: effects from which the search begins, such as those of an unfinished run; those that are not in the
-            catalogue are left out.
+            catalogue are left out. The search begins anew without them if they predict the motion no better than the
+            guess that every velocity stays as it is.
         found: called with the preliminary result at the beginning and whenever an effect has been found.
         settings: thresholds and budgets.
 

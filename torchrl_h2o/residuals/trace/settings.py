@@ -145,7 +145,7 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class InverseDynamicsSettings:
-    """The regression of missing forces, for a search that has found nothing but effects that keep joints still."""
+    """The regression of missing forces, for a search whose effects predict no better than constant velocities do."""
 
     half_width: float = 0.025
     """Time before and after a row, in s, over which its velocity and acceleration are averaged."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from torchrl_h2o.data.readers.units import UNITS, to_si
 
+_FORCES = ("tau", "torque", "torques", "effort", "force", "current", "moment")  # a commanded one is no desired position
 _WORDS = {
     "time": ("t", "time", "timestamp", "stamp", "secs", "seconds", "millis", "clock"),
     "done": ("done", "terminal", "terminated", "fallen"),
@@ -31,13 +32,12 @@ _WORDS = {
         "v",
         "w",
     ),
-    "action": ("tau", "torque", "torques", "u", "effort", "input", "action", "act", "force", "current", "moment"),
+    "action": (*_FORCES, "u", "input", "action", "act"),
     "position": (
         *("pos", "position", "positions", "angle", "q", "theta", "phi", "psi", "roll", "pitch", "yaw", "alpha", "beta"),
         *("x", "y", "z", "height", "encoder", "enc", "joint", "hip", "knee", "ankle", "elbow", "shoulder", "wrist"),
     ),
 }
-_FORCES = ("tau", "torque", "torques", "effort", "force", "current", "moment")  # a commanded one is no desired position
 _WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
 _SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
