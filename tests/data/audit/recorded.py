@@ -44,6 +44,23 @@ def recording(*effects, seed: int = 0, rows: int = 2000, noise: float = 0.01) ->
     return measured(observed + noise * observed.std(0) * rng.standard_normal(observed.shape), action)
 
 
+def holding(rows: int = 2000, noise: float = 0.01) -> Measured:
+    """One run of the arm, held away from its rest by a controller with small random torques."""
+    rng, reality, place = np.random.default_rng(0), arm(), np.array([1.2, 0.8])
+    data, random = mujoco.MjData(reality.model), np.zeros(2)
+    observed, action = [np.hstack([place, 0.0, 0.0])], []
+    for _ in range(rows):
+        position, velocity = np.split(observed[-1], 2)
+        data.qpos[:] = position
+        mujoco.mj_inverse(reality.model, data)  # the torque that holds the arm's weight
+        random = 0.9 * random + np.array([0.1, 0.03]) * rng.standard_normal(2)
+        pull = np.array([8.0, 2.0]) * (place - position) - np.array([1.0, 0.3]) * velocity
+        action.append(data.qfrc_inverse + pull + random)
+        observed.append(reality.rollout(observed[-1][None], action[-1][None, None])[0, 0])
+    rows_seen = np.array(observed)
+    return measured(rows_seen + noise * rows_seen.std(0) * rng.standard_normal(rows_seen.shape), np.array(action))
+
+
 def measured(observed: np.ndarray, action: np.ndarray, time: np.ndarray | None = None) -> Measured:
     """Transitions of one run from rows (T + 1, 4) and actions (T, 2)."""
     rows = len(action)

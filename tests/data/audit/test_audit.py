@@ -6,10 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from tests.data.audit.recorded import NAMES, arm, changed, measured, recording, rows_of, scaled, with_action
+from tests.data.audit.recorded import (
+    NAMES,
+    arm,
+    changed,
+    holding,
+    measured,
+    recording,
+    rows_of,
+    scaled,
+    with_action,
+)
 from torchrl_h2o.data import Audit, DataError, Finding, audit
 from torchrl_h2o.data.readers.ted import to_ted
-from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointFrictionLoss
+from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import Simulation
 
 DEGREES = 180.0 / np.pi
@@ -156,6 +166,20 @@ def test_late_actions(good, simulation):
 
 def test_unit_of_the_actions(good, simulation):
     assert "looks like another unit" in severe(with_action(good, 1e3 * good.action), simulation, "actions")
+
+
+def test_unit_of_the_actions_of_a_held_arm(simulation):
+    """Nearly all of the torque holds the arm's weight, as friction could."""
+    data = holding()
+    assert audit(data, simulation).warnings == audit(data, simulation).severe == ()
+    assert "looks like another unit" in severe(with_action(data, 50.0 * data.action), simulation, "actions")
+
+
+def test_arm_whose_friction_takes_most_of_the_torque_is_no_other_robot(simulation):
+    """Without friction, the simulator is wrong by several times the motion; no unit of the angles explains that."""
+    friction = JointFrictionLoss(1.2, "shoulder"), JointFrictionLoss(0.3, "elbow"), JointDamping(1.0, "shoulder")
+    found = audit(recording(*friction), simulation)
+    assert found.severe == found.warnings == ()
 
 
 def test_exchanged_actions(good, simulation):

@@ -124,7 +124,7 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)
-    if order or friction_cancels(response, settings):
+    if order or friction_dominates(response, settings):
         return [*found, *order]
     return [*found, *_gains(response, fits[best], settings)]
 
@@ -171,17 +171,27 @@ def friction_responses(response: Response) -> np.ndarray:
     return np.concatenate([response.by_force * term[:, None] for term in terms], axis=-1)
 
 
-def friction_cancels(response: Response, settings: AuditSettings) -> bool:
-    """Whether friction cancels most of what the actions do in the simulator, with the gains of its own motors.
+def friction_dominates(response: Response, settings: AuditSettings) -> bool:
+    """Whether friction takes most of what the motors do, with the gains that they have in the simulator.
 
-    This is usual in geared arms. What is left is then small beside the actions' effect, even if it is large beside the
-    motion, and a fit trades the gain of a motor against friction.
+    This is usual in geared arms. What a fit leaves is then small beside the actions' effect, even if it is large beside
+    the motion, and the fit trades the gain of a motor against friction. Constant forces and gravity, which a motor may
+    have to hold, are no friction: they are taken out first.
     """
     effect = (response.by_action * response.limited[response.rows].mean(1)[:, None]).sum(-1)
-    others = np.concatenate([friction_responses(response), response.by_zero], -1)
-    found = robust_fit(response.target - effect, others, response.scale, settings.robust)
-    left = np.nanmedian(np.abs(response.target - effect - others @ found.values), axis=0)
-    return bool(np.mean(left / np.maximum(np.nanmedian(np.abs(effect), axis=0), 1e-12)) < settings.cancelled)
+    dry, viscous, constant = np.split(friction_responses(response), 3, axis=-1)
+    held = np.concatenate([constant, response.by_zero], -1)
+    with_friction = np.concatenate([held, dry, viscous], -1)
+    varied = _usual_rest(effect, held, response, settings)
+    without, rest = (_usual_rest(response.target - effect, by, response, settings) for by in (held, with_friction))
+    driven = varied > settings.negligible
+    return bool(rest[driven].sum() < settings.cancelled * min(varied[driven].sum(), without[driven].sum()))
+
+
+def _usual_rest(target: np.ndarray, responses: np.ndarray, response: Response, settings: AuditSettings) -> np.ndarray:
+    """Median size of what a fit of a target (W, m) leaves, in usual changes of the velocities, (m,)."""
+    found = robust_fit(target, responses, response.scale, settings.robust)
+    return np.nanmedian(np.abs(target - responses @ found.values), axis=0) / response.scale
 
 
 def _over_lags(

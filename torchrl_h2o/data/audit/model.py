@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from torchrl_h2o.data.audit.actions import friction_cancels, friction_responses, reversed_action
+from torchrl_h2o.data.audit.actions import friction_dominates, friction_responses, reversed_action
 from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.regression import robust_fit
@@ -29,7 +29,7 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
     misfit = few.misfit()
     if misfit <= settings.misfit:
         return []
-    best, words = settings.better * misfit, None
+    best, words = min(settings.better * misfit, settings.foreign), None  # a change that explains nothing is no cause
     for change, what in _hypotheses(few.log.pairs):
         left = few.misfit(observations=change)
         if left < best and misfit - left > 0.1:
@@ -127,7 +127,7 @@ def check_belonging(response: Response, settings: AuditSettings) -> list[Finding
     responses = np.concatenate([gains, friction_responses(response), response.by_zero], -1)
     found = robust_fit(response.target, responses, response.scale, settings.robust)
     left = np.nanmedian(np.abs(response.target - responses @ found.values), axis=0) / response.scale
-    if not np.mean(left) > settings.foreign or friction_cancels(response, settings):
+    if not np.mean(left) > settings.foreign or friction_dominates(response, settings):
         return []
     words = (
         f"the simulator leaves {_percent(float(min(np.mean(left), 1.0)))} of the accelerations unexplained, with any "

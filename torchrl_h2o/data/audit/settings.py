@@ -163,8 +163,8 @@ class AuditSettings:
     foreign: float = 0.85
     """Misfit that the best gains, friction and zeros leave, above which the log belongs to another robot."""
     cancelled: float = 0.5
-    """Share of the actions' effect in the simulator that friction leaves at most if it dominates: no conclusions are
-    then drawn from the gains."""
+    """Share of the actions' simulated effect. If friction explains all but less than this share, gains are not
+    judged."""
     saturated: float = 0.2
     """Share of actions at their extreme from which a note is given."""
     mostly_saturated: float = 0.9

@@ -132,8 +132,8 @@ def _motion(simulation: Simulation, measured: Measured, rows: np.ndarray, half: 
     Rows next to unknown states, as those at the ends of a run with late sensors, are left out.
     """
     states, model = start_states(simulation, measured), simulation.model
-    known = np.isfinite(states).all(1)
-    rows = rows[known[rows - half] & known[rows] & known[rows + half]]
+    known = np.flatnonzero(np.isfinite(states).all(1))
+    rows = rows[np.all([np.isin(rows + offset, known) for offset in (-half, 0, half)], axis=0)]
     seconds, before, after = 2.0 * half * simulation.control_step, states[rows - half], states[rows + half]
     velocity = np.empty((len(rows), model.nv))
     for found, one, other in zip(velocity, before, after, strict=True):
