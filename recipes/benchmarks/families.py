@@ -33,7 +33,7 @@ def all_families(logs: Path | None = None) -> dict[str, Family]:
 
 
 def choose_families(names: Iterable[str], logs: Path | None = None) -> dict[str, Family]:
-    """Select families by name; with the folder of the real logs, also theirs, unless some of these are named.
+    """Select families by name. If ``logs`` is given and no family of it is named, all of its families are added.
 
     Raises:
         ValueError: for an unknown name.

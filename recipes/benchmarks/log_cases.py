@@ -68,6 +68,7 @@ def log_families(folder: Path) -> dict[str, Family]:
         judge=judge_pendulum,
         path=folder / "simple_pendulum" / "swing_up_sac.csv",
         columns="simple_pendulum",
+        held_out=0.5,
     )
     double_pendulum = LogCase(
         name="double_pendulum",

@@ -123,6 +123,20 @@ def test_an_unknown_kind_is_refused():
         Verdict("fine")
 
 
+def test_action_noise_that_stands_in_for_another_cause_is_not_recommended():
+    """Noise lowers no error, so it is judged by the classifier."""
+    measured, found = recorded(SIMULATION.with_effects(JointFrictionLoss(0.1)), 3000, noise=0.01), (ActionNoise(0.2),)
+    error = error_summary(SIMULATION, SIMULATION, measured)
+    worse, better, neither_tells = (
+        reach_verdict(SIMULATION, SIMULATION, measured, found, error, TwoSample(before, after))
+        for before, after in ((0.7, 0.75), (0.9, 0.75), (0.55, 0.6))
+    )
+    assert (worse.kind, worse.recommended) == (NOT_EXPLAINED, False)
+    assert "no more like the measured ones (AUC 0.7 → 0.75)" in worse.reasons[0]
+    assert better.recommended
+    assert neither_tells.recommended
+
+
 def test_action_noise_that_was_found_is_not_missing():
     noise = ActionNoise(0.2)
     explained = verdict((noise,), (noise,), noise=0.003)

@@ -40,17 +40,19 @@ def no_better_than_constant_velocity(
     clauses = []
     for effect in effects:
         own = _quantities_of_joints(mended, effect)
-        if errors and own and min(float(error.relative[own].min()) for error in errors) > most:
+        known = [error for error in errors if own and np.isfinite(error.guessed[own]).any()]
+        if known and min(float(np.nanmin(error.relative[own])) for error in known) > most:
             joints = f"with {effect_words(effect)}, the motion of these joints is predicted"
-            clauses.append(f"{joints} {_hardly_better(mended, errors[0], own)}")
+            clauses.append(f"{joints} {_hardly_better(mended, known[0], own)}")
     return tuple(clauses)
 
 
 def _hardly_better(mended: Simulation, error: ErrorsAhead, among: Sequence[int]) -> str:
     """The end of a clause, with the errors of the quantity with the median relative error; positions come first."""
     names, units, relative = mended.state_map.names, mended.state_map.units, error.relative
-    usual = np.median(relative[among])
-    index = min(among, key=lambda i: (units[i] in VELOCITY_UNITS, abs(relative[i] - usual)))
+    known = [i for i in among if np.isfinite(error.guessed[i])]
+    usual = np.median(relative[known])
+    index = min(known, key=lambda i: (units[i] in VELOCITY_UNITS, abs(relative[i] - usual)))
     missed, guessed = (quantity(float(which[index]), units[index], 2) for which in (error.simulated, error.guessed))
     ahead = f"{names[index]} {duration(error.steps * mended.control_step)} ahead"
     return f"hardly better than by the guess that every velocity stays as it is ({ahead}: {missed} against {guessed})"

@@ -140,6 +140,11 @@ def reasons_against(
     head, auc = error.headline, two_sample.auc_after
     if acting:
         reasons += no_better_than_constant_velocity(mended, measured, acting, settings)
+    elif two_sample.auc_before is not None and auc is not None and auc > max(rules.auc, two_sample.auc_before):
+        before, after = (number(value, 2) for value in (two_sample.auc_before, auc))
+        reasons.append(
+            f"the noise found makes simulated transitions no more like the measured ones (AUC {before} → {after})"
+        )
     halved = head is not None and head.after < rules.much_lower * head.before
     if auc is not None and auc > rules.auc_near_one and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")

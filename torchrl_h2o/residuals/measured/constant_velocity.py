@@ -32,8 +32,8 @@ class ErrorsAhead:
 
     @property
     def relative(self) -> np.ndarray:
-        """(n), errors of the simulator in errors of the guess; infinite where the simulator diverges."""
-        return np.nan_to_num(self.simulated / np.maximum(self.guessed, self.negligible), nan=np.inf)
+        """(n), errors of the simulator in errors of the guess; infinite where it diverges, NaN where none is known."""
+        return self.simulated / np.maximum(self.guessed, self.negligible)
 
 
 def errors_ahead(
@@ -56,8 +56,11 @@ def errors_ahead(
             continue
         missed = residuals(simulation, measured, starts, steps, states=states)[:, -1]
         wrong = following[starts + steps - 1] - at_constant_velocity(simulation, states[starts], steps)
-        simulated, guessed = (_median_size(error) for error in (missed, wrong))
-        errors.append(ErrorsAhead(steps, simulated, guessed, negligible))
+        known = np.isfinite(wrong)  # late sensors leave the readings at the ends of runs unknown
+        if known.any():
+            diverged_too = np.where(np.isfinite(missed), np.abs(missed), np.inf)
+            simulated, guessed = (_median(error, known) for error in (diverged_too, np.abs(wrong)))
+            errors.append(ErrorsAhead(steps, simulated, guessed, negligible))
     return errors
 
 
@@ -80,11 +83,11 @@ def explains_motion(errors: Sequence[ErrorsAhead], most: float) -> bool:
     Returns:
         The answer; True if the data hold enough windows for none of the times.
     """
-    return not errors or min(float(np.median(error.relative)) for error in errors) <= most
+    return not errors or min(float(np.nanmedian(error.relative)) for error in errors) <= most
 
 
-def _median_size(error: np.ndarray) -> np.ndarray:
-    """Median size of errors (W, n), (n); NaN where more than half of the windows diverge."""
-    size = np.nan_to_num(np.abs(error), nan=np.inf)
-    median = np.median(size, axis=0)
-    return np.where(np.isfinite(median), median, np.nan)
+def _median(error: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Median of the known errors (W, n), (n); NaN where none is known."""
+    return np.array(
+        [np.median(column[rows]) if rows.any() else np.nan for column, rows in zip(error.T, known.T, strict=True)]
+    )

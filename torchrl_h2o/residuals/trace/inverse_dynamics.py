@@ -85,10 +85,11 @@ def propose_effects(
         The entries, each with its effect at the value of the regression. None if coordinates are unobserved, if
         actuators have a state of their own, which is not measured, or if the rows are too few.
     """
+    if simulation.model.na or not simulation.state_map.observe.any(0).all():
+        return ()
     half = max(1, round(settings.half_width / simulation.control_step))
-    observed = (simulation.state_map.observe != 0.0).any(0)
     motion = _motion(simulation, measured, _rows(measured, half, settings), half)
-    if not observed.all() or simulation.model.na or len(motion.time) < settings.least_rows:
+    if len(motion.time) < settings.least_rows:
         return ()
     missing = missing_force(simulation, motion)
     entries, columns = [], []
