@@ -164,6 +164,8 @@ def test_estimators_are_accepted_in_every_form_that_torchrl_accepts(build):
         loss.make_value_estimator(TD0Estimator, gamma=0.9, average_rewards=True)
     with pytest.raises(TypeError, match="lmbda"):
         loss.make_value_estimator(gamma=0.9, lmbda=0.5)
+    with pytest.raises(NotImplementedError, match="computes its targets itself"):
+        _ = loss.value_estimator
 
 
 def test_exploration_keys_can_be_renamed(batch):

@@ -276,7 +276,12 @@ def filled_twice(x):
 
 @pytest.mark.parametrize(
     ("function", "message"),
-    [(nn.functional.dropout, "dropout"), (lambda x: x[torch.randperm(len(x))], "randperm"), (filled_twice, "in place")],
+    [
+        (nn.functional.dropout, "dropout"),
+        (lambda x: x[torch.randperm(len(x))], "randperm"),
+        (filled_twice, "in place"),
+        (lambda x: x + torch.randn(x.shape, generator=torch.Generator()), "generator of its own"),
+    ],
 )
 def test_draws_that_cannot_be_supplied_are_refused(function, message):
     population = Population([Randomly(function), Randomly(function)])
