@@ -1,9 +1,11 @@
-"""Begins a search with known effects, or anew where it has found only effects that keep the joints still."""
+"""Begins a search with known effects, or anew: where the effects found only keep the joints still, or without noise."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,10 +16,10 @@ from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.screening import is_possible, screen
+from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
-PROPOSAL = 0.1  # share by which a regression, and the fit of what it proposes, bring the bar closer to the stage's end
+PROPOSAL = 0.1  # share by which a regression, a screening, or the fit of a proposal brings the bar closer to the end
 
 
 def begin_with(state: SearchState, known: Sequence[Effect]) -> SearchState:
@@ -89,6 +91,50 @@ def begin_anew(
     if not _explains_motion(proposed):
         return None
     return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / (len(entries) * len(searched))))
+
+
+def begin_noise_free(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
+) -> SearchState | None:
+    """Begins another search, as if the sensors had no noise, if one more effect then explains most of what is left.
+
+    The noise of a sensor is estimated from the residual. While an effect is missing, the estimate may therefore contain
+    that effect: a sensor's wrong gain changes successive residuals as noise does, and is then not looked for any more.
+    No effect explains most of real noise.
+
+    Args:
+        state: what the search with noisy sensors has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+        progress: bar that shows how far the search is.
+
+    Returns:
+        The state with the same effects in windows of one control step; None if the sensors have noise.
+    """
+    noisy, measured, most = state.problem, state.problem.measured, state.settings.trace.noise_free_loss
+    if state.exact or noisy.sensor_std is None or measured.estimated_std is not None:
+        return None
+    no_noise = np.zeros(measured.observation.shape[1])
+    problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=no_noise, settings=state.settings.residual)
+    silent = replace(SearchState.begin(problem, catalogue, rng, state.settings), noise_free=True)
+    silent = silent.rescaled(silent.posed_at(state.fit.effects))
+    silent = silent.with_found(state.entries, silent.refitted(state.entries, state.fit.effects))
+    to_beat = most * silent.screened_loss(state.fit.effects)
+    explained = (
+        silent.screened_loss(silent.fit.effects) <= to_beat or _sketched_with_one_more(silent, progress) <= to_beat
+    )
+    return _with_rivals(silent) if explained else None
+
+
+def _sketched_with_one_more(state: SearchState, progress: LoopBar) -> float:
+    """Mean loss of the screened windows in a quick fit with the most promising entry."""
+    one_more = partial(progress.closer, PROPOSAL / max(1, len(state.others)))
+    leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
+    if not leads:
+        return math.inf
+    effects = [*state.fit.effects, leads[0].effect]
+    free = [*map(free_parameters, state.entries), leads[0].free]
+    return state.sketched(effects, free, state.settings.trace.sketch_evaluations).loss
 
 
 def _explains_motion(state: SearchState) -> bool:

@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.begin import begin_anew, begin_with
+from torchrl_h2o.residuals.trace.begin import begin_anew, begin_noise_free, begin_with
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.grow import grow
@@ -66,9 +66,8 @@ def trace_effects(
 
     for attempt in range(settings.trace.rounds):
         state = grow(state, rng, progress, report)
-        if attempt == 0 and (other := begin_anew(state, catalogue, rng, progress)) is not None:
-            report(other)
-            state = grow(other, rng, progress, report)
+        if attempt == 0:
+            state = _from_another_beginning(state, catalogue, rng, progress, report)
         if not state.entries:
             break
         progress.stage(OTHERS)
@@ -87,6 +86,24 @@ def trace_effects(
             break
     state, others = with_most_usual_set(state, lambda: progress.closer(SET_FITTED))
     return replace(_outcome(_fitted_to_all(state)), others=others)
+
+
+def _from_another_beginning(
+    state: SearchState,
+    catalogue: Sequence[CatalogueEntry],
+    rng: np.random.Generator,
+    progress: LoopBar,
+    found: Callable[[SearchState], object],
+) -> SearchState:
+    """What a search finds that begins otherwise, if the first one has left something that this may explain."""
+    silent = begin_noise_free(state, catalogue, rng, progress)
+    if silent is not None and (grown := grow(silent, rng, progress)).exact:
+        return grown
+    other = begin_anew(state, catalogue, rng, progress)
+    if other is None:
+        return state
+    found(other)
+    return grow(other, rng, progress, found)
 
 
 def _rescaled(state: SearchState) -> SearchState:

@@ -66,6 +66,7 @@ class SearchState:
         groups: for each effect found, alternatives with an equivalent loss.
         alternatives: the alternatives that were found so far, by :class:`Question`.
         exact: True if the residual is within the rounding of single-precision data.
+        noise_free: whether the search takes the sensors for free of noise, whatever the residual looks like.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -81,6 +82,7 @@ class SearchState:
     groups: tuple[tuple[Attempt, ...], ...] = ()
     alternatives: Mapping[Question, tuple[Attempt, ...]] = field(default_factory=dict)
     exact: bool = False
+    noise_free: bool = False
 
     @classmethod
     def begin(
@@ -170,11 +172,14 @@ class SearchState:
 
         Args:
             effects: the effects to put in.
-            sensor_std: (n), standard deviation of the readings' noise; estimated from the data by default.
+            sensor_std: (n), standard deviation of the readings' noise; by default zeros if the search takes the sensors
+                for free of noise, and otherwise estimated from the data.
         """
         if not effects and sensor_std is None:
             return self.first
         base = self.problem
+        if sensor_std is None and self.noise_free:
+            sensor_std = np.zeros(base.measured.observation.shape[1])
         mended = base.simulation.with_effects(*effects)
         return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std, settings=base.settings)
 
