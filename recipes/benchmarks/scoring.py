@@ -42,7 +42,16 @@ def is_named_first(report: Report, truth: Sequence[Effect], simulation: Simulati
 
 def is_exact_set(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
     """Whether exactly the true effects were found, each directly or through its group."""
-    found = [_alternatives(report, effect) for effect in report.effects]
+    return _is_exactly([_alternatives(report, effect) for effect in report.effects], truth, simulation)
+
+
+def is_listed_set(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
+    """Whether the true effects are one of the other sets that, by the report, explain the data as well."""
+    return any(_is_exactly([[effect] for effect in other.effects], truth, simulation) for other in report.others)
+
+
+def _is_exactly(found: Sequence[Sequence[Effect]], truth: Sequence[Effect], simulation: Simulation) -> bool:
+    """Whether one effect of each group found is a true one, and each true effect is in a group."""
     no_other = all(any(part_of(e, true, simulation) for e in group for true in truth) for group in found)
     return no_other and all(_is_found(true, found, simulation) for true in truth)
 

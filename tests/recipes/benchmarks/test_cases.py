@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, draw_case
-from drawn_cases import VISIBLE, plain, visibility
+from drawn_cases import HIDDEN, VISIBLE, plain, visibility
 from families import FAMILIES, all_families, choose_families
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -18,6 +18,7 @@ from robot_cases import EFFECTS
 from running import Job, run_all
 from scoring import (
     is_exact_set,
+    is_listed_set,
     is_marked_undeclared,
     is_named_first,
     is_reported_as_group,
@@ -43,7 +44,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
 from torchrl_h2o.residuals import Measured, Simulation, residuals
-from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, IndistinguishableGroup
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, IndistinguishableGroup, OtherExplanation
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.errors import ErrorSummary
 
@@ -103,14 +104,18 @@ def test_a_case_is_drawn_from_the_seed_and_its_number_alone():
     assert (short_case(drawn[0], 20).measure() == short_case(drawn[1], 20).measure()).all()
 
 
-@pytest.mark.parametrize("number", [2, 3], ids=["pendulum", "wheel_legged"])
-def test_every_one_of_several_effects_can_be_seen_and_explains_the_data(number):
-    case = draw_case(FAMILIES, "several", number, SEED)
+@pytest.mark.parametrize(
+    ("number", "seed"), [(2, SEED), (3, SEED), (15, 0)], ids=["pendulum", "wheel_legged", "one would be hidden"]
+)
+def test_every_one_of_several_effects_can_be_seen_and_explains_the_data(number, seed):
+    case = draw_case(FAMILIES, "several", number, seed)
     simulation, measured = plain(case.system, 0)
     assert 2 <= len(case.truth) <= 3
     assert len({type(effect) for effect in case.truth}) == len(case.truth)
     for effect in case.truth:
+        others = [other for other in case.truth if other is not effect]
         assert VISIBLE[0] / 2 < visibility(effect, simulation, measured)
+        assert visibility(effect, simulation.with_effects(*others), measured) > HIDDEN
     case = short_case(case, 400)
     assert one_step_error(case, *case.truth) < 0.1 * one_step_error(case)
 
@@ -247,6 +252,15 @@ def test_an_exact_set_has_no_more_and_no_less_than_the_truth(cheetah):
     assert not is_exact_set(report(one), (thighs,), cheetah)
     gain = ActionGain(0.5)
     assert is_exact_set(report(gain, gravity, groups=[(gain, mass)]), (mass, gravity), cheetah)
+
+
+def test_the_truth_may_be_another_set_that_the_report_lists(cheetah):
+    mass, gravity, gain = BodyMass(2.0, bodies="torso"), Gravity(0.5), ActionGain(0.5)
+    listed = [OtherExplanation((gain,), 0.0, "more motion"), OtherExplanation((gravity, mass), 0.0, "more motion")]
+    found = replace(report(gain), others=tuple(listed))
+    assert is_listed_set(found, (mass, gravity), cheetah)
+    assert not is_listed_set(found, (mass,), cheetah)
+    assert not is_listed_set(report(mass, gravity), (mass, gravity), cheetah)
 
 
 def test_patterns_and_names_of_the_same_elements_are_the_same(cheetah):

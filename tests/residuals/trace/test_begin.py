@@ -1,16 +1,24 @@
-"""A search that begins with known effects, such as those of an unfinished run."""
+"""A search that begins with known effects, such as those of an unfinished run, or anew without noise."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, JointFrictionLoss
+from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, ObservationGain
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.trace.begin import begin_noise_free
+from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.grow import grow
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
 FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
+GAIN = CatalogueEntry(ObservationGain(entries=(1,)), ({"scale": 0.8}, {"scale": 1.25}))
 TRUTH = (Gravity(1.3), JointFrictionLoss(0.05))
 
 
@@ -46,3 +54,29 @@ def test_every_addition_is_reported():
 def test_a_known_effect_that_is_not_needed_or_not_in_the_catalogue_does_not_stay():
     found, _ = traced([JointDamping(0.1), JointFrictionLoss(0.01)])
     assert found.keys() == {Gravity, JointFrictionLoss}
+
+
+@pytest.mark.parametrize(("gain", "noise", "begins"), [(1.3, 0.0, True), (1.0, 0.01, False), (1.3, 0.05, False)])
+def test_a_gain_that_was_taken_for_noise_is_found_by_a_search_without_noise(gain, noise, begins):
+    state = with_gravity_found(gain, noise)
+    other = begin_noise_free(state, [GRAVITY, GAIN], np.random.default_rng(0), LoopBar(disable=True))
+    assert (other is not None) is begins
+    if other is not None:
+        grown = grow(other, np.random.default_rng(0), LoopBar(disable=True))
+        assert grown.exact
+        assert grown.problem.horizon == 1
+        assert {type(effect): effect.scale for effect in grown.fit.effects} == pytest.approx(
+            {Gravity: 1.3, ObservationGain: gain}, rel=1e-4
+        )
+
+
+def with_gravity_found(gain, noise):
+    """A search that has found gravity, and takes the rest for noise of the velocity's sensor."""
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3)), noise=noise)
+    scale = np.array([1.0, gain])
+    measured = replace(measured, observation=scale * measured.observation, following=scale * measured.following)
+    found = Gravity(1.25)
+    sensor_std = np.array([0.0, 0.1]) * measured.observation.std(0)
+    state = SearchState.begin(Problem.pose(SIMULATION, measured, 5), [GRAVITY, GAIN], np.random.default_rng(0))
+    state = state.with_found([GRAVITY], Fit((found,), (("scale",),), 1.0, ({},)))
+    return state.rescaled(Problem.pose(SIMULATION.with_effects(found), measured, 5, sensor_std=sensor_std))
