@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchrl_h2o.effects import Effect, is_negligible
+from torchrl_h2o.effects import CatalogueEntry, Effect, is_negligible
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
@@ -15,12 +16,13 @@ from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
+from torchrl_h2o.residuals.judge.undetectable import undetectable_effects, undetectable_words
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.contents import TwoSample, Verdict
+from torchrl_h2o.residuals.report.contents import NOTHING_MISSING, TwoSample, Verdict
 from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
@@ -81,14 +83,23 @@ class Judgement:
 
 
 def judge(
-    evidence: Evidence, explanation: Explanation, *, seed: int = 0, settings: LoopSettings = DEFAULTS
+    evidence: Evidence,
+    explanation: Explanation,
+    catalogue: Sequence[CatalogueEntry] = (),
+    *,
+    seed: int = 0,
+    advance: Callable[[], object] = lambda: None,
+    settings: LoopSettings = DEFAULTS,
 ) -> Judgement:
     """Judges an explanation on data that no fit has used.
 
     Args:
         evidence: the simulator without the effects, and the data.
         explanation: the effects.
+        catalogue: the effects that were tried; where nothing is missing, the verdict names those of a usual size that
+            the data could not have shown.
         seed: seed of the classifiers.
+        advance: called after each entry of the catalogue that is judged.
         settings: horizons, networks and lengths of the lists.
     """
     simulation, effects = evidence.simulation, explanation.effects
@@ -99,6 +110,11 @@ def judge(
     # random effects are drawn in the two-sample test
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
+    verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings)
+    if verdict.kind == NOTHING_MISSING:
+        horizon = explanation.trace.horizon
+        hidden = undetectable_effects(simulation, measured, catalogue, horizon, advance, settings)
+        verdict = replace(verdict, caveats=undetectable_words(hidden, simulation.names))
     return Judgement(
         measured=measured,
         disturbed=tuple(disturbed),
@@ -117,7 +133,7 @@ def judge(
         trace=_residual_trace(simulation, mended, measured),
         windows=shown_windows(simulation, mended, measured, _shown_steps(error, simulation), settings=settings.judge),
         runs=run_errors(simulation, mended, measured, settings=settings.judge),
-        verdict=reach_verdict(simulation, mended, measured, effects, error, two_sample, settings),
+        verdict=verdict,
         failures=(*explanation.failures, *failures),
         others=_others(simulation, mended, measured, explanation, settings),
     )

@@ -151,7 +151,8 @@ class Verdict:
         reasons: figures that the kind follows from, in words.
         recommended: whether the effects should be put into a simulator for training.
         where: when and at which states the unexplained part is largest; empty if nothing is unexplained.
-        caveats: sentences on effects that may have another cause than the one they are named after.
+        caveats: sentences on effects that may have another cause than the one they are named after or, where nothing is
+            missing, on effects that the data could not have shown.
 
     Raises:
         ValueError: for an unknown kind.

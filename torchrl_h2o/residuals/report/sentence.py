@@ -44,14 +44,14 @@ def _verdict_words(report: ReportContents) -> list[str]:
     error = _error_words(report.error) if report.error else ""
     words = _listed(_found_words(report)) if report.found else ""
     kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
+    caveats = () if report.verdict is None else report.verdict.caveats
     if kind == NOT_EXPLAINED:
         attempt = words and f"the best attempt, {words}, is not recommended"
         return [f"Something is missing that {NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."]
     if report.found:
         rest = [f"Something else is missing that {NOT_IN_CATALOGUE}: {unknown}."] if unknown else []
-        caveats = report.verdict.caveats if report.verdict is not None else ()
         return [f"Your simulator lacks: {_joined(words, error)}.", *_alternatives_words(report), *caveats, *rest]
-    return [f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."]
+    return [f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}.", *caveats]
 
 
 def _unknown_words(verdict: Verdict) -> str:
