@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.trace.fit import Fit, Free, fit
@@ -182,6 +183,17 @@ class SearchState:
             sensor_std = np.zeros(base.measured.observation.shape[1])
         mended = base.simulation.with_effects(*effects)
         return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std, settings=base.settings)
+
+    def posed_with_some(self, effects: Sequence[Effect]) -> Problem:
+        """The problem with some of the effects found put in.
+
+        The sensors are free of noise if they are so with all effects put in. An estimate without one of the effects may
+        take what this effect does for noise, and the fits of others in its place would then be biased.
+        """
+        mended = self.problem.simulation.with_effects(*self.fit.effects)
+        if sensor_noise(mended, self.problem.measured) is not None:
+            return self.posed_at(effects)
+        return self.posed_at(effects, sensor_std=np.zeros(self.problem.measured.observation.shape[1]))
 
     def rescaled(self, posed: Problem) -> SearchState:
         """The state with the start states and scales of a problem posed with effects put in."""
