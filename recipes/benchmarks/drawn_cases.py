@@ -78,7 +78,11 @@ def _hidden(effects: Sequence[Effect], simulation: Simulation, measured: Measure
     """The first effect that the others hide, as a given inertia of a link hides its length; None without one."""
     for effect in effects:
         others = [other for other in effects if other is not effect]
-        if visibility(effect, simulation.with_effects(*others), measured) < HIDDEN:
+        try:
+            hidden = visibility(effect, simulation.with_effects(*others), measured) < HIDDEN
+        except ValueError:  # the model does not support these effects together
+            hidden = True
+        if hidden:
             return effect
     return None
 

@@ -47,7 +47,12 @@ def is_exact_set(report: Report, truth: Sequence[Effect], simulation: Simulation
 
 def is_listed_set(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
     """Whether the true effects are one of the other sets that, by the report, explain the data as well."""
-    return any(_is_exactly([[effect] for effect in other.effects], truth, simulation) for other in report.others)
+    return bool(_listed(report, truth, simulation))
+
+
+def _listed(report: Report, truth: Sequence[Effect], simulation: Simulation) -> list:
+    """The other sets of the report that consist of the true effects."""
+    return [other for other in report.others if _is_exactly([[e] for e in other.effects], truth, simulation)]
 
 
 def _is_exactly(found: Sequence[Sequence[Effect]], truth: Sequence[Effect], simulation: Simulation) -> bool:
@@ -70,13 +75,15 @@ def _alternatives(report: Report, effect: Effect) -> list[Effect]:
 
 
 def parameter_error(report: Report, truth: Sequence[Effect], simulation: Simulation) -> float:
-    """Largest relative error of a parameter of the true effects; infinite if an effect was not found."""
+    """Largest relative error of a parameter of the true effects; infinite if an effect was neither found nor listed."""
     # members of a group have values of their own, each fitted in place of the chosen effect
     in_groups = [e for effect in report.effects for e in _alternatives(report, effect)]
+    listed = _listed(report, truth, simulation)
     errors = []
     for true in truth:
         found = [e for e in report.effects if part_of(e, true, simulation)]
         found = found or [e for e in in_groups if part_of(e, true, simulation)]
+        found = found or [e for other in listed for e in other.effects if part_of(e, true, simulation)]
         errors += [_relative_error(e, true) for e in found] or [math.inf]
     return max(errors, default=0.0)
 

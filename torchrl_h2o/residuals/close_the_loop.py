@@ -32,7 +32,6 @@ from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.search import trace_effects
 from torchrl_h2o.residuals.undeclared.beside_or_instead import add_undeclared_force
 
-JUDGED = 2.0  # an entry that is judged brings the bar closer to the end by this share of the number of entries
 FAILURES = (ValueError, np.linalg.LinAlgError)  # a model that rejects an effect, or singular equations
 
 
@@ -105,7 +104,7 @@ def close_the_loop(
         computing = "the errors before and after were computed"
         so_far(unfinished_report(evidence, explanation, computing))
         bar.stage(REPORT)
-        one_more = partial(bar.closer, JUDGED / max(1, len(entries)))
+        one_more = partial(bar.closer, 1.0 / max(1, len(entries)))
         judgement = judge(evidence, explanation, entries, seed=seed, advance=one_more, settings=settings)
         bar.finish()
         wall_s = time.perf_counter() - start

@@ -1,5 +1,7 @@
 """The verdict: nothing missing, explained, explained in part, or not explained."""
 
+from dataclasses import replace
+
 import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
@@ -67,6 +69,17 @@ def test_half_an_explanation_is_called_that():
     half = verdict((Gravity(1.5), JointFrictionLoss(0.1)), (Gravity(1.5),))
     assert half.kind == EXPLAINED_IN_PART
     assert half.recommended
+
+
+@pytest.mark.parametrize(("left", "kind"), [(0.1, EXPLAINED_IN_PART), (0.001, EXPLAINED)])
+def test_a_classifier_that_sees_a_difference_counts_unless_all_errors_nearly_vanish(left, kind):
+    """The sentence's quantity alone may be right by chance, such as the pitch of a robot with a larger wheel."""
+    found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
+    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
+    head = replace(error.headline, after=0.001 * error.headline.before)
+    error = replace(error, headline=head, after=left * error.before)
+    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.94))
+    assert reached.kind == kind
 
 
 def test_an_effect_that_does_not_lower_the_error_is_not_recommended():

@@ -27,11 +27,13 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals.report.contents import (
+    NOTHING_MISSING,
     FoundEffect,
     IndistinguishableGroup,
     OtherExplanation,
     RejectedEffect,
     TwoSample,
+    Verdict,
 )
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.errors import ErrorSummary
@@ -99,6 +101,26 @@ def test_a_report_without_effects_says_whether_nothing_is_missing_or_nothing_can
         "Nothing is missing: the effects tried explain no more than chance; one-step error 0.0041 rad/s, floor 0.004."
     )
     assert no_conclusion().sentence() == "No conclusion: 7 rows are too few."
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [
+        (0, ""),
+        (1, " Noise or a lack of motion would hide in these data: gravity × 1."),
+        (
+            9,
+            " Noise or a lack of motion would hide 9 effects in these data, such as gravity × 1, gravity × 2, "
+            "gravity × 3 and gravity × 4.",
+        ),
+    ],
+)
+def test_where_nothing_is_missing_the_sentence_names_what_the_data_could_not_have_shown(count, words, tmp_path):
+    effects = tuple(f"gravity × {i + 1}" for i in range(count))
+    report = dataclasses.replace(nothing_missing(), verdict=Verdict(NOTHING_MISSING, undetectable=effects))
+    assert report.sentence() == nothing_missing().sentence() + words
+    assert Report.load(report.save(tmp_path)).verdict == report.verdict
+    assert ("gravity × 1" in (tmp_path / "report.html").read_text(encoding="utf-8")) is (count > 0)
 
 
 def test_an_error_that_is_not_known_is_left_out_of_the_sentence():

@@ -13,6 +13,7 @@ from torchrl_h2o.residuals.trace.begin import begin_noise_free
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import grow
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.search import _from_another_beginning
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()
@@ -70,9 +71,27 @@ def test_a_gain_that_was_taken_for_noise_is_found_by_a_search_without_noise(gain
         )
 
 
-def with_gravity_found(gain, noise):
+@pytest.mark.parametrize(("also", "exact"), [((), True), ((JointDamping(0.1),), False)])
+def test_a_search_without_noise_counts_if_it_explains_everything(also, exact):
+    """With damping that the catalogue lacks it does not, and the first search stays."""
+    state, seen = with_gravity_found(1.3, 0.0, *also), []
+    with LoopBar(disable=True) as bar:
+        after = _from_another_beginning(state, [GRAVITY, GAIN], np.random.default_rng(0), bar, seen.append)
+    assert after.exact is exact
+    assert (after is state) is not exact
+    assert [one.exact for one in seen] == [True] * exact
+
+
+def test_estimated_velocities_have_noise():
+    state = with_gravity_found(1.3, 0.0)
+    measured = replace(state.problem.measured, estimated_std=np.array([0.0, 0.01]))
+    state = replace(state, problem=replace(state.problem, measured=measured))
+    assert begin_noise_free(state, [GRAVITY, GAIN], np.random.default_rng(0), LoopBar(disable=True)) is None
+
+
+def with_gravity_found(gain, noise, *also):
     """A search that has found gravity, and takes the rest for noise of the velocity's sensor."""
-    measured = recorded(SIMULATION.with_effects(Gravity(1.3)), noise=noise)
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3), *also), noise=noise)
     scale = np.array([1.0, gain])
     measured = replace(measured, observation=scale * measured.observation, following=scale * measured.following)
     found = Gravity(1.25)

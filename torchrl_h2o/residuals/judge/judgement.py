@@ -16,7 +16,7 @@ from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
-from torchrl_h2o.residuals.judge.undetectable import undetectable_effects, undetectable_words
+from torchrl_h2o.residuals.judge.undetectable import undetectable_effects
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -101,6 +101,9 @@ def judge(
         seed: seed of the classifiers.
         advance: called after each entry of the catalogue that is judged.
         settings: horizons, networks and lengths of the lists.
+
+    Returns:
+        The held-out figures and the verdict.
     """
     simulation, effects = evidence.simulation, explanation.effects
     disturbed = _remaining_disturbances(evidence, explanation, settings)
@@ -111,10 +114,9 @@ def judge(
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
     verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings)
-    if verdict.kind == NOTHING_MISSING:
-        horizon = explanation.trace.horizon
-        hidden = undetectable_effects(simulation, measured, catalogue, horizon, advance, settings)
-        verdict = replace(verdict, caveats=undetectable_words(hidden, simulation.names))
+    if verdict.kind == NOTHING_MISSING and not explanation.failures:
+        unseen = undetectable_effects(simulation, measured, catalogue, advance, settings)
+        verdict = replace(verdict, undetectable=tuple(effect_words(effect, simulation.names) for effect in unseen))
     return Judgement(
         measured=measured,
         disturbed=tuple(disturbed),

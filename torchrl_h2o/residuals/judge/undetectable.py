@@ -1,97 +1,115 @@
-"""Effects of a usual size that data could not have shown: noise hides them, or the motion does not excite them."""
+"""Effects that data could not have shown, because noise hides them or the motion does not excite them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from torchrl_h2o.effects import CatalogueEntry, Effect
-from torchrl_h2o.effects.effect import NO_NAMES, EntryNames
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
-
-NAMED = 5  # kinds of effects that the sentence names
 
 
 def undetectable_effects(
     simulation: Simulation,
     measured: Measured,
     catalogue: Sequence[CatalogueEntry],
-    horizon: int = 1,
     advance: Callable[[], object] = lambda: None,
     settings: LoopSettings = DEFAULTS,
 ) -> tuple[Effect, ...]:
     """Finds the effects that a search would have missed if they had been there.
 
-    For the largest trials of each entry, the search's own test is repeated on residuals to which the trial's change is
-    added: the effect is found if it then explains the share of the loss that an addition must explain, significantly.
+    For the largest trials of each entry, the change by the trial is added to the residuals, and two conditions of the
+    search are tested with windows of every possible length: the effect must explain the share of the loss that an
+    addition must explain, and significantly. A search has further conditions, so it may miss more than is listed.
 
     Args:
         simulation: the simulator, to which nothing was added.
         measured: the data.
         catalogue: the entries that the search tried; those of random effects are left out.
-        horizon: control steps per window of the search.
         advance: called after each entry.
         settings: thresholds of the search.
 
     Returns:
-        The effects at the trials that would be missed; of an entry with several parameters, one where all would be.
+        The effects at the trials that would be missed; of an entry with several parameters one, if all trials would be
+        missed. The effect of each kind that shows most comes first, then the others, in descending order of what shows.
     """
-    problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
     level = settings.significance.level / max(1, len(catalogue))
-    judged = measured.selected_on(horizon)
-    right = problem.residual((), judged)
-
-    def is_missed(effect: Effect) -> bool:
-        try:
-            change = right - problem.residual((effect,), judged)
-        except ValueError:  # a value that the model rejects, such as negative damping
-            return False
-        before, after = losses(right + change), losses(right)
-        least = settings.trace.min_gain if problem.sensor_std is None else settings.trace.min_gain_under_noise
-        small = before.mean() - after.mean() <= least * before.mean()
-        return bool(small or p_value_of_losses(before, after, settings.significance) >= level)
-
-    missed = []
+    lengths = [h for h in possible_horizons(simulation, measured, settings.horizon) if len(measured.selected_on(h))]
+    if not lengths:
+        return ()
+    tests = [_Test(simulation, measured, horizon, level, settings) for horizon in lengths]
+    missed: list[tuple[float, Effect]] = []
     for entry in catalogue:
-        largest = () if entry.effect.random else _largest(entry)
-        missed_here = [effect for effect in largest if is_missed(effect)]
+        largest = [] if entry.effect.random else [e for e in _largest(entry) if _is_possible(simulation, e)]
+        shares = {effect: share for effect in largest if (share := _share_if_missed(effect, tests)) is not None}
         if len(entry.fitted) == 1:
-            missed += missed_here
-        elif largest and len(missed_here) == len(largest):
-            missed.append(missed_here[0])
+            missed += [(share, effect) for effect, share in shares.items()]
+        elif shares and len(shares) == len(largest):
+            effect = max(shares, key=lambda one: shares[one])
+            missed.append((shares[effect], effect))
         advance()
-    return tuple(missed)
+    ranked = [effect for _, effect in sorted(missed, key=lambda pair: -pair[0])]
+    first = {type(effect): effect for effect in reversed(ranked)}
+    return tuple(sorted(ranked, key=lambda effect: effect is not first[type(effect)]))
+
+
+class _Test:
+    """The test of effects in windows of one length, on the part of the data by which effects are chosen."""
+
+    def __init__(
+        self, simulation: Simulation, measured: Measured, horizon: int, level: float, settings: LoopSettings
+    ) -> None:
+        self.problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+        self.judged, self.level, self.settings = measured.selected_on(horizon), level, settings
+        self.right = self.problem.residual((), self.judged)
+
+    def share(self, effect: Effect) -> tuple[float, bool]:
+        """Share of the loss that an effect would explain if it were there, and whether a search would miss it."""
+        change = self.right - self.problem.residual((effect,), self.judged)
+        before, after = losses(self.right + change), losses(self.right)
+        share = 1.0 - float(after.mean() / max(before.mean(), 1e-300))
+        rules = self.settings.trace
+        least = rules.min_gain if self.problem.sensor_std is None else rules.min_gain_under_noise
+        missed = share <= least or p_value_of_losses(before, after, self.settings.significance) >= self.level
+        return share, missed
+
+
+def _share_if_missed(effect: Effect, tests: Sequence[_Test]) -> float | None:
+    """Largest share of the loss that an effect would explain; None if a search would find it."""
+    shares = []
+    for test in tests:
+        share, missed = test.share(effect)
+        if not missed:
+            return None
+        shares.append(share)
+    return max(shares)
+
+
+def _is_possible(simulation: Simulation, effect: Effect) -> bool:
+    """Whether the model accepts an effect; it rejects, for example, negative total damping."""
+    try:
+        return simulation.with_effects(effect).model is not None
+    except (ValueError, np.linalg.LinAlgError):
+        return False
 
 
 def _largest(entry: CatalogueEntry) -> list[Effect]:
-    """The effect at its largest trials: of one parameter, one on each side of the neutral value; else all of them."""
+    """The effect at its largest trials: one on each side of a neutral value, the smallest limit, or all for several.
+
+    Several parameters have no common order, so all of their trials are taken.
+    """
     if len(entry.fitted) > 1:
         return list(entry.starts)
     [name] = entry.fitted
     values, neutral = [trial[name] for trial in entry.trials], entry.effect.parameters[name].neutral
-    if math.isfinite(neutral):
-        least, most = min(values), max(values)
-        values = [value for value, is_end in ((least, least < neutral), (most, most > neutral)) if is_end]
-    return [entry.effect.with_parameters({name: value}) for value in values]
-
-
-def undetectable_words(effects: Sequence[Effect], names: EntryNames = NO_NAMES) -> tuple[str, ...]:
-    """The effects that data could not have shown in a sentence, one of each kind; no sentence without any.
-
-    Args:
-        effects: the effects, in the order of the catalogue, which begins with the most elements.
-        names: names of the observations, for the words.
-    """
-    of_kinds = list({type(effect): effect for effect in reversed(effects)}.values())[::-1]
-    if not of_kinds:
-        return ()
-    words = [effect_words(effect, names=names) for effect in of_kinds[:NAMED]]
-    if more := len(effects) - len(words):
-        words.append(f"{more} more effect{'s' if more > 1 else ''} of the catalogue")
-    listed = " or ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
-    return (f"These data could not have shown: {listed}.",)
+    least, most = min(values), max(values)
+    ends = [least] if least < neutral else []
+    ends += [most] if math.isfinite(neutral) and most > neutral else []
+    return [entry.effect.with_parameters({name: value}) for value in ends]

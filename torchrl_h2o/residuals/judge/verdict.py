@@ -67,12 +67,19 @@ def reach_verdict(
         signs = (*made_worse(simulation, mended, measured, steps, settings), *signs)
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
     caveats = short_delays(effects, measured, simulation.control_step)
-    small = error.headline is not None and error.headline.after < rules.small_rest * error.headline.before
-    if signs and not small:
+    if signs and not _leaves_little(error, two_sample, rules):
         where = where_most(mended, measured, settings)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
         return Verdict(kind, (*against, *signs), recommended=not against, where=where, caveats=caveats)
     return Verdict(NOT_EXPLAINED if against else EXPLAINED, against, recommended=not against, caveats=caveats)
+
+
+def _leaves_little(error: ErrorSummary, two_sample: TwoSample, rules: VerdictSettings) -> bool:
+    """Whether hardly an error of the sentence's quantity is left, and of all quantities if a classifier sees one."""
+    head, auc = error.headline, two_sample.auc_after
+    if head is None or head.after >= rules.small_rest * head.before:
+        return False
+    return auc is None or auc <= rules.auc or error.after < rules.small_rest * error.before
 
 
 def signs_of_something_missing(

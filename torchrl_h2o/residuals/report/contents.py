@@ -151,8 +151,9 @@ class Verdict:
         reasons: figures that the kind follows from, in words.
         recommended: whether the effects should be put into a simulator for training.
         where: when and at which states the unexplained part is largest; empty if nothing is unexplained.
-        caveats: sentences on effects that may have another cause than the one they are named after or, where nothing is
-            missing, on effects that the data could not have shown.
+        caveats: sentences on effects that may have another cause than the one they are named after.
+        undetectable: where nothing is missing, effects that the data could not have shown, in words; one of each kind
+            comes first.
 
     Raises:
         ValueError: for an unknown kind.
@@ -163,6 +164,7 @@ class Verdict:
     recommended: bool = True
     where: str = ""
     caveats: tuple[str, ...] = ()
+    undetectable: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.kind not in VERDICTS:

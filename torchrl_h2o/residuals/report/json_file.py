@@ -266,7 +266,8 @@ def _other(entry: Mapping[str, Any]) -> OtherExplanation:
 
 
 def _verdict(entry: Mapping[str, Any]) -> Verdict:
-    return _read(Verdict, entry, reasons=tuple(entry["reasons"]), caveats=tuple(entry.get("caveats", ())))
+    lists = {name: tuple(entry.get(name, ())) for name in ("reasons", "caveats", "undetectable")}
+    return _read(Verdict, entry, **lists)
 
 
 def _window(entry: Mapping[str, Any]) -> ShownWindow:

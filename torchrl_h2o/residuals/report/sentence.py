@@ -10,6 +10,7 @@ from torchrl_h2o.residuals.report.contents import EXPLAINED_IN_PART, NOT_EXPLAIN
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
 
+NAMED = 4  # undetectable effects that the sentence names
 MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together
 NOT_IN_CATALOGUE = "this catalogue does not explain"
 
@@ -24,7 +25,8 @@ def sentences(report: ReportContents) -> list[str]:
 
     Returns:
         The result; other effects that these data cannot rule out; effects that may have another cause; what the effects
-        found do not explain; and severe faults of the data. Those that do not apply are left out.
+        found do not explain; where nothing is missing, effects that the data could not have shown; and severe faults of
+        the data. Those that do not apply are left out.
     """
     words = _verdict_words(report)
     if report.audit is not None and report.audit.severe:
@@ -44,14 +46,26 @@ def _verdict_words(report: ReportContents) -> list[str]:
     error = _error_words(report.error) if report.error else ""
     words = _listed(_found_words(report)) if report.found else ""
     kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
-    caveats = () if report.verdict is None else report.verdict.caveats
     if kind == NOT_EXPLAINED:
         attempt = words and f"the best attempt, {words}, is not recommended"
         return [f"Something is missing that {NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."]
     if report.found:
         rest = [f"Something else is missing that {NOT_IN_CATALOGUE}: {unknown}."] if unknown else []
+        caveats = report.verdict.caveats if report.verdict is not None else ()
         return [f"Your simulator lacks: {_joined(words, error)}.", *_alternatives_words(report), *caveats, *rest]
-    return [f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}.", *caveats]
+    nothing = f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
+    return [nothing, *_undetectable_words(report.verdict)]
+
+
+def _undetectable_words(verdict: Verdict | None) -> list[str]:
+    """Effects that the data could not have shown, in up to one sentence."""
+    effects = () if verdict is None else verdict.undetectable
+    if not effects:
+        return []
+    named = _listed(effects[:NAMED])
+    if len(effects) <= NAMED:
+        return [f"Noise or a lack of motion would hide in these data: {named}."]
+    return [f"Noise or a lack of motion would hide {len(effects)} effects in these data, such as {named}."]
 
 
 def _unknown_words(verdict: Verdict) -> str:

@@ -38,7 +38,7 @@ def alternatives(
     kept = [effect for i, effect in enumerate(state.fit.effects) if i != index]
     if not is_possible(state.problem, kept):
         return state, ()
-    state = state.rescaled(state.posed_with_some(kept))
+    state = state.rescaled(state.posed_instead(kept))
     with_it = state.selection_losses(state.fit.effects)
     explained = state.selection_losses(kept).mean() - with_it.mean()
     if explained <= 0.0:

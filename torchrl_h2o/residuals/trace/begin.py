@@ -13,10 +13,11 @@ from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.trace.add import sketched_set
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible, screen
+from torchrl_h2o.residuals.trace.screening import is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 
 PROPOSAL = 0.1  # share by which a regression, a screening, or the fit of a proposal brings the bar closer to the end
@@ -41,10 +42,10 @@ def begin_with(state: SearchState, known: Sequence[Effect]) -> SearchState:
 
 def _with_rivals(state: SearchState, advance: Callable[[], object] = lambda: None) -> SearchState:
     """The state with the leads that a screening without each of its effects gives; ``advance`` follows each entry."""
-    rivals = {}
+    rivals, found = {}, {entry.name for entry in state.entries}
     for entry, effect in zip(state.entries, state.fit.effects, strict=True):
         others = [other for other in state.fit.effects if other is not effect]
-        candidates = [one for one in state.catalogue if one is entry or one not in state.entries]
+        candidates = [one for one in state.catalogue if one.name == entry.name or one.name not in found]
         rivals[entry.name] = screen(state.problem, others, candidates, state.windows.screened, advance)
     return replace(state, rivals=rivals)
 
@@ -96,11 +97,12 @@ def begin_anew(
 def begin_noise_free(
     state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
 ) -> SearchState | None:
-    """Begins another search, as if the sensors had no noise, if one more effect then explains most of what is left.
+    """Begins another search, as if the sensors had no noise, if noise does not explain what is left.
 
     The noise of a sensor is estimated from the residual. While an effect is missing, the estimate may therefore contain
     that effect: a sensor's wrong gain changes successive residuals as noise does, and is then not looked for any more.
-    No effect explains most of real noise.
+    Windows that were lengthened for such noise may also keep a fit from the right value. No effect explains most of
+    real noise, and no other values of the effects found do.
 
     Args:
         state: what the search with noisy sensors has found.
@@ -109,32 +111,33 @@ def begin_noise_free(
         progress: bar that shows how far the search is.
 
     Returns:
-        The state with the same effects in windows of one control step; None if the sensors have noise.
+        The state with the same effects, refitted in windows of one control step; None if neither these nor one more
+        effect explain most of what is left there, or if the noise is known because columns were estimated.
     """
-    noisy, measured, most = state.problem, state.problem.measured, state.settings.trace.noise_free_loss
-    if state.exact or noisy.sensor_std is None or measured.estimated_std is not None:
+    noisy, measured = state.problem, state.problem.measured
+    estimated = measured.estimated_std is not None and bool(measured.estimated_std.any())
+    if state.exact or noisy.sensor_std is None or estimated:
         return None
     no_noise = np.zeros(measured.observation.shape[1])
     problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=no_noise, settings=state.settings.residual)
     silent = replace(SearchState.begin(problem, catalogue, rng, state.settings), noise_free=True)
     silent = silent.rescaled(silent.posed_at(state.fit.effects))
+    to_beat = state.settings.trace.noise_free_loss * silent.screened_loss(state.fit.effects)
     silent = silent.with_found(state.entries, silent.refitted(state.entries, state.fit.effects))
-    to_beat = most * silent.screened_loss(state.fit.effects)
-    explained = (
-        silent.screened_loss(silent.fit.effects) <= to_beat or _sketched_with_one_more(silent, progress) <= to_beat
-    )
-    return _with_rivals(silent) if explained else None
+    refitted = silent.screened_loss(silent.fit.effects)
+    advance = partial(progress.closer, PROPOSAL / (len(catalogue) * max(1, len(state.entries))))
+    if refitted > to_beat and _loss_with_one_more(silent, advance) > to_beat:
+        return None
+    return _with_rivals(silent, advance)
 
 
-def _sketched_with_one_more(state: SearchState, progress: LoopBar) -> float:
-    """Mean loss of the screened windows in a quick fit with the most promising entry."""
-    one_more = partial(progress.closer, PROPOSAL / max(1, len(state.others)))
-    leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
-    if not leads:
+def _loss_with_one_more(state: SearchState, advance: Callable[[], object]) -> float:
+    """Mean loss of the screened windows in a quick fit with the most promising entry; infinite without one."""
+    leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, advance)
+    if not leads or leads[0].promise <= 0.0:
         return math.inf
-    effects = [*state.fit.effects, leads[0].effect]
-    free = [*map(free_parameters, state.entries), leads[0].free]
-    return state.sketched(effects, free, state.settings.trace.sketch_evaluations).loss
+    sketch = sketched_set(state, [*state.fit.effects, leads[0].effect], leads[:1])
+    return math.inf if sketch is None else sketch.loss
 
 
 def _explains_motion(state: SearchState) -> bool:

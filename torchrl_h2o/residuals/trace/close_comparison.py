@@ -17,12 +17,12 @@ from torchrl_h2o.residuals.trace.state import SearchState
 
 def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) -> Fit:
     """The fit of an explanation, continued with residuals scaled by what it leaves."""
-    return state.rescaled(state.posed_at(fitted.effects)).refitted(entries, fitted.effects)
+    return state.rescaled(state.posed_instead(fitted.effects)).refitted(entries, fitted.effects)
 
 
 def worse_of(state: SearchState, one: Fit, other: Fit) -> Fit | None:
     """The explanation that is clearly and significantly worse under both scalings of the residuals; None if none is."""
-    scaled = [state.rescaled(state.posed_at(scaling.effects)) for scaling in (one, other)]
+    scaled = [state.rescaled(state.posed_instead(scaling.effects)) for scaling in (one, other)]
     for worse, better in ((one, other), (other, one)):
         if all(_is_worse(at, worse, better) for at in scaled):
             return worse

@@ -57,7 +57,7 @@ def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None)
     scaled by what the effects found leave and with residuals scaled by what the set itself leaves.
     """
     rules = state.settings.trace
-    state = state.rescaled(state.posed_with_some(()))
+    state = state.rescaled(state.posed_instead(()))
     with_it, without = (state.selection_losses(effects) for effects in (state.fit.effects, ()))
     explained = float(without.mean() - with_it.mean())
     if explained <= 0.0:

@@ -98,7 +98,9 @@ def _from_another_beginning(
     """What a search finds that begins otherwise, if the first one has left something that this may explain."""
     silent = begin_noise_free(state, catalogue, rng, progress)
     if silent is not None and (grown := grow(silent, rng, progress)).exact:
+        found(grown)
         return grown
+    progress.show_found(state.entries)
     other = begin_anew(state, catalogue, rng, progress)
     if other is None:
         return state

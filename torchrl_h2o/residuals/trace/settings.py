@@ -96,7 +96,7 @@ class TraceSettings:
     min_fitted: int = 120
     """Smallest number of windows in a fit during the search."""
     noise_free_loss: float = 0.5
-    """Share of the loss to which a fit or one more effect must lower it without sensor noise; else there is noise."""
+    """Share of the loss to which a refit or one more effect must lower it, or the sensors are taken to be noisy."""
     noise_free_fits: int = 4
     """Largest number of such fits, each with residuals scaled anew, that may leave only rounding."""
     leads_combined: int = 60

@@ -184,14 +184,16 @@ class SearchState:
         mended = base.simulation.with_effects(*effects)
         return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std, settings=base.settings)
 
-    def posed_with_some(self, effects: Sequence[Effect]) -> Problem:
-        """The problem with some of the effects found put in.
+    def posed_instead(self, effects: Sequence[Effect]) -> Problem:
+        """The problem with other effects in the place of those found, and without noise if these leave none.
 
-        The sensors are free of noise if they are so with all effects put in. An estimate without one of the effects may
-        take what this effect does for noise, and the fits of others in its place would then be biased.
+        An estimate of the noise with the wrong effects contains their error, and fits of these effects are then biased.
+
+        Args:
+            effects: the effects to put in.
         """
         mended = self.problem.simulation.with_effects(*self.fit.effects)
-        if sensor_noise(mended, self.problem.measured) is not None:
+        if not self.noise_free and sensor_noise(mended, self.problem.measured) is not None:
             return self.posed_at(effects)
         return self.posed_at(effects, sensor_std=np.zeros(self.problem.measured.observation.shape[1]))
 
