@@ -107,7 +107,7 @@ def _largest(entry: CatalogueEntry) -> list[Effect]:
     """
     if len(entry.fitted) > 1:
         return list(entry.starts)
-    [name] = entry.fitted
+    name = entry.fitted[0]
     values, neutral = [trial[name] for trial in entry.trials], entry.effect.parameters[name].neutral
     least, most = min(values), max(values)
     ends = [least] if least < neutral else []
