@@ -105,9 +105,9 @@ def _largest(entry: CatalogueEntry) -> list[Effect]:
 
     Several parameters have no common order, so all of their trials are taken.
     """
-    if len(entry.fitted) > 1:
+    if len(entry.fitted) != 1:
         return list(entry.starts)
-    name = entry.fitted[0]
+    [name] = entry.fitted
     values, neutral = [trial[name] for trial in entry.trials], entry.effect.parameters[name].neutral
     least, most = min(values), max(values)
     ends = [least] if least < neutral else []
