@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
 from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
 
@@ -47,7 +46,7 @@ def undetectable_effects(
     tests = [_Test(simulation, measured, horizon, level, settings) for horizon in lengths]
     missed: list[tuple[float, Effect]] = []
     for entry in catalogue:
-        largest = [] if entry.effect.random else [e for e in _largest(entry) if _is_possible(simulation, e)]
+        largest = [] if entry.effect.random else [e for e in _largest(entry) if is_possible(tests[0].problem, [e])]
         shares = {effect: share for effect in largest if (share := _share_if_missed(effect, tests)) is not None}
         if len(entry.fitted) == 1:
             missed += [(share, effect) for effect, share in shares.items()]
@@ -69,11 +68,12 @@ class _Test:
         self.problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
         self.judged, self.level, self.settings = measured.selected_on(horizon), level, settings
         self.right = self.problem.residual((), self.judged)
+        self.after = losses(self.right)
 
     def share(self, effect: Effect) -> tuple[float, bool]:
         """Share of the loss that an effect would explain if it were there, and whether a search would miss it."""
         change = self.right - self.problem.residual((effect,), self.judged)
-        before, after = losses(self.right + change), losses(self.right)
+        before, after = losses(self.right + change), self.after
         share = 1.0 - float(after.mean() / max(before.mean(), 1e-300))
         rules = self.settings.trace
         least = rules.min_gain if self.problem.sensor_std is None else rules.min_gain_under_noise
@@ -90,14 +90,6 @@ def _share_if_missed(effect: Effect, tests: Sequence[_Test]) -> float | None:
             return None
         shares.append(share)
     return max(shares)
-
-
-def _is_possible(simulation: Simulation, effect: Effect) -> bool:
-    """Whether the model accepts an effect; it rejects, for example, negative total damping."""
-    try:
-        return simulation.with_effects(effect).model is not None
-    except (ValueError, np.linalg.LinAlgError):
-        return False
 
 
 def _largest(entry: CatalogueEntry) -> list[Effect]:

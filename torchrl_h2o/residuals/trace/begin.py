@@ -118,8 +118,8 @@ def begin_noise_free(
     estimated = measured.estimated_std is not None and bool(measured.estimated_std.any())
     if state.exact or noisy.sensor_std is None or estimated:
         return None
-    no_noise = np.zeros(measured.observation.shape[1])
-    problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=no_noise, settings=state.settings.residual)
+    settings = state.settings.residual
+    problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=measured.no_noise, settings=settings)
     silent = replace(SearchState.begin(problem, catalogue, rng, state.settings), noise_free=True)
     silent = silent.rescaled(silent.posed_at(state.fit.effects))
     to_beat = state.settings.trace.noise_free_loss * silent.screened_loss(state.fit.effects)

@@ -82,7 +82,7 @@ def propose_effects(
         settings: rows, smoothing and the size of the set.
 
     Returns:
-        The entries, each with its effect at the value of the regression. None if coordinates are unobserved, if
+        The entries, each with its effect at the value of the regression; empty if coordinates are unobserved, if
         actuators have a state of their own, which is not measured, or if the rows are too few.
     """
     if simulation.model.na or not simulation.state_map.observe.any(0).all():

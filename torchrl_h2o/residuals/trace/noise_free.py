@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -25,7 +23,7 @@ def without_noise(state: SearchState) -> SearchState:
     if state.exact or not state.entries or state.problem.sensor_std is None:
         return state
     rules = state.settings.trace
-    no_noise = np.zeros(state.problem.measured.observation.shape[1])
+    no_noise = state.problem.measured.no_noise
     silent = state.rescaled(state.posed_at(state.fit.effects, sensor_std=no_noise))
     free = [free_parameters(entry) for entry in state.entries]
     fitted = silent.sketched(state.fit.effects, free, rules.sketch_evaluations)

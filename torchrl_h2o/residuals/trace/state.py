@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -180,7 +181,7 @@ class SearchState:
             return self.first
         base = self.problem
         if sensor_std is None and self.noise_free:
-            sensor_std = np.zeros(base.measured.observation.shape[1])
+            sensor_std = base.measured.no_noise
         mended = base.simulation.with_effects(*effects)
         return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std, settings=base.settings)
 
@@ -192,10 +193,15 @@ class SearchState:
         Args:
             effects: the effects to put in.
         """
-        mended = self.problem.simulation.with_effects(*self.fit.effects)
-        if not self.noise_free and sensor_noise(mended, self.problem.measured) is not None:
+        if not self._leaves_no_noise:
             return self.posed_at(effects)
-        return self.posed_at(effects, sensor_std=np.zeros(self.problem.measured.observation.shape[1]))
+        return self.posed_at(effects, sensor_std=self.problem.measured.no_noise)
+
+    @cached_property
+    def _leaves_no_noise(self) -> bool:
+        """Whether the sensors have no noise by the residual that the effects found leave."""
+        mended = self.problem.simulation.with_effects(*self.fit.effects)
+        return self.noise_free or sensor_noise(mended, self.problem.measured) is None
 
     def rescaled(self, posed: Problem) -> SearchState:
         """The state with the start states and scales of a problem posed with effects put in."""
