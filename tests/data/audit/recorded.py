@@ -32,6 +32,18 @@ def arm(*effects) -> Simulation:
     return Simulation(lambda: mujoco.MjSpec.from_string(XML), 2, state_map, effects, "arm")
 
 
+def swinging(*effects, zero: float = 0.0, rows: int = 2000, noise: float = 0.002) -> tuple[Measured, Simulation]:
+    """Free motion of the arm without motors, with a wrong zero of the shoulder, and the simulation without either."""
+    xml = XML[: XML.index("<actuator>")] + "</mujoco>"
+    simulation = replace(arm(), spec=lambda: mujoco.MjSpec.from_string(xml))
+    action, rng = np.zeros((rows, 0)), np.random.default_rng(0)
+    start = np.array([1.2, -0.6, 0.0, 0.0])
+    reached = simulation.with_effects(*effects).rollout(start[None], action[None])[0]
+    observed = np.vstack([start, reached]) + np.array([zero, 0.0, 0.0, 0.0])
+    observed += noise * observed.std(0) * rng.standard_normal(observed.shape)
+    return measured(observed, action), simulation
+
+
 def recording(*effects, seed: int = 0, rows: int = 2000, noise: float = 0.01) -> Measured:
     """One run of the arm with effects under random torques; noise is a share of each signal's spread."""
     rng, reality = np.random.default_rng(seed), arm(*effects)

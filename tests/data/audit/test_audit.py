@@ -15,6 +15,7 @@ from tests.data.audit.recorded import (
     recording,
     rows_of,
     scaled,
+    swinging,
     with_action,
 )
 from torchrl_h2o.data import Audit, DataError, Finding, audit
@@ -69,6 +70,17 @@ def test_good_log_has_neither_severe_findings_nor_warnings(good, simulation):
 )
 def test_dynamics_gap_is_no_fault_of_the_data(effect, simulation):
     assert audit(recording(effect), simulation).severe == ()
+
+
+@pytest.mark.parametrize("effects", [(), (JointFrictionLoss(0.15), Gravity(2.0))], ids=["no gap", "a gap"])
+def test_free_motion_of_a_model_without_actuators_has_no_severe_findings(effects):
+    data, simulation = swinging(*effects)
+    assert audit(data, simulation).severe == ()
+
+
+def test_a_wrong_zero_is_found_without_actuators():
+    data, simulation = swinging(zero=0.3)
+    assert "zero of shoulder is shifted" in warned(data, simulation, "model")
 
 
 def test_short_delay_of_a_drive_is_a_note(simulation):

@@ -172,6 +172,8 @@ class Response:
     @cached_property
     def by_action(self) -> np.ndarray:
         """Derivative of the change by a constant offset of each action, (W, m, nu), by differences inside its range."""
+        if not self.anchor.shape[-1]:  # a model without actuators
+            return np.zeros((*self.change.shape, 0))
         base, unit = self.anchor, self.settings.nudge * self.action_unit
         inward = np.where(base.mean(1) > 0.5 * sum(np.nan_to_num(self._range, posinf=0.0, neginf=0.0)), -1.0, 1.0)
         steps = inward * unit  # (W, nu)
