@@ -54,6 +54,42 @@ def test_there_are_at_least_25_kinds_of_effect_and_nothing_twice(task):
     assert len({entry.name for entry in entries}) == len({entry.effect for entry in entries}) == len(entries)
 
 
+SCALED = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="carriage">
+      <joint name="axis" type="slide" axis="1 0 0" damping="{mass}"/>
+      <geom type="box" size="0.1 0.1 0.1" mass="{mass}"/>
+      <body name="arm"><joint name="hinge" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03" mass="{mass}"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="axis" gear="{mass}"/><motor joint="hinge" gear="{mass}"/></actuator>
+</mujoco>
+"""
+
+
+def test_trials_of_a_crane_are_those_of_a_toy_with_all_forces_and_masses_a_million_times_as_large():
+    toy, crane = (
+        catalogue(mujoco.MjSpec.from_string(SCALED.format(mass=mass)), num_observations=4, dt=0.01)
+        for mass in (0.1, 1e5)
+    )
+    assert [entry.name for entry in crane] == [entry.name for entry in toy]
+    factors = {
+        (entry.name, parameter): large[parameter] / small[parameter]
+        for entry, other in zip(toy, crane, strict=True)
+        for small, large in zip(entry.trials, other.trials, strict=True)
+        for parameter in small
+        if small[parameter]
+    }
+    wrong = {key: factor for key, factor in factors.items() if not np.isclose(factor, [1.0, 1e6], rtol=1e-6).any()}
+    assert not wrong
+    grown = {name.split("[")[0].split()[0] for (name, _), factor in factors.items() if factor > 2.0}
+    assert grown >= {"JointDamping", "JointFrictionLoss", "Armature", "JointForce", "JointSpring", "LinearDrag"}
+
+
 @pytest.mark.parametrize("task", FILES)
 def test_every_entry_is_neutral_and_every_trial_changes_what_it_acts_on(task):
     unchanged = as_bytes(compile_model(mujoco.MjSpec.from_file(str(FILES[task]))))

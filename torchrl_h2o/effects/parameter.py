@@ -4,6 +4,12 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+#: bounds of a quantity whose size depends on the machine, which may be a watch or a crane, or on the unit of its
+#: commands; they only leave out numbers that are too large for MuJoCo (its ``mjMAXVAL`` is 1e10)
+ANY_SIZE = (-1e9, 1e9)
+#: the same for a quantity that is not negative
+ANY_AMOUNT = (0.0, 1e9)
+
 
 @dataclass(frozen=True)
 class Parameter:

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchrl_h2o.effects.effect import ActionEffect, Process
 from torchrl_h2o.effects.indices import Indices, entry_mask
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_AMOUNT, parameter
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ActionDeadBand(ActionEffect):
 
     wording: ClassVar[str] = "dead band of {width} on {actuators}"
     memoryless: ClassVar[bool] = True
-    width: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
+    width: float = parameter(unit="1", bounds=ANY_AMOUNT, neutral=0.0)
     actuators: Indices = None
 
     def process(self, dt: float, rng: np.random.Generator) -> Process:
@@ -87,7 +87,7 @@ class ActionBacklash(ActionEffect):
     """
 
     wording: ClassVar[str] = "backlash of {width} on {actuators}"
-    width: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
+    width: float = parameter(unit="1", bounds=ANY_AMOUNT, neutral=0.0)
     actuators: Indices = None
 
     def process(self, dt: float, rng: np.random.Generator) -> Process:

@@ -7,7 +7,7 @@ import numpy as np
 
 from torchrl_h2o.effects.effect import NO_NAMES, ActionEffect, EntryNames, Process
 from torchrl_h2o.effects.indices import Indices, entry_mask
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_SIZE, parameter
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ActionNoise(ActionEffect):
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"
     random: ClassVar[bool] = True
     memoryless: ClassVar[bool] = True
-    std: float = parameter(unit="1", bounds=(-10.0, 10.0), neutral=0.0)
+    std: float = parameter(unit="1", bounds=ANY_SIZE, neutral=0.0)
     actuators: Indices = None
 
     def describe(self, names: EntryNames = NO_NAMES) -> str:
@@ -106,7 +106,7 @@ class ActionBias(ActionEffect):
 
     wording: ClassVar[str] = "bias of {bias} on {actuators}"
     memoryless: ClassVar[bool] = True
-    bias: float = parameter(unit="1", bounds=(-100.0, 100.0), neutral=0.0)
+    bias: float = parameter(unit="1", bounds=ANY_SIZE, neutral=0.0)
     actuators: Indices = None
 
     def process(self, dt: float, rng: np.random.Generator) -> Process:

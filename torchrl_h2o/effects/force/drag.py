@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect
 from torchrl_h2o.effects.force.kinematics import com_jacobians
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_AMOUNT, ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -31,7 +31,7 @@ class JointForce(ForceEffect):
     """
 
     wording: ClassVar[str] = "constant {load} of {torque} on {joints}"
-    torque: float = parameter(unit="N·m", bounds=(-1000.0, 1000.0), neutral=0.0)
+    torque: float = parameter(unit="N·m", bounds=ANY_SIZE, neutral=0.0)
     joints: Names = "*"
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator | None) -> Force:
@@ -61,7 +61,7 @@ class LinearDrag(ForceEffect):
     """
 
     wording: ClassVar[str] = "drag of {coefficient} on {bodies}"
-    coefficient: float = parameter(unit="N·s/m", bounds=(0.0, 1000.0), neutral=0.0)
+    coefficient: float = parameter(unit="N·s/m", bounds=ANY_AMOUNT, neutral=0.0)
     bodies: Names = "*"
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
@@ -88,7 +88,7 @@ class QuadraticDrag(ForceEffect):
     """
 
     wording: ClassVar[str] = "quadratic drag of {coefficient} on {bodies}"
-    coefficient: float = parameter(unit="N·s²/m²", bounds=(0.0, 1000.0), neutral=0.0)
+    coefficient: float = parameter(unit="N·s²/m²", bounds=ANY_AMOUNT, neutral=0.0)
     bodies: Names = "*"
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_h2o.effects.parameter import Parameter
+from torchrl_h2o.effects.parameter import ANY_SIZE, Parameter
 
 _TIMES = " · "
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -24,7 +24,6 @@ _FACTORS = {
     "step": re.compile(rf"step\(t - ({_NUMBER})\)"),
 }
 _RAISED = str.maketrans({"2": "²", "3": "³", "4": "⁴", "5": "⁵", "6": "⁶", "7": "⁷", "8": "⁸", "9": "⁹"})
-_LARGEST = 1e9  # nominal bound: a Parameter requires bounds, but a number in a term has no physical limit
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class Factor:
         names = {"sin": ("frequency", "phase"), "step": ("start",)}.get(self.function, ())
         units = {"frequency": per.get(self.coordinate, "1"), "phase": "rad", "start": "s"}
         return {
-            name: Parameter(value, units[name], (-_LARGEST, _LARGEST), np.nan)
+            name: Parameter(value, units[name], ANY_SIZE, np.nan)
             for name, value in zip(names, self.numbers, strict=True)
         }
 
@@ -173,7 +172,7 @@ class ForceTerm:
 
     def parameters(self) -> dict[str, Parameter]:
         """Returns the coefficient and the numbers in the factors, by name."""
-        found = {"coefficient": Parameter(self.coefficient, self.unit, (-_LARGEST, _LARGEST), 0.0)}
+        found = {"coefficient": Parameter(self.coefficient, self.unit, ANY_SIZE, 0.0)}
         for factor in self.factors:
             for name, value in factor.parameters(self.sliding).items():
                 found[name if name not in found else f"second_{name}"] = value

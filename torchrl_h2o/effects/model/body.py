@@ -9,7 +9,7 @@ import numpy as np
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.model.inertial import Inertial, compile_unscaled, edit_inertials
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_AMOUNT, parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -134,7 +134,7 @@ class Payload(ModelEffect):
     """
 
     wording: ClassVar[str] = "payload of {mass} at x {x}, y {y}, z {z} on {bodies}"
-    mass: float = parameter(unit="kg", bounds=(0.0, 1000.0), neutral=0.0)
+    mass: float = parameter(unit="kg", bounds=ANY_AMOUNT, neutral=0.0)
     x: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
     z: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
     y: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)

@@ -10,7 +10,7 @@ import mujoco
 
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import ModelEffect
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -58,7 +58,7 @@ class JointDamping(ModelEffect):
     """
 
     wording: ClassVar[str] = "damping of {joints} + {damping}"
-    damping: float = parameter(unit="N·m·s/rad", bounds=(-100.0, 100.0), neutral=0.0)
+    damping: float = parameter(unit="N·m·s/rad", bounds=ANY_SIZE, neutral=0.0)
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:
@@ -84,7 +84,7 @@ class JointFrictionLoss(ModelEffect):
     """
 
     wording: ClassVar[str] = "dry friction of {joints} + {torque}"
-    torque: float = parameter(unit="N·m", bounds=(-100.0, 100.0), neutral=0.0)
+    torque: float = parameter(unit="N·m", bounds=ANY_SIZE, neutral=0.0)
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:
@@ -109,7 +109,7 @@ class Armature(ModelEffect):
     """
 
     wording: ClassVar[str] = "armature of {joints} + {inertia}"
-    inertia: float = parameter(unit="kg·m²", bounds=(-100.0, 100.0), neutral=0.0)
+    inertia: float = parameter(unit="kg·m²", bounds=ANY_SIZE, neutral=0.0)
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:

@@ -12,7 +12,7 @@ import mujoco
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.model.joint import added, those_with
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Names
 
 
@@ -62,7 +62,7 @@ class JointSpring(ModelEffect):
     """
 
     wording: ClassVar[str] = "stiffness of {joints} + {stiffness}"
-    stiffness: float = parameter(unit="N·m/rad", bounds=(-10000.0, 10000.0), neutral=0.0)
+    stiffness: float = parameter(unit="N·m/rad", bounds=ANY_SIZE, neutral=0.0)
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:

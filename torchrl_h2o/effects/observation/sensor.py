@@ -8,7 +8,7 @@ import numpy as np
 from torchrl_h2o.effects.delay_line import advanced, delay_line
 from torchrl_h2o.effects.effect import ObservationEffect, Process
 from torchrl_h2o.effects.indices import Indices, entry_mask
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_AMOUNT, ANY_SIZE, parameter
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ObservationNoise(ObservationEffect):
     wording: ClassVar[str] = "noise of standard deviation {std} on {entries} of the observation"
     memoryless: ClassVar[bool] = True
     random: ClassVar[bool] = True
-    std: float = parameter(unit="1", bounds=(0.0, 100.0), neutral=0.0)
+    std: float = parameter(unit="1", bounds=ANY_AMOUNT, neutral=0.0)
     entries: Indices = None
 
     def process(self, dt: float, rng: np.random.Generator) -> Process:
@@ -56,7 +56,7 @@ class ObservationBias(ObservationEffect):
 
     wording: ClassVar[str] = "bias of {bias} on {entries} of the observation"
     memoryless: ClassVar[bool] = True
-    bias: float = parameter(unit="1", bounds=(-100.0, 100.0), neutral=0.0)
+    bias: float = parameter(unit="1", bounds=ANY_SIZE, neutral=0.0)
     entries: Indices = None
 
     def process(self, dt: float, rng: np.random.Generator) -> Process:
