@@ -1,5 +1,7 @@
 """Several logs in one recording: their order, rows, and which are held out."""
 
+from dataclasses import replace
+
 import hydra
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import torch
 from torchrl_h2o.commands.close_the_loop import make_simulation
 from torchrl_h2o.commands.recording import read_recording, split_by_name
 from torchrl_h2o.data import write_ted
+from torchrl_h2o.data.readers.observed import words_of_estimates
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.residuals.measured.transitions import Measured
 
@@ -170,5 +173,7 @@ def test_an_estimated_velocity_is_part_of_the_recording(logs):
     recording, _ = read("data=logs", "simulator.coordinates={rate: pivot_velocity}")
     (estimate,) = recording.estimated
     assert (estimate.name, estimate.position, estimate.unit) == ("rate", "pivot", "rad/s")
-    assert "rate was not measured: it is estimated from pivot, with an error of" in estimate.words()
+    words = words_of_estimates([estimate, replace(estimate, name="other")])
+    assert words.startswith("not measured but estimated: rate from pivot, with an error of ")
+    assert words.count("other from pivot") == words.count("smooth over time") == 1
     torch.testing.assert_close(recording.transitions["observation"][:, 1], torch.full((39,), 300.0), rtol=1e-3, atol=0)

@@ -24,6 +24,7 @@ from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import Audit, DataError, audit
+from torchrl_h2o.data.readers.observed import words_of_estimates
 from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.options import CloseTheLoopOptions
@@ -83,7 +84,7 @@ def main(cfg: DictConfig) -> None:
         simulation,
         recording.transitions,
         chosen_entries(cfg, simulation),
-        source="; ".join([recording.source, *(estimate.words() for estimate in recording.estimated)]),
+        source="; ".join(filter(None, [recording.source, words_of_estimates(recording.estimated)])),
         held_out=recording.reported_on,
         seed=cfg.seed,
         audit=audited(cfg, recording, simulation),

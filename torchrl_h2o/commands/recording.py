@@ -56,7 +56,7 @@ class Recording:
 
     @property
     def estimated(self) -> tuple[EstimatedVelocity, ...]:
-        """Observed velocities that were not measured but estimated from positions; ``words()`` says so in a report."""
+        """Observed velocities that were not measured but estimated from positions."""
         return () if self.columns is None else estimated_velocities(self.transitions, self.columns)
 
     def for_model(self, model: mujoco.MjModel) -> Recording:

@@ -75,19 +75,22 @@ class EstimatedVelocity:
     std: float
     unit: str
 
-    def words(self) -> str:
-        """Return a sentence for a report.
 
-        Example:
-            >>> from torchrl_h2o.data.readers.observed import EstimatedVelocity
-            >>> EstimatedVelocity("hip_velocity", "hip", 0.0123, "rad/s").words()[:71]
-            'hip_velocity was not measured: it is estimated from hip, with an error '
-        """
-        return (
-            f"{self.name} was not measured: it is estimated from {self.position}, with an error of {self.std:.2g} "
-            f"{self.unit} (standard deviation). The estimate is smooth over time, so a delay of the actions may look "
-            "like a lag."
-        )
+def words_of_estimates(estimated: Sequence[EstimatedVelocity]) -> str:
+    """Return a clause for a report that names all estimated columns; empty without any.
+
+    Examples:
+        >>> from torchrl_h2o.data.readers.observed import EstimatedVelocity, words_of_estimates
+        >>> words_of_estimates([EstimatedVelocity("hip_velocity", "hip", 0.0123, "rad/s")])[:79]
+        'not measured but estimated: hip_velocity from hip, with an error of 0.012 rad/s'
+    """
+    if not estimated:
+        return ""
+    each = [f"{one.name} from {one.position}, with an error of {one.std:.2g} {one.unit}" for one in estimated]
+    return (
+        f"not measured but estimated: {', '.join(each)} (standard deviation); such estimates are smooth over time, so "
+        "a delay of the actions may look like a lag"
+    )
 
 
 def estimated_velocities(td: TensorDictBase, layout: LogColumns) -> tuple[EstimatedVelocity, ...]:
