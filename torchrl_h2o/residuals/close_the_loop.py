@@ -156,7 +156,7 @@ def explain(
     )
     so_far(declared, "undeclared forces were looked for")
     progress.stage(FORCES)
-    add_force = partial(add_undeclared_force, rng=rng, settings=settings)
+    add_force = partial(add_undeclared_force, rng=rng, catalogue=catalogue, settings=settings)
     with_force = _tried("an undeclared force", declared, lambda: add_force(simulation, measured, declared))
     so_far(with_force, "action noise was looked for")
     progress.stage(NOISE)

@@ -11,6 +11,7 @@ from torchrl_h2o.residuals.trace.settings import (
     FitSettings,
     HorizonSettings,
     InverseDynamicsSettings,
+    LongerWindowsSettings,
     SignificanceSettings,
     TraceSettings,
 )
@@ -42,6 +43,7 @@ class LoopSettings:
     """Choice of the window length."""
     trace: TraceSettings = field(default_factory=TraceSettings)
     """Search over the catalogue."""
+    longer_windows: LongerWindowsSettings = field(default_factory=LongerWindowsSettings)
     inverse_dynamics: InverseDynamicsSettings = field(default_factory=InverseDynamicsSettings)
     """Regression of missing forces."""
     undeclared: UndeclaredSettings = field(default_factory=UndeclaredSettings)

@@ -197,13 +197,7 @@ def _alternatives(
 def _others(
     simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
 ) -> tuple[tuple[RivalSet, float, str], ...]:
-    """Error of each other set of effects, and the data that would distinguish it from the effects found.
-
-    Empty if the explanation contains an undeclared force: the sets explain only as much as the catalogue's effects
-    alone, and the force explains more.
-    """
-    if not all(part.declared for part in explanation.parts):
-        return ()
+    """Error of each other set of effects, and the data that would distinguish it from the effects found."""
     others = []
     for rival in explanation.trace.others:
         other = simulation.with_effects(*rival.fit.effects)

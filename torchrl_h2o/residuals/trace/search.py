@@ -16,6 +16,7 @@ from torchrl_h2o.residuals.trace.begin import begin_anew, begin_noise_free, begi
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.grow import grow
+from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.per_joint import divide_by_element
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -115,7 +116,10 @@ def _rescaled(state: SearchState) -> SearchState:
 def _fitted_to_all(state: SearchState) -> SearchState:
     """The effects found, fitted to all windows with residuals scaled by their present size."""
     rescaled = _rescaled(state)
-    return rescaled.with_found(state.entries, rescaled.refitted(state.entries, state.fit.effects, state.windows.all))
+    fitted = rescaled.refitted(state.entries, state.fit.effects, state.windows.all)
+    if state.entries:
+        fitted = fitted_in_longer_windows(rescaled.problem, fitted, state.settings)
+    return rescaled.with_found(state.entries, fitted)
 
 
 def _outcome(state: SearchState) -> Trace:

@@ -144,6 +144,18 @@ class TraceSettings:
 
 
 @dataclass(frozen=True)
+class LongerWindowsSettings:
+    """The last fit where sensors are noisy, in windows that are longer than those of the search."""
+
+    fits: int = 3
+    """Fits, each with states estimated with the values of the one before."""
+    steps: int = 10
+    """Control steps per window."""
+    longest: float = 0.2
+    """Largest length of a window, in s."""
+
+
+@dataclass(frozen=True)
 class InverseDynamicsSettings:
     """The regression of missing forces, for a search whose effects predict no better than constant velocities do."""
 

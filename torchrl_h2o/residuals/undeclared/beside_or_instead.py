@@ -8,14 +8,16 @@ from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.effects import ResidualForce
+from torchrl_h2o.effects import CatalogueEntry, ResidualForce
 from torchrl_h2o.residuals.explanation import Explanation, Part
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.begin import entry_of
 from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+from torchrl_h2o.residuals.undeclared.by_catalogue import by_catalogue
 from torchrl_h2o.residuals.undeclared.find_force import Undeclared, find_undeclared
 from torchrl_h2o.residuals.undeclared.needed import needed_parts
 
@@ -43,18 +45,21 @@ def add_undeclared_force(
     explanation: Explanation,
     *,
     rng: np.random.Generator,
+    catalogue: Sequence[CatalogueEntry] = (),
     settings: LoopSettings = DEFAULTS,
 ) -> Explanation:
     """Adds a force outside the catalogue if it improves the explanation.
 
     The force is searched for beside the effects found, and instead of them, because a force alone may fit the data
     better than the catalogue's effects. Both candidates are judged on held-out data against the present explanation.
+    A force whose terms are all effects of the catalogue is replaced by these; see :func:`by_catalogue`.
 
     Args:
         simulation: the simulator without the effects found.
         measured: the data.
         explanation: effects of the catalogue.
         rng: generator of synthetic noise.
+        catalogue: effects that the simulator may lack.
         settings: thresholds and budgets.
 
     Returns:
@@ -79,7 +84,13 @@ def add_undeclared_force(
         pays = _pays(first, before, after, parts, candidate.parts, settings)
         if pays and _beyond_noise(candidate, measured, horizon, rng, settings):
             paying.append((candidate.parts, after.mean()))
-    return explanation.with_parts(_shortest(paying, settings) if paying else parts)
+    if not paying:
+        return explanation
+    chosen = by_catalogue(problem, _shortest(paying, settings), catalogue, settings)
+    found = [entry_of(part.effect, catalogue) for part in chosen if part.declared]
+    attempts = tuple(attempt for attempt in explanation.trace.attempts if attempt.entry not in found)
+    # other sets of the catalogue's effects explain less than a force beside or instead of these effects
+    return replace(explanation, parts=chosen, trace=replace(explanation.trace, attempts=attempts, others=()))
 
 
 def _horizon(explanation: Explanation, settings: LoopSettings) -> int:

@@ -1,0 +1,44 @@
+"""The last fit in noisy data uses windows of several steps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import JointDamping, JointFrictionLoss
+from torchrl_h2o.residuals.trace.fit import fit
+from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
+from torchrl_h2o.residuals.trace.problem import Problem
+
+TRUE = {"damping": 0.05, "torque": 0.12}
+
+
+def one_step_fit(noise: float, seed: int):
+    """Friction and damping, fitted in windows of one step with states that were estimated with friction alone."""
+    real = pendulum().with_effects(JointFrictionLoss(TRUE["torque"]), JointDamping(TRUE["damping"]))
+    posed = Problem.pose(pendulum().with_effects(JointFrictionLoss(0.18)), recorded(real, 1500, noise=noise, seed=seed))
+    problem = replace(posed, simulation=pendulum())
+    starts = problem.measured.fitted()
+    return problem, fit(problem, (JointDamping(0.1), JointFrictionLoss(0.1)), (("damping",), ("torque",)), starts)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_and_damping_in_noisy_data_get_their_values(seed):
+    problem, short = one_step_fit(0.03, seed)
+    longer = fitted_in_longer_windows(problem, short)
+    errors = [
+        [abs(one.parameters[name].value / TRUE[name] - 1.0) for one, name in zip(found.effects, TRUE, strict=True)]
+        for found in (short, longer)
+    ]
+    assert max(errors[1]) < 0.08 < max(errors[0])
+    for index, name in enumerate(TRUE):
+        low, high = longer.ci95(index)[name]
+        assert low < TRUE[name] < high
+
+
+def test_a_fit_to_data_without_noise_stays():
+    problem, short = one_step_fit(0.0, 0)
+    assert problem.sensor_std is None
+    assert fitted_in_longer_windows(problem, short) is short
+    np.testing.assert_allclose([short.effects[0].damping, short.effects[1].torque], list(TRUE.values()), rtol=1e-3)

@@ -1,0 +1,43 @@
+"""Fits effects again in longer windows where sensors are noisy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.trace.fit import Fit, fit
+from torchrl_h2o.residuals.trace.problem import Problem
+
+
+def fitted_in_longer_windows(problem: Problem, found: Fit, settings: LoopSettings = DEFAULTS) -> Fit:
+    """Fits effects again in longer windows, with states that are estimated with these effects.
+
+    In windows of one step, the values depend on the values with which the states were estimated. Dry friction shows
+    this: it acts where a velocity changes its sign, and the estimated states decide when that is. In longer windows,
+    the motion after the start decides.
+
+    Args:
+        problem: simulation without the effects, data and scales of the residuals.
+        found: the effects, fitted in windows of the problem's length.
+        settings: number of the fits, and length of their windows.
+
+    Returns:
+        The fit in longer windows; the given one if the sensors have no noise, if the problem's windows are as long, or
+        if the values predict the selection part no better in longer windows.
+    """
+    rules, simulation, measured = settings.longer_windows, problem.simulation, problem.measured
+    steps = min(rules.steps, int(rules.longest / simulation.control_step))
+    starts, judged = measured.fitted(steps), measured.selected_on(steps)
+    if problem.sensor_std is None or steps <= problem.horizon or not len(starts) or not len(judged):
+        return found
+
+    def posed_with(fitted: Fit) -> Problem:
+        mended = simulation.with_effects(*fitted.effects)
+        return replace(Problem.pose(mended, measured, steps, settings=problem.settings), simulation=simulation)
+
+    longer, at_first = found, posed_with(found)
+    for index in range(rules.fits):
+        posed = posed_with(longer) if index else at_first
+        longer = fit(posed, longer.effects, longer.free, starts, settings=settings.fit)
+    better = at_first.selection_loss(longer.effects) < at_first.selection_loss(found.effects)
+    return longer if better else found
