@@ -51,6 +51,11 @@ TRUTH: Mapping[str, tuple[Effect, ...]] = MappingProxyType(
             *(JointDamping(size, joint) for joint, size in zip(ARM, (4.0, 5.0, 3.0, 0.6, 0.5, 0.4), strict=True)),
             Payload(1.2, y=0.12, z=0.03, bodies="wrist_3"),
         ),
+        "linear axis": (
+            JointFrictionLoss(20.0, "carriage"),
+            JointDamping(200.0, "carriage"),
+            JointForce(-3.0, "carriage"),
+        ),
     }
 )
 #: machines with a fault that a catalogue does not have: friction that depends on the position

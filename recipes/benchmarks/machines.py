@@ -157,6 +157,10 @@ def _arm_friction(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     return -dry_friction * dry(v) - viscous * v
 
 
+def _axis(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return -20.0 * np.tanh(v / 0.001) - 200.0 * v - 3.0
+
+
 def _tool(spec: mujoco.MjSpec) -> None:
     spec.body("wrist_3").add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0.12, 0.03], size=[0.03, 0, 0], mass=1.2, contype=0, conaffinity=0
@@ -217,6 +221,17 @@ MACHINES: Mapping[str, Machine] = MappingProxyType(
             filter_time=0.004,
             change=_tool,
             torque=_arm_friction,
+        ),
+        "linear axis": Machine(
+            model="linear_axis",
+            step=0.002,
+            command=(4.0,),
+            memory=0.2,
+            hold=(60.0,),
+            brake=(2.0,),
+            encoder=(1e-6,),
+            filter_time=0.004,
+            torque=_axis,
         ),
     }
 )
