@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_h2o.data import Column, DataError, LogColumns, episodes, load, read_robot_log
-from torchrl_h2o.data.readers.observed import estimated_velocities
+from torchrl_h2o.data.readers.observed import estimated_velocities, words_of_estimates
 from torchrl_h2o.data.readers.velocity import estimate_velocity
 
 LAYOUT = LogColumns(
@@ -108,7 +108,7 @@ def test_a_log_without_velocities_is_read_with_estimates(tmp_path, log_messages)
         assert run["next", "truncated"].flatten().nonzero().flatten().tolist() == [len(run) - 1]
     (estimate,) = estimated_velocities(td, LAYOUT)
     assert (estimate.name, estimate.position, estimate.unit) == ("w", "q", "rad/s")
-    assert f"with an error of {std[0, 1]:.2g} rad/s" in estimate.words()
+    assert f"with an error of {std[0, 1]:.2g} rad/s" in words_of_estimates([estimate])
     assert any("w is estimated from q over" in message for message in log_messages)
 
 
