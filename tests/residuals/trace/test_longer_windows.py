@@ -7,17 +7,19 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import JointDamping, JointFrictionLoss
+from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.fit import fit
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.settings import LongerWindowsSettings
 
 TRUE = {"damping": 0.05, "torque": 0.12}
 
 
-def one_step_fit(noise: float, seed: int):
+def one_step_fit(noise: float, seed: int, rows: int = 1500):
     """Friction and damping, fitted in windows of one step with states that were estimated with friction alone."""
     real = pendulum().with_effects(JointFrictionLoss(TRUE["torque"]), JointDamping(TRUE["damping"]))
-    posed = Problem.pose(pendulum().with_effects(JointFrictionLoss(0.18)), recorded(real, 1500, noise=noise, seed=seed))
+    posed = Problem.pose(pendulum().with_effects(JointFrictionLoss(0.18)), recorded(real, rows, noise=noise, seed=seed))
     problem = replace(posed, simulation=pendulum())
     starts = problem.measured.fitted()
     return problem, fit(problem, (JointDamping(0.1), JointFrictionLoss(0.1)), (("damping",), ("torque",)), starts)
@@ -42,3 +44,18 @@ def test_a_fit_to_data_without_noise_stays():
     assert problem.sensor_std is None
     assert fitted_in_longer_windows(problem, short) is short
     np.testing.assert_allclose([short.effects[0].damping, short.effects[1].torque], list(TRUE.values()), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "rules",
+    [LongerWindowsSettings(longest=0.01), LongerWindowsSettings(steps=1)],
+    ids=["a control step is longer than a window may be", "the windows are as long already"],
+)
+def test_without_longer_windows_the_fit_stays(rules):
+    problem, short = one_step_fit(0.03, 0)
+    assert fitted_in_longer_windows(problem, short, replace(DEFAULTS, longer_windows=rules)) is short
+
+
+def test_too_few_longer_windows_are_not_fitted():
+    problem, short = one_step_fit(0.03, 0, rows=200)
+    assert fitted_in_longer_windows(problem, short) is short

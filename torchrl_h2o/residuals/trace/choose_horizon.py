@@ -50,9 +50,10 @@ def choose_horizon(
 def possible_horizons(simulation: Simulation, measured: Measured, rules: HorizonSettings) -> list[int]:
     """One control step and the lengths of the settings, in control steps, of which the data hold enough windows."""
     steps = sorted({1, *(round(seconds / simulation.control_step) for seconds in rules.seconds)} - {0})
-    return [horizon for horizon in steps if horizon == 1 or _enough_windows(measured, horizon, rules)]
+    return [horizon for horizon in steps if horizon == 1 or enough_windows(measured, horizon, rules)]
 
 
-def _enough_windows(measured: Measured, horizon: int, rules: HorizonSettings) -> bool:
+def enough_windows(measured: Measured, horizon: int, rules: HorizonSettings) -> bool:
+    """Whether data hold enough windows of a length, in control steps, for a fit and for a choice."""
     fitted, selected_on = measured.fitted(horizon), measured.selected_on(horizon)
     return len(fitted) >= rules.min_fitted and len(selected_on) >= rules.min_selected

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.trace.choose_horizon import enough_windows
 from torchrl_h2o.residuals.trace.fit import Fit, fit
 from torchrl_h2o.residuals.trace.problem import Problem
 
@@ -22,14 +23,14 @@ def fitted_in_longer_windows(problem: Problem, found: Fit, settings: LoopSetting
         settings: number of the fits, and length of their windows.
 
     Returns:
-        The fit in longer windows; the given one if the sensors have no noise, if the problem's windows are as long, or
-        if the values predict the selection part no better in longer windows.
+        The fit in longer windows; the given one if the sensors have no noise, if the problem's windows are as long, if
+        the data hold too few longer ones, or if the values predict the selection part no better in them.
     """
     rules, simulation, measured = settings.longer_windows, problem.simulation, problem.measured
     steps = min(rules.steps, int(rules.longest / simulation.control_step))
-    starts, judged = measured.fitted(steps), measured.selected_on(steps)
-    if problem.sensor_std is None or steps <= problem.horizon or not len(starts) or not len(judged):
+    if problem.sensor_std is None or steps <= problem.horizon or not enough_windows(measured, steps, settings.horizon):
         return found
+    starts = measured.fitted(steps)
 
     def posed_with(fitted: Fit) -> Problem:
         mended = simulation.with_effects(*fitted.effects)

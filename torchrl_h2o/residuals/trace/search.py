@@ -114,7 +114,10 @@ def _rescaled(state: SearchState) -> SearchState:
 
 
 def _fitted_to_all(state: SearchState) -> SearchState:
-    """The effects found, fitted to all windows with residuals scaled by their present size."""
+    """The effects found, fitted to all windows with residuals scaled by their present size, then in longer windows.
+
+    Alternatives and other sets keep the values of the search's windows.
+    """
     rescaled = _rescaled(state)
     fitted = rescaled.refitted(state.entries, state.fit.effects, state.windows.all)
     if state.entries:

@@ -150,7 +150,7 @@ class LongerWindowsSettings:
     fits: int = 3
     """Fits, each with states estimated with the values of the one before."""
     steps: int = 10
-    """Control steps per window."""
+    """Largest number of control steps per window."""
     longest: float = 0.2
     """Largest length of a window, in s."""
 

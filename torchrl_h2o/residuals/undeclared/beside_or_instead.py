@@ -86,9 +86,13 @@ def add_undeclared_force(
             paying.append((candidate.parts, after.mean()))
     if not paying:
         return explanation
-    chosen = by_catalogue(problem, _shortest(paying, settings), catalogue, settings)
-    found = [entry_of(part.effect, catalogue) for part in chosen if part.declared]
-    attempts = tuple(attempt for attempt in explanation.trace.attempts if attempt.entry not in found)
+    with_force = _shortest(paying, settings)
+    chosen = by_catalogue(problem, with_force, catalogue, settings)
+    if not _pays(first, before, _selection_losses(problem, chosen), parts, chosen, settings):
+        chosen = with_force
+    entries = [entry_of(part.effect, catalogue) for part in chosen if part.declared]
+    found = {entry.name for entry in entries if entry is not None}
+    attempts = tuple(attempt for attempt in explanation.trace.attempts if attempt.entry.name not in found)
     # other sets of the catalogue's effects explain less than a force beside or instead of these effects
     return replace(explanation, parts=chosen, trace=replace(explanation.trace, attempts=attempts, others=()))
 

@@ -1,7 +1,7 @@
 """Replaces a force outside the catalogue by effects of the catalogue if each of its terms is one, such as dry friction.
 
 The search for a force may accept a weak effect that the search over the catalogue rejects, because it tries fewer
-alternatives. Such a force is dry friction, not something that no list declares.
+alternatives. A force -0.06 · sign(v), for example, is dry friction.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from torchrl_h2o.residuals.trace.begin import entry_of
 from torchrl_h2o.residuals.trace.fit import fit
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
 Parts = tuple[Part, ...]
@@ -57,21 +58,22 @@ def by_catalogue(
     effects = [*(part.effect for part in known), *cast("list[Effect]", added)]
     free = [*(tuple(part.ci95) for part in known), *(tuple(effect.parameters) for effect in effects[len(known) :])]
     starts = problem.measured.fitted(problem.horizon)
+    if not is_possible(problem, effects):
+        return parts
     result = fit(problem, effects, free, starts, settings=settings.fit)
     before, after = (_losses(problem, some) for some in ([part.effect for part in parts], result.effects))
     worse = after.mean() > before.mean() / (1.0 - settings.undeclared.min_gain_over_catalogue)
     if worse and p_value_of_losses(after, before, settings.significance) < settings.significance.level:
         return parts
     result = fitted_in_longer_windows(problem, result, settings)
-    alike = [*(part.alike for part in known), *((),) * len(added)]
-    return tuple(
-        Part(effect, True, result.ci95(index), own)
-        for index, (effect, own) in enumerate(zip(result.effects, alike, strict=True))
-    )
+    # alternatives of the effects were found without the force
+    return tuple(Part(effect, True, result.ci95(index)) for index, effect in enumerate(result.effects))
 
 
 def effect_of_term(term: ForceTerm) -> Effect | None:
     """Returns the effect on a joint that a term of a force describes; None if there is none.
+
+    A positive coefficient of ``v``, ``q`` or ``sign(v)`` has none, although a model may have too much friction.
 
     Examples:
         >>> effect_of_term(ForceTerm.parse("torque on elbow: -0.06 · sign(v)")).describe()
