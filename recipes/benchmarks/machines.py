@@ -108,9 +108,9 @@ class _Sensors:
         return position, self.filtered
 
 
-def dry(velocity: np.ndarray) -> np.ndarray:
+def dry(velocity: np.ndarray, width: float = FRICTION_WIDTH) -> np.ndarray:
     """Sign of a velocity, continuous at rest."""
-    return np.tanh(velocity / FRICTION_WIDTH)
+    return np.tanh(velocity / width)
 
 
 def _cart_pole(q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -158,7 +158,7 @@ def _arm_friction(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _axis(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return -20.0 * np.tanh(v / 0.001) - 200.0 * v - 3.0
+    return -20.0 * dry(v, width=0.001) - 200.0 * v - 3.0  # a carriage is slow
 
 
 def _tool(spec: mujoco.MjSpec) -> None:

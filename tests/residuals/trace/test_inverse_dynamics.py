@@ -18,10 +18,11 @@ from torchrl_h2o.effects import (
     ObservationDelay,
     Payload,
 )
+from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import StateMap, trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS
-from torchrl_h2o.residuals.trace.begin import begin_anew, entry_of
+from torchrl_h2o.residuals.trace.begin import begin_anew
 from torchrl_h2o.residuals.trace.inverse_dynamics import _rows, propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible

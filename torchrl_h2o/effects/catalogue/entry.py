@@ -1,7 +1,7 @@
 """An entry of a catalogue: a candidate effect with initial values for its fit."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from torchrl_h2o.effects.effect import Effect
@@ -57,6 +57,12 @@ class CatalogueEntry:
     def starts(self) -> tuple[Effect, ...]:
         """The effect with the values of each trial."""
         return tuple(self.effect.with_parameters(trial) for trial in self.trials)
+
+
+def entry_of(effect: Effect, catalogue: Sequence[CatalogueEntry]) -> CatalogueEntry | None:
+    """The entry with the same effect at its neutral value; None if the catalogue has none."""
+    neutral = effect.with_parameters({name: p.neutral for name, p in effect.parameters.items()})
+    return next((entry for entry in catalogue if entry.effect == neutral), None)
 
 
 def entries_of(

@@ -13,7 +13,7 @@ from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.outcome import Attempt
-from torchrl_h2o.residuals.trace.problem import losses, matters
+from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import (
     Lead,
     are_possible_alone,
@@ -192,10 +192,9 @@ def sketched_set(state: SearchState, start: Sequence[Effect], added: Sequence[Le
 def _remember(state: SearchState, sketches: Sequence[Sketch]) -> SearchState:
     """Records what single entries explain in addition to the effects found, for the report."""
     problem, present, attempts = state.problem, state.fit.effects, dict(state.attempts)
-    judged = problem.measured.selected_on(problem.horizon)
-    before = losses(problem.residual(present, judged))
+    before = problem.selection_losses(present)
     for (lead,), sketch in sketches:
-        after = losses(problem.residual(sketch.effects, judged))
+        after = problem.selection_losses(sketch.effects)
         p = state.p_value(before, after)
         attempts[lead.entry.name] = Attempt(lead.entry, sketch, len(present), float(after.mean()), p)
     return replace(state, attempts=attempts)

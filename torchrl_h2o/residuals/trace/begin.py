@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
@@ -145,9 +146,3 @@ def _explains_motion(state: SearchState) -> bool:
     mended = state.first.simulation.with_effects(*state.fit.effects)
     errors = errors_ahead(mended, state.first.measured, Split.SELECTION, state.settings)
     return explains_motion(errors, state.settings.verdict.better_than_guess)
-
-
-def entry_of(effect: Effect, catalogue: Sequence[CatalogueEntry]) -> CatalogueEntry | None:
-    """The entry with the same effect at its neutral value; None if the catalogue has none."""
-    neutral = effect.with_parameters({name: p.neutral for name, p in effect.parameters.items()})
-    return next((entry for entry in catalogue if entry.effect == neutral), None)

@@ -36,9 +36,9 @@ def fitted_in_longer_windows(problem: Problem, found: Fit, settings: LoopSetting
         mended = simulation.with_effects(*fitted.effects)
         return replace(Problem.pose(mended, measured, steps, settings=problem.settings), simulation=simulation)
 
-    longer, at_first = found, posed_with(found)
-    for index in range(rules.fits):
-        posed = posed_with(longer) if index else at_first
-        longer = fit(posed, longer.effects, longer.free, starts, settings=settings.fit)
+    at_first = posed_with(found)
+    longer = fit(at_first, found.effects, found.free, starts, settings=settings.fit)
+    for _ in range(rules.fits - 1):
+        longer = fit(posed_with(longer), longer.effects, longer.free, starts, settings=settings.fit)
     better = at_first.selection_loss(longer.effects) < at_first.selection_loss(found.effects)
     return longer if better else found

@@ -8,14 +8,14 @@ from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry, ResidualForce
+from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
+from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals.explanation import Explanation, Part
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise, stand_in
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.begin import entry_of
-from torchrl_h2o.residuals.trace.problem import Problem, losses, matters
+from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 from torchrl_h2o.residuals.undeclared.by_catalogue import by_catalogue
 from torchrl_h2o.residuals.undeclared.find_force import Undeclared, find_undeclared
@@ -77,10 +77,10 @@ def add_undeclared_force(
         return explanation
     compared = [parts, *(candidate.parts for candidate in candidates)]
     problem = _with_least_noise(simulation, measured, compared, horizon, settings)
-    before = _selection_losses(problem, parts)
+    before = problem.selection_losses(_effects_of(parts))
     paying = []
     for candidate in candidates:
-        after = _selection_losses(problem, candidate.parts)
+        after = problem.selection_losses(_effects_of(candidate.parts))
         pays = _pays(first, before, after, parts, candidate.parts, settings)
         if pays and _beyond_noise(candidate, measured, horizon, rng, settings):
             paying.append((candidate.parts, after.mean()))
@@ -88,7 +88,7 @@ def add_undeclared_force(
         return explanation
     with_force = _shortest(paying, settings)
     chosen = by_catalogue(problem, with_force, catalogue, settings)
-    if not _pays(first, before, _selection_losses(problem, chosen), parts, chosen, settings):
+    if not _pays(first, before, problem.selection_losses(_effects_of(chosen)), parts, chosen, settings):
         chosen = with_force
     entries = [entry_of(part.effect, catalogue) for part in chosen if part.declared]
     found = {entry.name for entry in entries if entry is not None}
@@ -129,12 +129,12 @@ def _beside(
     candidate = (*parts, Part(force.effect, False, force.ci95))
     if not parts:
         return candidate
-    mended = simulation.with_effects(*(part.effect for part in parts))
+    mended = simulation.with_effects(*_effects_of(parts))
     posed = Problem.pose(mended, measured, horizon, settings=settings.residual)
     needed = needed_parts(replace(posed, simulation=simulation), explanation.trace, candidate, settings)
     known = needed[:-1]
     again = find_undeclared(
-        simulation.with_effects(*(part.effect for part in known)), measured, horizon, settings=settings
+        simulation.with_effects(*_effects_of(known)), measured, horizon, settings=settings
     )  # the new search omits terms that have become redundant
     return needed if again is None else (*known, Part(again.effect, False, again.ci95))
 
@@ -147,7 +147,7 @@ def _with_least_noise(
     What one explanation treats as sensor noise, another may explain as a force. Start states that are filtered with the
     first explanation would favour it.
     """
-    mended = [simulation.with_effects(*(part.effect for part in parts)) for parts in explanations]
+    mended = [simulation.with_effects(*_effects_of(parts)) for parts in explanations]
     spread = np.maximum(measured.observation.std(0), 1e-12)
 
     def noise(candidate: Simulation) -> float:
@@ -158,9 +158,8 @@ def _with_least_noise(
     return replace(posed, simulation=simulation)
 
 
-def _selection_losses(problem: Problem, parts: Parts) -> np.ndarray:
-    judged = problem.measured.selected_on(problem.horizon)
-    return losses(problem.residual([part.effect for part in parts], judged))
+def _effects_of(parts: Parts) -> list[Effect]:
+    return [part.effect for part in parts]
 
 
 def _pays(
@@ -171,7 +170,7 @@ def _pays(
     gains = after.mean() < (1.0 - rules.min_gain_over_catalogue) * before.mean()
     if not (gains and p_value_of_losses(before, after, test) < test.level):
         return False
-    none, present, proposed = (first.selection_loss([part.effect for part in some]) for some in ((), parts, candidate))
+    none, present, proposed = (first.selection_loss(_effects_of(some)) for some in ((), parts, candidate))
     return matters(none, present, proposed, rules.min_share)
 
 

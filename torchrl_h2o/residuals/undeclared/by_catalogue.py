@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import cast
 
-import numpy as np
-
 from torchrl_h2o.effects import (
     CatalogueEntry,
     Effect,
@@ -20,13 +18,13 @@ from torchrl_h2o.effects import (
     JointSpring,
     ResidualForce,
 )
+from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.force.term import ForceTerm
 from torchrl_h2o.residuals.explanation import Part
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
-from torchrl_h2o.residuals.trace.begin import entry_of
 from torchrl_h2o.residuals.trace.fit import fit
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
-from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
@@ -61,7 +59,7 @@ def by_catalogue(
     if not is_possible(problem, effects):
         return parts
     result = fit(problem, effects, free, starts, settings=settings.fit)
-    before, after = (_losses(problem, some) for some in ([part.effect for part in parts], result.effects))
+    before, after = (problem.selection_losses(some) for some in ([part.effect for part in parts], result.effects))
     worse = after.mean() > before.mean() / (1.0 - settings.undeclared.min_gain_over_catalogue)
     if worse and p_value_of_losses(after, before, settings.significance) < settings.significance.level:
         return parts
@@ -84,15 +82,7 @@ def effect_of_term(term: ForceTerm) -> Effect | None:
     factors = " · ".join(map(str, term.factors))
     if factors == "":
         return JointForce(term.coefficient, joints=term.joint)
-    resisting = {
-        "sign(v)": lambda size: JointFrictionLoss(size, joints=term.joint),
-        "v": lambda size: JointDamping(size, joints=term.joint),
-        "q": lambda size: JointSpring(size, joints=term.joint),
-    }
-    if factors not in resisting or term.coefficient >= 0.0:
+    resistance = {"sign(v)": JointFrictionLoss, "v": JointDamping, "q": JointSpring}
+    if factors not in resistance or term.coefficient >= 0.0:
         return None
-    return resisting[factors](-term.coefficient)
-
-
-def _losses(problem: Problem, effects: Sequence[Effect]) -> np.ndarray:
-    return losses(problem.residual(effects, problem.measured.selected_on(problem.horizon)))
+    return resistance[factors](-term.coefficient, joints=term.joint)

@@ -10,7 +10,7 @@ from torchrl_h2o.residuals.explanation import Part
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.trace.fit import fit
 from torchrl_h2o.residuals.trace.outcome import Trace
-from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
@@ -54,4 +54,4 @@ def _refitted(
         Part(effect, parts[i].declared, result.ci95(position), parts[i].alike)
         for position, (i, effect) in enumerate(zip(chosen, result.effects, strict=True))
     )
-    return refitted, losses(problem.residual(result.effects, problem.measured.selected_on(problem.horizon)))
+    return refitted, problem.selection_losses(result.effects)
