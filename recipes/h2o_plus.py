@@ -88,7 +88,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     # Environments: to collect, to evaluate during training, and for the evaluation at the end
     simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
     evaluator = evaluator_of(cfg, task, preprocessing)  # in reality; with overlap=true, beside the next updates
-    trials = task.make_simulator(cfg.eval_episodes, preprocessing) if keeps_best(cfg) else None
+    trials = task.make_simulator(cfg.trial_episodes, preprocessing) if keeps_best(cfg) else None
     final_reality = task.make_reality(cfg.final_episodes, preprocessing)
     final_simulator = task.make_simulator(1, preprocessing)
     observation_dim = final_reality.observation_spec["observation"].shape[-1]
@@ -126,7 +126,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     parts |= {"replay": replay, "episodes": episodes}
     best = None
     if trials is not None:
-        best = BestPolicy(actor, trials, cfg.eval_episodes)
+        best = BestPolicy(actor, trials, cfg.trial_episodes)
         parts["policy"] = best.policy
     training = Training("H2O+", folder, budget, **parts)
     setup_s = time.perf_counter() - start

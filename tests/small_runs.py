@@ -21,6 +21,7 @@ SMALL = [
     "eval_every=1",
     "checkpoint_every=1",
     "eval_episodes=1",
+    "trial_episodes=1",
     "final_episodes=1",
     "num_cells=[8,8]",
     "batch_size=[8,8]",

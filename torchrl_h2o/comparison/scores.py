@@ -57,7 +57,7 @@ class Cell:
 #: columns in which the variants of H2O+ differ in the ablations, and their labels in tables
 VARIANTS = {"backbone": "", "mixing": "λ", "ratio": "ratio"}
 #: overrides that change how often a policy is evaluated during training, and nothing in the last policy
-EVALUATION = ("eval_every=", "eval_episodes=")
+EVALUATION = ("eval_every=", "eval_episodes=", "trial_episodes=")
 
 
 def task_of(row: Row) -> Task:

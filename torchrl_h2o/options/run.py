@@ -134,6 +134,7 @@ class ExperimentOptions(Options):
     eval_episodes: Count
     overlap: bool = False
     keep: Literal["last", "best_in_simulator"]
+    trial_episodes: Count = 10
     final_episodes: Count
     checkpoint_every: Count
     render: bool

@@ -92,6 +92,8 @@ def load_config(
             raise DataError(f"the entry is {value!r}, not a {kind.__name__}", _REMEDY, source=saved, column=name)
     require_known_targets(cfg, saved, trust=trust, typed=typed)
     cfg.update({name: value for name, value in ADDED.items() if name not in entries})
+    if "trial_episodes" not in entries:  # earlier versions had one number for both
+        cfg.trial_episodes = cfg.get("eval_episodes", 1)
     return cfg
 
 

@@ -1,4 +1,4 @@
-"""A search that begins with known effects, such as those of an unfinished run, or anew without noise."""
+"""A search that begins with known effects, or anew: without noise, or in longer windows."""
 
 from dataclasses import replace
 
@@ -71,15 +71,33 @@ def test_a_gain_that_was_taken_for_noise_is_found_by_a_search_without_noise(gain
         )
 
 
-@pytest.mark.parametrize(("also", "exact"), [((), True), ((JointDamping(0.1),), False)])
-def test_a_search_without_noise_counts_if_it_explains_everything(also, exact):
-    """With damping that the catalogue lacks it does not, and the first search stays."""
-    state, seen = with_gravity_found(1.3, 0.0, *also), []
+def from_another_beginning(state, catalogue):
+    seen = []
     with LoopBar(disable=True) as bar:
-        after = _from_another_beginning(state, [GRAVITY, GAIN], np.random.default_rng(0), bar, seen.append)
-    assert after.exact is exact
-    assert (after is state) is not exact
-    assert [one.exact for one in seen] == [True] * exact
+        return _from_another_beginning(state, catalogue, np.random.default_rng(0), bar, seen.append), seen
+
+
+def test_a_search_without_noise_counts_if_it_explains_everything():
+    state = with_gravity_found(1.3, 0.0)
+    after, seen = from_another_beginning(state, [GRAVITY, GAIN])
+    assert after.exact
+    assert seen == [after]
+
+
+def test_where_it_does_not_longer_windows_show_the_gain_beside_damping_that_the_catalogue_lacks():
+    state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
+    after, seen = from_another_beginning(state, [GRAVITY, GAIN])
+    assert seen == [after]
+    assert not after.exact
+    assert after.problem.horizon == 10 > state.problem.horizon
+    assert {type(effect) for effect in after.fit.effects} == {Gravity, ObservationGain}
+
+
+def test_a_search_in_longer_windows_that_finds_the_same_effects_does_not_count():
+    state = with_gravity_found(1.0, 0.01)
+    after, seen = from_another_beginning(state, [GRAVITY])
+    assert after is state
+    assert not seen
 
 
 def test_estimated_velocities_have_noise():

@@ -1,4 +1,4 @@
-"""The last fit in noisy data uses windows of several steps."""
+"""In noisy data, the search and its last fit use windows of several steps."""
 
 from dataclasses import replace
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import JointDamping, JointFrictionLoss
+from torchrl_h2o.effects import CatalogueEntry, JointDamping, JointFrictionLoss, ObservationDelay
+from torchrl_h2o.residuals import trace_effects
+from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.fit import fit
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
@@ -14,6 +16,11 @@ from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.settings import LongerWindowsSettings
 
 TRUE = {"damping": 0.05, "torque": 0.12}
+CATALOGUE = (
+    CatalogueEntry(JointDamping(), ({"damping": 0.01}, {"damping": 0.1})),
+    CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1})),
+    CatalogueEntry(ObservationDelay(entries=(1,)), ({"delay": 0.002},)),
+)
 
 
 def one_step_fit(noise: float, seed: int, rows: int = 1500):
@@ -37,6 +44,21 @@ def test_friction_and_damping_in_noisy_data_get_their_values(seed):
     for index, name in enumerate(TRUE):
         low, high = longer.ci95(index)[name]
         assert low < TRUE[name] < high
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2])
+def test_the_search_finds_friction_and_damping_in_noisy_data(seed):
+    """In windows of one step it finds a late velocity sensor as well (seed 0), or friction of 0.185 N·m alone (2)."""
+    real = pendulum().with_effects(JointFrictionLoss(TRUE["torque"]), JointDamping(TRUE["damping"]))
+    measured = recorded(real, noise=0.03, seed=seed)
+    with LoopBar(disable=True) as bar:
+        trace = trace_effects(pendulum(), measured, CATALOGUE, rng=np.random.default_rng(0), progress=bar)
+    found = {type(effect): effect for effect in trace.fit.effects}
+    assert found.keys() == {JointDamping, JointFrictionLoss}
+    assert found[JointDamping].damping == pytest.approx(TRUE["damping"], rel=0.05)
+    assert found[JointFrictionLoss].torque == pytest.approx(TRUE["torque"], rel=0.05)
+    assert trace.horizon == 10
 
 
 def test_a_fit_to_data_without_noise_stays():

@@ -1,4 +1,8 @@
-"""Begins a search with known effects, or anew: where the effects found only keep the joints still, or without noise."""
+"""Begins a search with known effects, or another search after the first one.
+
+Another search has windows and effects of its own if the first one explains no motion; it has no sensor noise if one
+more effect explains most of what was taken for noise; or it has longer windows where sensors are noisy.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +21,7 @@ from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
+from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -130,6 +135,34 @@ def begin_noise_free(
     if refitted > to_beat and _loss_with_one_more(silent, advance) > to_beat:
         return None
     return _with_rivals(silent, advance)
+
+
+def begin_in_longer_windows(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
+) -> SearchState | None:
+    """Begins another search in longer windows, from the effects found, where sensors are noisy.
+
+    Two effects that look alike in one step differ in longer windows. In one step, dry friction that is fitted too high
+    may explain viscous friction as well, because the noise of the start states hides when the joint turns around.
+
+    Args:
+        state: what the search in shorter windows has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+        progress: bar that shows how far the search is.
+
+    Returns:
+        The state with the same effects, refitted in longer windows; None if nothing was found, or
+        :func:`~torchrl_h2o.residuals.trace.longer_windows.longer_windows` has no longer ones.
+    """
+    steps = longer_windows(state.problem, state.settings)
+    if state.exact or not state.entries or steps is None:
+        return None
+    problem = Problem.pose(state.first.simulation, state.first.measured, steps, settings=state.settings.residual)
+    longer = SearchState.begin(problem, catalogue, rng, state.settings)
+    longer = longer.rescaled(longer.posed_at(state.fit.effects))
+    longer = longer.with_found(state.entries, longer.refitted(state.entries, state.fit.effects))
+    return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(state.entries))))
 
 
 def _loss_with_one_more(state: SearchState, advance: Callable[[], object]) -> float:

@@ -1,4 +1,4 @@
-"""Fits effects again in longer windows where sensors are noisy."""
+"""Longer windows where sensors are noisy: their length, and the last fit of the effects found."""
 
 from __future__ import annotations
 
@@ -8,6 +8,24 @@ from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.trace.choose_horizon import enough_windows
 from torchrl_h2o.residuals.trace.fit import Fit, fit
 from torchrl_h2o.residuals.trace.problem import Problem
+
+
+def longer_windows(problem: Problem, settings: LoopSettings = DEFAULTS) -> int | None:
+    """Length of the longer windows, in control steps.
+
+    Args:
+        problem: simulation, data and windows of the search.
+        settings: the largest length of a window, and the number of windows that the data must hold.
+
+    Returns:
+        The length; None if the sensors have no noise, if the problem's windows are as long, or if the data hold too few
+        longer ones.
+    """
+    rules = settings.longer_windows
+    steps = min(rules.steps, int(rules.longest / problem.simulation.control_step))
+    if problem.sensor_std is None or steps <= problem.horizon:
+        return None
+    return steps if enough_windows(problem.measured, steps, settings.horizon) else None
 
 
 def fitted_in_longer_windows(problem: Problem, found: Fit, settings: LoopSettings = DEFAULTS) -> Fit:
@@ -23,12 +41,11 @@ def fitted_in_longer_windows(problem: Problem, found: Fit, settings: LoopSetting
         settings: number of the fits, and length of their windows.
 
     Returns:
-        The fit in longer windows; the given one if the sensors have no noise, if the problem's windows are as long, if
-        the data hold too few longer ones, or if the values predict the selection part no better in them.
+        The fit in longer windows; the given one if there are no longer windows, or if the values predict the selection
+        part no better in them.
     """
     rules, simulation, measured = settings.longer_windows, problem.simulation, problem.measured
-    steps = min(rules.steps, int(rules.longest / simulation.control_step))
-    if problem.sensor_std is None or steps <= problem.horizon or not enough_windows(measured, steps, settings.horizon):
+    if (steps := longer_windows(problem, settings)) is None:
         return found
     starts = measured.fitted(steps)
 

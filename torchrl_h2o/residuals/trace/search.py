@@ -12,7 +12,12 @@ from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.begin import begin_anew, begin_noise_free, begin_with
+from torchrl_h2o.residuals.trace.begin import (
+    begin_anew,
+    begin_in_longer_windows,
+    begin_noise_free,
+    begin_with,
+)
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.grow import grow
@@ -102,11 +107,29 @@ def _from_another_beginning(
         found(grown)
         return grown
     progress.show_found(state.entries)
-    other = begin_anew(state, catalogue, rng, progress)
-    if other is None:
+    if (other := begin_anew(state, catalogue, rng, progress)) is not None:
+        found(other)
+        return grow(other, rng, progress, found)
+    return _from_longer_windows(state, catalogue, rng, progress, found)
+
+
+def _from_longer_windows(
+    state: SearchState,
+    catalogue: Sequence[CatalogueEntry],
+    rng: np.random.Generator,
+    progress: LoopBar,
+    found: Callable[[SearchState], object],
+) -> SearchState:
+    """What a search in longer windows finds, if it finds other effects than the first one."""
+    longer = begin_in_longer_windows(state, catalogue, rng, progress)
+    if longer is None:
         return state
-    found(other)
-    return grow(other, rng, progress, found)
+    grown = grow(longer, rng, progress)
+    progress.show_found(state.entries)
+    if {entry.name for entry in grown.entries} == {entry.name for entry in state.entries}:
+        return state
+    found(grown)
+    return grown
 
 
 def _rescaled(state: SearchState) -> SearchState:
