@@ -63,9 +63,12 @@ def test_the_loop_of_the_recipe_reaches_the_numbers_of_the_loop_of_train(command
 
 @pytest.mark.slow
 def test_a_population_is_trained_by_its_lists_of_options(command, tmp_path):
-    printed = run(command(*SMALL, *ROBOT, "seeds=[0,1]", "hydra.run.dir=out", script="train.py"))
+    small = [*SMALL, *ROBOT, "seeds=[0,1]", "keep=best_in_simulator", "hydra.run.dir=out"]
+    printed = run(command(*small, script="train.py"))
     assert all(name in printed for name in ("seed_0", "seed_1"))
-    assert (tmp_path / "out" / "seed_1" / "summary.json").exists()
+    trials = {name: json.loads((tmp_path / "out" / name / "summary.json").read_text())["return_trial"]
+              for name in ("seed_0", "seed_1")}  # fmt: skip
+    assert f"use        {max(trials, key=lambda name: trials[name])}, the best in the simulator" in printed
 
 
 @pytest.mark.slow

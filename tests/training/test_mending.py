@@ -323,6 +323,15 @@ def test_the_end_of_a_run_shows_what_was_found_and_then_the_returns(tmp_path):
     assert table.count("Your simulator lacks") == 1
 
 
+def test_a_population_names_the_member_that_was_best_in_the_simulator(tmp_path):
+    result = Evaluation([1.0], [10])
+    of_each = {"seed_0": result, "seed_1": result, "seed_2": None}
+    assert "use " not in table_of_population(of_each, tmp_path, 0.1, {"seed_0": None, "seed_1": None})
+    table = table_of_population(of_each, tmp_path, 0.1, {"seed_0": 10.0, "seed_1": 20.0})
+    assert "use        seed_1, the best in the simulator: 20" in table
+    assert table.endswith("/seed_1")
+
+
 @pytest.mark.slow
 def test_a_posterior_run_collects_in_its_draws_and_is_resumed_and_evaluated_like_any_other(command, tmp_path):
     out = tmp_path / "out"

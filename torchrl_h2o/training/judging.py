@@ -8,10 +8,11 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -28,6 +29,7 @@ from torchrl_h2o.whole_file import write_text
 
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 DATA = "the data's behaviour"
+NO_TRIALS: Mapping[str, float | None] = MappingProxyType({})
 
 
 def judge(
@@ -79,6 +81,7 @@ def judge(
             "updates": trainings[main].updates,
             "return_real": in_reality[main].summary() | observed,
             "return_sim": in_simulator.summary(),
+            "return_trial": best_trial(trainings[main].rows),
             "return_data": behaviour.summary(),
             "baselines": {name: in_reality[name].summary() for name in policies if name != main},
             "updates_per_second": trainings[main].updates_per_second,
@@ -86,6 +89,19 @@ def judge(
         },
     )
     return in_reality | {DATA: behaviour}
+
+
+def best_trial(rows: Iterable[Mapping[str, Any]]) -> float | None:
+    """Returns the mean return in the simulator by which ``keep=best_in_simulator`` chose the policy; else None.
+
+    Args:
+        rows: metrics of a training.
+
+    Examples:
+        >>> best_trial([{"updates": 1000, "return_sim": 20.0}, {"updates": 2000, "return_sim": 10.0}])
+        20.0
+    """
+    return max((row["return_sim"] for row in rows if "return_sim" in row), default=None)
 
 
 def write_failure(directory: Path, failure: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
@@ -159,14 +175,29 @@ def table_of_run(
     return "\n".join(lines)
 
 
-def table_of_population(in_reality: Mapping[str, Evaluation | None], directory: Path, seconds_per_step: float) -> str:
-    """Format the same table for a population, one line per member; None stands for a member that failed."""
+def table_of_population(
+    in_reality: Mapping[str, Evaluation | None],
+    directory: Path,
+    seconds_per_step: float,
+    trials: Mapping[str, float | None] = NO_TRIALS,
+) -> str:
+    """Format the same table for a population, one line per member, and the member to use.
+
+    Args:
+        in_reality: evaluations by the name of the member; None stands for a member that failed.
+        directory: the population's folder.
+        seconds_per_step: control step, in s.
+        trials: by member, the value of :func:`best_trial`. The member with the highest one is the one to use.
+    """
     folder = os.path.relpath(directory)
+    tried = {name: value for name, value in trials.items() if value is not None}
+    best = max(tried, key=lambda name: tried[name], default=None)
     lines = [
         *lines_of_mending([directory / name for name in in_reality]),
         *_lines(in_reality, seconds_per_step),
         f"\nresults    {folder}/*/summary.json, metrics.csv, learning_curve.png",
-        f"replay     python recipes/evaluate.py checkpoint={folder}/{next(iter(in_reality))}",
+        *([] if best is None else [f"use        {best}, the best in the simulator: {tried[best]:.0f}"]),
+        f"replay     python recipes/evaluate.py checkpoint={folder}/{best or next(iter(in_reality))}",
     ]
     return "\n".join(lines)
 

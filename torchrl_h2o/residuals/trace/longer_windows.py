@@ -15,14 +15,14 @@ def longer_windows(problem: Problem, settings: LoopSettings = DEFAULTS) -> int |
 
     Args:
         problem: simulation, data and windows of the search.
-        settings: the largest length of a window, and the number of windows that the data must hold.
+        settings: bounds of a window's length, and the number of windows that the data must hold.
 
     Returns:
         The length; None if the sensors have no noise, if the problem's windows are as long, or if the data hold too few
         longer ones.
     """
-    rules = settings.longer_windows
-    steps = min(rules.steps, int(rules.longest / problem.simulation.control_step))
+    rules, control_step = settings.longer_windows, problem.simulation.control_step
+    steps = min(max(rules.steps, round(rules.seconds / control_step)), int(rules.longest / control_step))
     if problem.sensor_std is None or steps <= problem.horizon:
         return None
     return steps if enough_windows(problem.measured, steps, settings.horizon) else None

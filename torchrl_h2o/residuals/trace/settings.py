@@ -145,14 +145,16 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class LongerWindowsSettings:
-    """The last fit where sensors are noisy, in windows that are longer than those of the search."""
+    """Longer windows where sensors are noisy: a second search, and the last fit."""
 
     fits: int = 3
     """Fits, each with states estimated with the values of the one before."""
     steps: int = 10
-    """Largest number of control steps per window."""
+    """Smallest number of control steps per window."""
+    seconds: float = 0.1
+    """Smallest length of a window, in s."""
     longest: float = 0.2
-    """Largest length of a window, in s."""
+    """Largest length of a window, in s; it may have fewer control steps then."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from tqdm import tqdm
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.job import prepare
-from torchrl_h2o.training.judging import DATA, judge, run_settings, table_of_population, write_failure
+from torchrl_h2o.training.judging import DATA, best_trial, judge, run_settings, table_of_population, write_failure
 from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.methods.h2o_plus import make_learner
 from torchrl_h2o.training.populations.loop import members_of, train_population
@@ -59,7 +59,9 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
             wall_s=wall_s + outcome.seconds,
             preprocessing=preprocessing,
         )["H2O+"]
-    tqdm.write(table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step))
+    trials = {name: best_trial(outcome.rows) for name, outcome in outcomes.items() if outcome.failure is None}
+    table = table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step, trials)
+    tqdm.write(table)
     failures = {name: outcome.failure for name, outcome in outcomes.items() if outcome.failure is not None}
     if failures:
         which = ", ".join(f"{name} after {one['updates']:,} updates ({one['why']})" for name, one in failures.items())
