@@ -65,10 +65,16 @@ def test_the_loop_of_the_recipe_reaches_the_numbers_of_the_loop_of_train(command
 def test_a_population_is_trained_by_its_lists_of_options(command, tmp_path):
     small = [*SMALL, *ROBOT, "seeds=[0,1]", "keep=best_in_simulator", "hydra.run.dir=out"]
     printed = run(command(*small, script="train.py"))
-    assert all(name in printed for name in ("seed_0", "seed_1"))
     trials = {name: json.loads((tmp_path / "out" / name / "summary.json").read_text())["return_trial"]
               for name in ("seed_0", "seed_1")}  # fmt: skip
+    assert all(name in printed for name in trials)
     assert f"use        {max(trials, key=lambda name: trials[name])}, the best in the simulator" in printed
+
+
+@pytest.mark.slow
+def test_members_with_different_simulators_are_not_compared_in_them(command, tmp_path):
+    small = [*SMALL, *ROBOT, "gaps=[null,gravity]", "keep=best_in_simulator", "hydra.run.dir=out"]
+    assert "the best in the simulator" not in run(command(*small, script="train.py"))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ OF_THE_CALL = {"resume", "trust"}  # read from the command line alone
 
 
 def test_a_folder_of_the_first_version_has_every_option_with_what_that_version_did(compose, tmp_path):
-    cfg, _ = compose(config="h2o_plus")
+    cfg, _ = compose("eval_episodes=3", config="h2o_plus")
     later = set(cfg) - FIRST - OF_THE_CALL
     with open_dict(cfg):
         for name in later | OF_THE_CALL:
@@ -27,6 +27,7 @@ def test_a_folder_of_the_first_version_has_every_option_with_what_that_version_d
     told = {"action_history": 0, "compiled": False, "data_seconds": None, "n_steps": 1, "layer_norm": False,
             "num_worlds": 1, "keep": "last", "ratio_estimator": "paper", "sim_capacity_min": 1}  # fmt: skip
     assert {name: loaded[name] for name in told} == told
+    assert loaded.trial_episodes == loaded.eval_episodes == 3
     assert {name: loaded[name] for name in FIRST} == {name: cfg[name] for name in FIRST}
     check_options(loaded, RunOptions)
 

@@ -38,7 +38,7 @@ def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
 def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
     cfg, real = compose("updates=100", "keep=best_in_simulator", "trial_episodes=2", "lr=0.01", "seed=2")
     policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
-    promised = [row["return_sim"] for row in training.rows]
+    promised = [row["return_trial"] for row in training.rows]
     assert max(promised) > promised[-1]
     for handed_over in (policy, load_policy(cfg, tmp_path / "whole")):
         assert evaluate(make_simulator(cfg, 2), handed_over, 2, TRIAL_SEED).mean == max(promised)

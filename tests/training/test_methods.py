@@ -170,7 +170,7 @@ def test_a_method_that_learns_from_real_data_alone_has_no_simulator(compose, tmp
     monkeypatch.delattr(HybridReplayBuffer, "extend")
     monkeypatch.delattr("torchrl_h2o.training.task.Task.make_simulator")
     policy, training = train(METHODS[name], cfg, real, tmp_path)
-    assert "return_sim" not in training.rows[-1]
+    assert "return_trial" not in training.rows[-1]
     kept = load_policy(cfg, tmp_path, METHODS[name].title)
     torch.testing.assert_close(kept.state_dict(), policy.state_dict())
 

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -29,7 +28,6 @@ from torchrl_h2o.whole_file import write_text
 
 PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 DATA = "the data's behaviour"
-NO_TRIALS: Mapping[str, float | None] = MappingProxyType({})
 
 
 def judge(
@@ -92,16 +90,21 @@ def judge(
 
 
 def best_trial(rows: Iterable[Mapping[str, Any]]) -> float | None:
-    """Returns the mean return in the simulator by which ``keep=best_in_simulator`` chose the policy; else None.
+    """Returns the highest mean return in the simulator, by which ``keep=best_in_simulator`` chose the policy.
+
+    It is the highest of several means, so it is on average above the policy's expected return there.
 
     Args:
         rows: metrics of a training.
 
+    Returns:
+        The return; None with ``keep=last``.
+
     Examples:
-        >>> best_trial([{"updates": 1000, "return_sim": 20.0}, {"updates": 2000, "return_sim": 10.0}])
+        >>> best_trial([{"updates": 1000, "return_trial": 20.0}, {"updates": 2000, "return_trial": 10.0}])
         20.0
     """
-    return max((row["return_sim"] for row in rows if "return_sim" in row), default=None)
+    return max((row["return_trial"] for row in rows if "return_trial" in row), default=None)
 
 
 def write_failure(directory: Path, failure: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
@@ -179,7 +182,7 @@ def table_of_population(
     in_reality: Mapping[str, Evaluation | None],
     directory: Path,
     seconds_per_step: float,
-    trials: Mapping[str, float | None] = NO_TRIALS,
+    trials: Mapping[str, float | None] | None = None,
 ) -> str:
     """Format the same table for a population, one line per member, and the member to use.
 
@@ -187,10 +190,11 @@ def table_of_population(
         in_reality: evaluations by the name of the member; None stands for a member that failed.
         directory: the population's folder.
         seconds_per_step: control step, in s.
-        trials: by member, the value of :func:`best_trial`. The member with the highest one is the one to use.
+        trials: by member, the value of :func:`best_trial`. The member with the highest one is the one to use. None if
+            there are none, or if the members have different simulators.
     """
     folder = os.path.relpath(directory)
-    tried = {name: value for name, value in trials.items() if value is not None}
+    tried = {name: value for name, value in (trials or {}).items() if value is not None}
     best = max(tried, key=lambda name: tried[name], default=None)
     lines = [
         *lines_of_mending([directory / name for name in in_reality]),

@@ -156,12 +156,12 @@ class BestPolicy:
 
         Args:
             actor: the policy with its current parameters.
-            rows: metrics of the earlier evaluations, with ``return_sim``.
+            rows: metrics of the earlier evaluations, with ``return_trial``; those of versions before it are left out.
 
         Returns:
-            The mean return, as ``return_sim``.
+            The mean return, as ``return_trial``.
         """
-        return_sim = evaluate(self.simulator, actor, self.episodes, TRIAL_SEED).mean
-        if return_sim >= max((row["return_sim"] for row in rows), default=-inf):
+        return_trial = evaluate(self.simulator, actor, self.episodes, TRIAL_SEED).mean
+        if return_trial >= max((row["return_trial"] for row in rows if "return_trial" in row), default=-inf):
             self.policy.load_state_dict(actor.state_dict())
-        return {"return_sim": return_sim}
+        return {"return_trial": return_trial}

@@ -9,9 +9,10 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, ObservationGain
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.begin import begin_noise_free
+from torchrl_h2o.residuals.trace.begin import begin_in_longer_windows, begin_noise_free, begin_with
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import grow
+from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.search import _from_another_beginning
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -89,15 +90,39 @@ def test_where_it_does_not_longer_windows_show_the_gain_beside_damping_that_the_
     after, seen = from_another_beginning(state, [GRAVITY, GAIN])
     assert seen == [after]
     assert not after.exact
-    assert after.problem.horizon == 10 > state.problem.horizon
+    assert after.problem.horizon == 10
+    assert after.chosen_horizon == state.problem.horizon == 5
     assert {type(effect) for effect in after.fit.effects} == {Gravity, ObservationGain}
 
 
 def test_a_search_in_longer_windows_that_finds_the_same_effects_does_not_count():
     state = with_gravity_found(1.0, 0.01)
+    assert longer_windows(state.problem) == 10
     after, seen = from_another_beginning(state, [GRAVITY])
     assert after is state
     assert not seen
+
+
+def test_a_search_begins_with_effects_of_which_the_model_rejects_some_without_the_others():
+    """The joint has damping of 0.1, so -0.08 twice needs the + 0.1 of the third effect."""
+    known = [JointDamping(size, joints) for size, joints in ((0.1, "elbow"), (-0.08, "*"), (-0.08, "elb*"))]
+    entries = [CatalogueEntry(JointDamping(joints=one.joints), ({"damping": 0.01},)) for one in known]
+    measured = recorded(SIMULATION.with_effects(JointDamping(-0.06)), 600)
+    state = SearchState.begin(Problem.pose(SIMULATION, measured), entries, np.random.default_rng(0))
+    assert len(begin_with(state, known).entries) == len(known)
+
+
+@pytest.mark.parametrize("why", ["nothing was found", "only rounding is left", "the windows are as long"])
+def test_a_search_in_longer_windows_does_not_begin_if(why):
+    state = with_gravity_found(1.0, 0.01)
+    if why == "nothing was found":
+        state = state.with_found((), Fit((), (), 1.0, ()))
+    elif why == "only rounding is left":
+        state = replace(state, exact=True)
+    else:
+        state = replace(state, problem=replace(state.problem, horizon=10))
+    with LoopBar(disable=True) as bar:
+        assert begin_in_longer_windows(state, [GRAVITY], np.random.default_rng(0), bar) is None
 
 
 def test_estimated_velocities_have_noise():

@@ -20,6 +20,7 @@ from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
+from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -52,7 +53,10 @@ def _with_rivals(state: SearchState, advance: Callable[[], object] = lambda: Non
     for entry, effect in zip(state.entries, state.fit.effects, strict=True):
         others = [other for other in state.fit.effects if other is not effect]
         candidates = [one for one in state.catalogue if one.name == entry.name or one.name not in found]
-        rivals[entry.name] = screen(state.problem, others, candidates, state.windows.screened, advance)
+        possible = is_possible(state.problem, others)  # less damping than the model has may need the other effects
+        rivals[entry.name] = (
+            screen(state.problem, others, candidates, state.windows.screened, advance) if possible else []
+        )
     return replace(state, rivals=rivals)
 
 
@@ -127,9 +131,8 @@ def begin_noise_free(
     settings = state.settings.residual
     problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=measured.no_noise, settings=settings)
     silent = replace(SearchState.begin(problem, catalogue, rng, state.settings), noise_free=True)
-    silent = silent.rescaled(silent.posed_at(state.fit.effects))
+    silent = _refitted_at(state, silent)
     to_beat = state.settings.trace.noise_free_loss * silent.screened_loss(state.fit.effects)
-    silent = silent.with_found(state.entries, silent.refitted(state.entries, state.fit.effects))
     refitted = silent.screened_loss(silent.fit.effects)
     advance = partial(progress.closer, PROPOSAL / (len(catalogue) * max(1, len(state.entries))))
     if refitted > to_beat and _loss_with_one_more(silent, advance) > to_beat:
@@ -152,17 +155,21 @@ def begin_in_longer_windows(
         progress: bar that shows how far the search is.
 
     Returns:
-        The state with the same effects, refitted in longer windows; None if nothing was found, or
-        :func:`~torchrl_h2o.residuals.trace.longer_windows.longer_windows` has no longer ones.
+        The state with the same effects, refitted in longer windows, without those that are not needed there; None if
+        nothing was found, or there are no longer windows.
     """
     steps = longer_windows(state.problem, state.settings)
     if state.exact or not state.entries or steps is None:
         return None
     problem = Problem.pose(state.first.simulation, state.first.measured, steps, settings=state.settings.residual)
-    longer = SearchState.begin(problem, catalogue, rng, state.settings)
-    longer = longer.rescaled(longer.posed_at(state.fit.effects))
-    longer = longer.with_found(state.entries, longer.refitted(state.entries, state.fit.effects))
-    return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(state.entries))))
+    longer = eliminate(_refitted_at(state, SearchState.begin(problem, catalogue, rng, state.settings)))
+    return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(longer.entries))))
+
+
+def _refitted_at(found: SearchState, other: SearchState) -> SearchState:
+    """Another search with the effects found: residuals scaled by what these leave, and the effects fitted again."""
+    other = other.rescaled(other.posed_at(found.fit.effects))
+    return other.with_found(found.entries, other.refitted(found.entries, found.fit.effects))
 
 
 def _loss_with_one_more(state: SearchState, advance: Callable[[], object]) -> float:

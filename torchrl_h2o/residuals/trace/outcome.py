@@ -79,7 +79,7 @@ class Trace:
         groups: for each effect found, alternatives with an equivalent loss, in ascending order of their loss.
         exact: True if the remaining residual is within the rounding of single-precision data.
         others: other sets of effects with an equivalent loss, the most usual ones first.
-        horizon: control steps per window of the search.
+        horizon: control steps per window that were chosen for the data.
     """
 
     entries: tuple[CatalogueEntry, ...]

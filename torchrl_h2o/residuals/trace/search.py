@@ -20,7 +20,7 @@ from torchrl_h2o.residuals.trace.begin import (
 )
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
-from torchrl_h2o.residuals.trace.grow import grow
+from torchrl_h2o.residuals.trace.grow import grow, simplest_of_best
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.per_joint import divide_by_element
@@ -120,16 +120,17 @@ def _from_longer_windows(
     progress: LoopBar,
     found: Callable[[SearchState], object],
 ) -> SearchState:
-    """What a search in longer windows finds, if it finds other effects than the first one."""
+    """What a search in longer windows finds, if it finds other effects than the first one; else the first one's."""
     longer = begin_in_longer_windows(state, catalogue, rng, progress)
     if longer is None:
         return state
-    grown = grow(longer, rng, progress)
-    progress.show_found(state.entries)
-    if {entry.name for entry in grown.entries} == {entry.name for entry in state.entries}:
+    best = simplest_of_best([longer, grow(longer, rng, progress)])
+    if {entry.name for entry in best.entries} == {entry.name for entry in state.entries}:
+        progress.show_found(state.entries)
         return state
-    found(grown)
-    return grown
+    best = replace(best, chosen_horizon=state.problem.horizon)
+    found(best)
+    return best
 
 
 def _rescaled(state: SearchState) -> SearchState:
@@ -153,4 +154,4 @@ def _outcome(state: SearchState) -> Trace:
     tried = sorted(state.attempts.values(), key=lambda attempt: attempt.loss)
     attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
     groups = state.groups or ((),) * len(state.entries)  # alternatives are looked for after the effects
-    return Trace(state.entries, state.fit, attempts, groups, state.exact, horizon=state.problem.horizon)
+    return Trace(state.entries, state.fit, attempts, groups, state.exact, state.chosen_horizon or state.problem.horizon)

@@ -69,6 +69,8 @@ class SearchState:
         alternatives: the alternatives that were found so far, by :class:`Question`.
         exact: True if the residual is within the rounding of single-precision data.
         noise_free: whether the search takes the sensors for free of noise, whatever the residual looks like.
+        chosen_horizon: control steps per window that were chosen for the data, by which forces are looked for; None for
+            those of the problem. A search in longer windows has others.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -85,6 +87,7 @@ class SearchState:
     alternatives: Mapping[Question, tuple[Attempt, ...]] = field(default_factory=dict)
     exact: bool = False
     noise_free: bool = False
+    chosen_horizon: int | None = None
 
     @classmethod
     def begin(

@@ -59,7 +59,9 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
             wall_s=wall_s + outcome.seconds,
             preprocessing=preprocessing,
         )["H2O+"]
-    trials = {name: best_trial(outcome.rows) for name, outcome in outcomes.items() if outcome.failure is None}
+    trials = None
+    if len(cfg.gaps or [None]) == 1:  # returns in different simulators cannot be compared
+        trials = {name: best_trial(outcome.rows) for name, outcome in outcomes.items() if outcome.failure is None}
     table = table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step, trials)
     tqdm.write(table)
     failures = {name: outcome.failure for name, outcome in outcomes.items() if outcome.failure is not None}
