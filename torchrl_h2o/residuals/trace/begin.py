@@ -20,7 +20,6 @@ from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
-from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -148,6 +147,9 @@ def begin_in_longer_windows(
     Two effects that look alike in one step differ in longer windows. In one step, dry friction that is fitted too high
     may explain viscous friction as well, because the noise of the start states hides when the joint turns around.
 
+    All effects found stay at the beginning, also those that longer windows do not need: one that stands for another
+    effect, such as a dead band for a constant force, leads to it among its alternatives.
+
     Args:
         state: what the search in shorter windows has found.
         catalogue: effects that the simulator may lack.
@@ -155,14 +157,14 @@ def begin_in_longer_windows(
         progress: bar that shows how far the search is.
 
     Returns:
-        The state with the same effects, refitted in longer windows, without those that are not needed there; None if
-        nothing was found, or there are no longer windows.
+        The state with the same effects, refitted in longer windows; None if nothing was found, or there are no longer
+        windows.
     """
     steps = longer_windows(state.problem, state.settings)
     if state.exact or not state.entries or steps is None:
         return None
     problem = Problem.pose(state.first.simulation, state.first.measured, steps, settings=state.settings.residual)
-    longer = eliminate(_refitted_at(state, SearchState.begin(problem, catalogue, rng, state.settings)))
+    longer = _refitted_at(state, SearchState.begin(problem, catalogue, rng, state.settings))
     return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(longer.entries))))
 
 
