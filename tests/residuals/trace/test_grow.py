@@ -5,7 +5,7 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointFrictionLoss
-from torchrl_h2o.residuals.trace.grow import _simplest_of_best
+from torchrl_h2o.residuals.trace.grow import _simplest_of_best, is_beaten_by
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -39,3 +39,11 @@ def test_a_further_effect_must_contribute_its_share_however_significant_it_is(or
     losses = [both.selection_losses(state.fit.effects) for state in (gravity, both)]
     assert both.p_value(*losses) < both.settings.significance.level
     assert found(_simplest_of_best([gravity, both][::order])) == found(gravity)
+
+
+def test_a_list_is_beaten_by_one_with_a_clearly_lower_loss_alone():
+    gravity, both = lists(friction=0.2)
+    assert is_beaten_by(gravity, both)
+    assert not is_beaten_by(both, gravity)
+    gravity, both = lists(friction=5e-4)
+    assert not is_beaten_by(gravity, both)

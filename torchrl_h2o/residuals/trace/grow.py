@@ -78,7 +78,7 @@ class _Beam:
                 to_beat = min(self.first.state.screened_loss(one.fit.effects) for one in [*complete, *beam])
                 beam += self._put_in(pairs_by_prediction(self.first, self.seen, to_beat, self.rng))
             if not beam:
-                return simplest_of_best(complete)
+                return _simplest_of_best(complete)
             exact = [one for one in beam if one.exact]
             lists = [min(exact, key=_size)] if exact else _closest([*complete, *beam])
             self.progress.show_found(lists[0].entries)
@@ -133,7 +133,7 @@ def _closest(states: Sequence[SearchState]) -> list[SearchState]:
     return [state for _, state in distinct(near, itemgetter(0), rules.same_fit)[: rules.beam_width]]
 
 
-def simplest_of_best(states: Sequence[SearchState]) -> SearchState:
+def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
     """Of the states that are as good as the one with the lowest loss, the one with the fewest parameters."""
     if len(states) == 1:
         return states[0]
@@ -141,6 +141,12 @@ def simplest_of_best(states: Sequence[SearchState]) -> SearchState:
     lowest, best = min(zip(losses, states, strict=True), key=lambda pair: pair[0].mean())
     as_good = [one for one, loss in zip(states, losses, strict=True) if not _is_beaten(one, loss, best, lowest)]
     return min(as_good, key=_size)
+
+
+def is_beaten_by(state: SearchState, other: SearchState) -> bool:
+    """Whether another list of effects, in the same windows, explains the selection part significantly better."""
+    mine, its = _comparable_losses([state, other])
+    return bool(its.mean() < mine.mean()) and _is_beaten(state, mine, other, its)
 
 
 def _is_beaten(state: SearchState, loss: np.ndarray, best: SearchState, lowest: np.ndarray) -> bool:

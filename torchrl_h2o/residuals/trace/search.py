@@ -20,7 +20,7 @@ from torchrl_h2o.residuals.trace.begin import (
 )
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
-from torchrl_h2o.residuals.trace.grow import grow, simplest_of_best
+from torchrl_h2o.residuals.trace.grow import grow, is_beaten_by
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.per_joint import divide_by_element
@@ -124,13 +124,13 @@ def _from_longer_windows(
     longer = begin_in_longer_windows(state, catalogue, rng, progress)
     if longer is None:
         return state
-    best = simplest_of_best([longer, grow(longer, rng, progress)])
-    if {entry.name for entry in best.entries} == {entry.name for entry in state.entries}:
+    grown = replace(grow(longer, rng, progress), chosen_horizon=state.problem.horizon)
+    same = {entry.name for entry in grown.entries} == {entry.name for entry in state.entries}
+    if same or is_beaten_by(grown, longer):
         progress.show_found(state.entries)
         return state
-    best = replace(best, chosen_horizon=state.problem.horizon)
-    found(best)
-    return best
+    found(grown)
+    return grown
 
 
 def _rescaled(state: SearchState) -> SearchState:
