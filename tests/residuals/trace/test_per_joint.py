@@ -28,17 +28,19 @@ def torques(effects):
     return [float(model.dof_frictionloss[model.joint(joint).dofadr[0]]) for joint in ("shoulder", "elbow")]
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.002])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.002, marks=pytest.mark.slow)])
 def test_joints_that_differ_have_a_value_each(noise):
     assert torques(friction(0.15, 0.03, noise)) == pytest.approx([0.15, 0.03], rel=0.1)
 
 
+@pytest.mark.slow
 def test_joints_that_are_equal_share_a_value():
     effects = friction(0.08, 0.08, 0.002)
     assert [effect.joints for effect in effects] == ["*"]
     assert torques(effects) == pytest.approx([0.08, 0.08], rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_effect_that_is_only_possible_beside_another_does_not_end_the_search():
     """Together they are 0.012 at the shoulder and 0.009 kg·m² at the elbow; alone, the second would be negative."""
     truth = (Armature(0.012, "shoulder"), Armature(0.009, "elbow"))
