@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import grow
 from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.search import _from_another_beginning
+from torchrl_h2o.residuals.trace.search import _from_another_beginning, _outcome
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()
@@ -123,6 +123,12 @@ def test_a_search_in_longer_windows_does_not_begin_if(why):
         state = replace(state, problem=replace(state.problem, horizon=10))
     with LoopBar(disable=True) as bar:
         assert begin_in_longer_windows(state, [GRAVITY], np.random.default_rng(0), bar) is None
+
+
+def test_the_outcome_has_the_window_length_that_was_chosen_for_the_data():
+    state = with_gravity_found(1.0, 0.01)
+    assert (_outcome(state).horizon, _outcome(state).others) == (5, ())
+    assert _outcome(replace(state, chosen_horizon=1)).horizon == 1
 
 
 def test_estimated_velocities_have_noise():

@@ -154,4 +154,6 @@ def _outcome(state: SearchState) -> Trace:
     tried = sorted(state.attempts.values(), key=lambda attempt: attempt.loss)
     attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
     groups = state.groups or ((),) * len(state.entries)  # alternatives are looked for after the effects
-    return Trace(state.entries, state.fit, attempts, groups, state.exact, state.chosen_horizon or state.problem.horizon)
+    return Trace(
+        state.entries, state.fit, attempts, groups, state.exact, horizon=state.chosen_horizon or state.problem.horizon
+    )
