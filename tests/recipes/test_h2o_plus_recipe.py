@@ -88,7 +88,7 @@ def test_a_population_of_another_method_is_refused(command):
 @pytest.mark.parametrize(
     ("interruption", "options", "updates"),
     # long enough that the signal comes before the end; with overlap=true a checkpoint waits for the evaluation
-    [(signal.SIGKILL, [], 300), (signal.SIGINT, [], 300), (signal.SIGKILL, ["overlap=true"], 1000)],
+    [(signal.SIGKILL, [], 300), (signal.SIGINT, [], 1000), (signal.SIGKILL, ["overlap=true"], 1000)],
 )
 def test_a_resumed_run_reaches_what_an_unbroken_one_reaches(command, tmp_path, interruption, options, updates):
     small = [*SMALL, *ROBOT, f"updates={updates}"]
