@@ -95,6 +95,14 @@ def test_where_it_does_not_longer_windows_show_the_gain_beside_damping_that_the_
     assert {type(effect) for effect in after.fit.effects} == {Gravity, ObservationGain}
 
 
+def test_the_first_search_stays_where_the_one_in_longer_windows_explains_less(monkeypatch):
+    monkeypatch.setattr("torchrl_h2o.residuals.trace.search.is_beaten_by", lambda grown, longer: True)
+    state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
+    after, seen = from_another_beginning(state, [GRAVITY, GAIN])
+    assert after is state
+    assert not seen
+
+
 def test_a_search_in_longer_windows_that_finds_the_same_effects_does_not_count():
     state = with_gravity_found(1.0, 0.01)
     assert longer_windows(state.problem) == 10
