@@ -3,6 +3,7 @@
 import csv
 import json
 import shlex
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -51,6 +52,13 @@ def test_results_of_an_earlier_version_without_some_columns_are_kept(tmp_path):
     with pytest.raises(ValueError, match="has the columns"):
         append_rows(tmp_path / "a.csv", IDENTITY, [new], new | {"seed": "2"})
     assert len(read_rows(tmp_path / "a.csv")) == 2
+
+
+def test_runs_that_end_at_the_same_time_all_get_their_rows(tmp_path):
+    rows = [dict.fromkeys(IDENTITY, "x") | {"seed": str(seed)} for seed in range(40)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda row: append_rows(tmp_path / "a.csv", IDENTITY, [row], row), rows))
+    assert {row["seed"] for row in read_rows(tmp_path / "a.csv")} == {row["seed"] for row in rows}
 
 
 @pytest.mark.parametrize(

@@ -5,16 +5,13 @@ evaluation, for learning curves.
 """
 
 import csv
-import fcntl
 import json
-import os
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TextIO
 
+from filelock import FileLock
 from omegaconf import DictConfig
 
 from torchrl_h2o.data.readers.sources import Source
@@ -176,8 +173,9 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
         rows: the rows to append.
         who: the run's identity.
     """
-    with _locked(path) as file:
-        earlier = list(csv.DictReader(file))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_name(f".{path.name}.lock")):  # other runs of the group may finish at the same time
+        earlier = read_rows(path)
         if any(_key(row) == _key(who) for row in earlier):
             return
         columns = list(columns)
@@ -187,19 +185,6 @@ def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who
             writer = csv.DictWriter(new, columns)
             writer.writeheader()
             writer.writerows([*earlier, *rows])
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[TextIO]:
-    """Opens a file, created if missing, that no other process replaces before the end of the block."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        with open(path, "a+", newline="") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)  # other runs of the group may finish at the same time
-            if os.path.samestat(os.fstat(file.fileno()), os.stat(path)):  # else it was replaced in the meantime
-                file.seek(0)
-                yield file
-                return
 
 
 def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
