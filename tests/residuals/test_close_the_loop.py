@@ -16,7 +16,7 @@ from torchrl_h2o.effects import (
     Gravity,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals import LoopSettings, Simulation, close_the_loop, residuals
+from torchrl_h2o.residuals import LoopSettings, Report, Simulation, close_the_loop, residuals
 from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
@@ -165,6 +165,14 @@ def test_a_simulator_that_diverges_is_no_conclusion():
     measured = recorded(SIMULATION, 300)
     far = replace(measured, observation=1e12 * measured.observation, following=1e12 * measured.following)
     assert "diverges within one step of" in closed(far).conclusion
+
+
+def test_a_search_whose_time_is_up_does_not_say_that_the_catalogue_has_no_cause():
+    report = closed(recorded(SIMULATION.with_effects(Gravity(1.3)), 1500), minutes=0.0)
+    assert not report.found
+    assert report.sentence().startswith("Something is missing that the search has not explained")
+    assert "The time for the search was up while it was looking for effects" in report.sentence()
+    assert Report.from_json(report.to_json()).ended_in == report.ended_in
 
 
 def test_a_progress_bar_is_shown_only_if_asked(capsys):

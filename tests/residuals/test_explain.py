@@ -6,7 +6,7 @@ import pytest
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
 from torchrl_h2o.residuals import Evidence, explain
-from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.progress import OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.trace import search
 
 SIMULATION = pendulum()
@@ -58,6 +58,18 @@ def test_an_error_in_the_search_leaves_what_was_found_before(monkeypatch):
     explanation = explained(Gravity(1.3), noise=0.002)
     assert explanation.effects[0].scale == pytest.approx(1.3, rel=0.02)
     assert "further effects of the catalogue failed: Singular matrix" in explanation.failures[0]
+
+
+def test_what_was_found_when_the_time_was_up_is_the_explanation(monkeypatch):
+    def end(*args):
+        raise OutOfTimeError(OTHERS)
+
+    monkeypatch.setattr(search, "simplify", end)
+    explanation = explained(Gravity(1.3), RIPPLE, noise=0.002)
+    assert explanation.ended_in == OTHERS
+    assert all(part.declared for part in explanation.parts)  # no force is looked for
+    assert Gravity in {type(effect) for effect in explanation.effects}
+    assert not explanation.failures
 
 
 def test_where_the_catalogue_explains_all_no_force_is_made():

@@ -5,7 +5,7 @@ import io
 import pytest
 
 from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry
-from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, REPORT, STAGES, LoopBar
+from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, REPORT, STAGES, LoopBar, OutOfTimeError
 
 
 @pytest.fixture
@@ -52,6 +52,15 @@ def test_the_time_left_follows_from_all_the_time_passed():
         for _ in range(100):  # the smallest steps are the last ones
             bar.update(1e-3)
         assert "about 01:0" in str(bar) or "about 00:5" in str(bar)
+
+
+def test_the_search_ends_when_its_time_is_up_and_the_report_does_not():
+    with LoopBar(disable=True, minutes=0.0) as bar:
+        bar.stage(EFFECTS)
+        with pytest.raises(OutOfTimeError, match=EFFECTS):
+            bar.closer(0.5)
+        bar.stage(REPORT)
+        bar.closer(0.5)
 
 
 def test_a_stage_that_does_not_exist_is_refused(bar):

@@ -87,6 +87,7 @@ def main(cfg: DictConfig) -> None:
         source="; ".join(filter(None, [recording.source, words_of_estimates(recording.estimated)])),
         held_out=recording.reported_on,
         seed=cfg.seed,
+        minutes=cfg.minutes,
         audit=audited(cfg, recording, simulation),
         known=() if cfg.start_from is None else Report.load(cfg.start_from).effects,
         so_far=lambda unfinished: write_json(unfinished, directory),
@@ -140,6 +141,8 @@ def print_report(report: Report, directory: Path) -> None:
     if mended is not None and mended.left_out:
         where = f"not in {mended.file}" if mended.file else f"no {FILE} ({mended.failure})"
         print(f"           {where}: {'; '.join(left.words for left in mended.left_out)}")
+    if report.ended_in is not None:
+        print(f"go on      close-the-loop ... start_from={folder}")
     if report.recommended:
         print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")
 

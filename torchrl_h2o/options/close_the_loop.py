@@ -70,5 +70,6 @@ class CloseTheLoopOptions(Options):
     )
     audit: bool | Literal["warn"]
     start_from: AnyPath | None
+    minutes: Positive | None
     catalogue: Pattern | list[Pattern] | None
     seed: Seed

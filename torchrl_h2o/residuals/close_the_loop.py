@@ -24,7 +24,7 @@ from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.offered import offered_entries
-from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar
+from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -44,6 +44,7 @@ def close_the_loop(
     held_out: float | Collection[int] = HELD_OUT,
     seed: int = 0,
     progress: bool = True,
+    minutes: float | None = None,
     audit: Audit | None = None,
     known: Sequence[Effect] = (),
     so_far: Callable[[Report], object] = lambda report: None,
@@ -61,6 +62,8 @@ def close_the_loop(
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
+        minutes: time for the search, after which its present result is judged and reported as such; None for as long
+            as it takes. The step that is under way is finished, and the report comes after it.
         audit: findings of :func:`torchrl_h2o.data.audit`, for the report.
         known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
         so_far: called with an unfinished report whenever an effect has been found and after each stage.
@@ -90,7 +93,7 @@ def close_the_loop(
     if (reason := why_no_conclusion(simulation, measured)) is not None:
         return inconclusive_report(simulation, measured, reason, audit)
     entries = offered_entries(simulation, measured) if catalogue is None else catalogue
-    with LoopBar(disable=not progress) as bar:
+    with LoopBar(disable=not progress, minutes=minutes) as bar:
         evidence = gather_evidence(simulation, measured, settings, audit=audit)
         explanation = explain(
             evidence,
@@ -146,27 +149,32 @@ def explain(
         settings: thresholds and budgets.
 
     Returns:
-        The explanation, without any parts if nothing is missing.
+        The explanation, without any parts if nothing is missing; the one so far if the time of ``progress`` is up.
     """
     simulation, measured = evidence.simulation, evidence.undisturbed
     options: dict[str, Any] = {"rng": rng, "progress": progress, "known": known, "settings": settings}
+
+    def further(before: Explanation, stage: str, what: str, add: Callable[..., Explanation]) -> Explanation:
+        """What a further stage makes of an explanation; the same one if the time is up."""
+        if before.ended_in is not None or progress.time_is_up:
+            return replace(before, ended_in=before.ended_in or stage)
+        so_far(before, f"{what} was looked for")
+        progress.stage(stage)
+        return _tried(what, before, lambda: add(simulation, measured, before, settings=settings))
+
     declared = _by_catalogue(
         lambda found: trace_effects(simulation, measured, catalogue, found=found, **options),
         lambda explanation: so_far(explanation, "effects of the catalogue were tried"),
     )
-    so_far(declared, "undeclared forces were looked for")
-    progress.stage(FORCES)
-    add_force = partial(add_undeclared_force, rng=rng, catalogue=catalogue, settings=settings)
-    with_force = _tried("an undeclared force", declared, lambda: add_force(simulation, measured, declared))
-    so_far(with_force, "action noise was looked for")
-    progress.stage(NOISE)
-    return _tried("action noise", with_force, lambda: add_action_noise(simulation, measured, with_force, settings))
+    add_force = partial(add_undeclared_force, rng=rng, catalogue=catalogue)
+    with_force = further(declared, FORCES, "an undeclared force", add_force)
+    return further(with_force, NOISE, "action noise", add_action_noise)
 
 
 def _by_catalogue(
     search: Callable[[Callable[[Trace], object]], Trace], so_far: Callable[[Explanation], object]
 ) -> Explanation:
-    """The effects of the catalogue that a search finds; those found before it failed, with the failure recorded."""
+    """The effects of the catalogue that a search finds; those found before its time was up, or before it failed."""
     explanations: list[Explanation] = []
 
     def found(trace: Trace) -> None:
@@ -175,6 +183,8 @@ def _by_catalogue(
 
     try:
         return Explanation.of(search(found))
+    except OutOfTimeError as end:
+        return replace(explanations[-1], ended_in=str(end))
     except FAILURES as error:
         if not explanations:  # the data cannot be searched at all
             raise

@@ -84,6 +84,7 @@ def compose_report(
         audit=evidence.audit,
         verdict=judgement.verdict,
         failures=judgement.failures,
+        ended_in=explanation.ended_in,
         others=tuple(
             OtherExplanation(rival.fit.effects, error, where, tuple(map(words, rival.fit.effects)))
             for rival, error, where in judgement.others

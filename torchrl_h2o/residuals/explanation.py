@@ -34,11 +34,13 @@ class Explanation:
         parts: the effects in the order of their composition; empty if nothing is missing.
         trace: the search over the catalogue.
         failures: attempts that failed with an error, and why.
+        ended_in: stage of the search in which its time was up; None if it came to its end.
     """
 
     parts: tuple[Part, ...]
     trace: Trace
     failures: tuple[str, ...] = ()
+    ended_in: str | None = None
 
     @classmethod
     def of(cls, trace: Trace) -> Explanation:

@@ -1,7 +1,9 @@
-"""The progress bar of closing the loop: the stage, and an estimate of the time that is left."""
+"""The progress bar of closing the loop: the stage, an estimate of the time that is left, and the end of that time."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,12 +19,18 @@ FORCES, NOISE, REPORT = "looking for undeclared forces", "looking for action noi
 STAGES = {EFFECTS: 35.0, OTHERS: 30.0, FORCES: 20.0, NOISE: 5.0, REPORT: 10.0}
 
 
+class OutOfTimeError(Exception):
+    """The time for the search is up; the argument is the stage in which that happened."""
+
+
 class LoopBar(tqdm):
     """Shows how much of the expected time has passed, in per cent, and what is being done.
 
     How many effects a search will find is not known before, so the bar moves by shares of what is left of a stage.
 
     Args:
+        minutes: time for all stages before the report, after which :meth:`closer` raises :class:`OutOfTimeError`; None
+            for as long as they take.
         **options: options of ``tqdm``, such as ``disable=True`` or ``file``.
 
     Examples:
@@ -31,12 +39,19 @@ class LoopBar(tqdm):
         ...     bar.closer(0.5)
     """
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, *, minutes: float | None = None, **options: Any) -> None:
         form = "{desc}{percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
         options.setdefault("desc", MEASURING)
         options.setdefault("smoothing", 0.0)  # the time left follows from all the time passed; the last steps are tiny
         super().__init__(total=sum(STAGES.values()), bar_format=form, **options)
         self._end = 0.0
+        self._stage = MEASURING
+        self._deadline = math.inf if minutes is None else time.monotonic() + 60.0 * minutes
+
+    @property
+    def time_is_up(self) -> bool:
+        """Whether no further step may begin; never during the report."""
+        return self._stage != REPORT and time.monotonic() >= self._deadline
 
     def stage(self, name: str) -> None:
         """Begins a stage; the bar never moves back.
@@ -46,12 +61,18 @@ class LoopBar(tqdm):
         """
         share = STAGES[name]
         start = sum(list(STAGES.values())[: list(STAGES).index(name)])
-        self._end = max(self._end, start + share)
+        self._stage, self._end = name, max(self._end, start + share)
         self.set_description(name, refresh=False)
         self.update(max(0.0, start - self.n))
 
     def closer(self, share: float) -> None:
-        """Moves the bar by a share of what is left of the stage."""
+        """Moves the bar by a share of what is left of the stage.
+
+        Raises:
+            OutOfTimeError: if the time for the search is up.
+        """
+        if self.time_is_up:
+            raise OutOfTimeError(self._stage)
         self.update(share * max(0.0, self._end - self.n))
 
     def show_found(self, entries: Sequence[CatalogueEntry]) -> None:

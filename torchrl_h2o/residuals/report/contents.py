@@ -229,6 +229,7 @@ class ReportContents:
             versions.
         failures: attempts that failed with an error, and why.
         unfinished: stage in which the run stopped or was when the report was written; None for a finished report.
+        ended_in: stage in which the time that was given to the search was up; None if the search came to its end.
         audit: findings of the audit of the data; None if it was not audited.
         windows: worst, median and best window by the error with the effects, measured against simulated.
         runs: error of each run.
@@ -254,6 +255,7 @@ class ReportContents:
     verdict: Verdict | None = None
     failures: tuple[str, ...] = ()
     unfinished: str | None = None
+    ended_in: str | None = None
     audit: Audit | None = None
     windows: tuple[ShownWindow, ...] = ()
     runs: tuple[RunError, ...] = ()

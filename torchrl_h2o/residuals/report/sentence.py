@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.report.words import change, duration, effect_name, in
 
 NAMED = 4  # undetectable effects that the sentence names
 MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together
-NOT_IN_CATALOGUE = "this catalogue does not explain"
+NOT_IN_CATALOGUE, NOT_SO_FAR = "this catalogue does not explain", "the search has not explained"
 
 
 def sentence(report: ReportContents) -> str:
@@ -24,9 +24,9 @@ def sentences(report: ReportContents) -> list[str]:
     """The result in words, and what qualifies it.
 
     Returns:
-        The result; other effects that these data cannot rule out; effects that may have another cause; what the effects
-        found do not explain; where nothing is missing, effects that the data could not have shown; and severe faults of
-        the data. Those that do not apply are left out.
+        The result; whether the time for the search was up before its end; other effects that these data cannot rule
+        out; effects that may have another cause; what the effects found do not explain; where nothing is missing,
+        effects that the data could not have shown; and severe faults of the data. Those that do not apply are left out.
     """
     words = _verdict_words(report)
     if report.audit is not None and report.audit.severe:
@@ -46,15 +46,26 @@ def _verdict_words(report: ReportContents) -> list[str]:
     error = _error_words(report.error) if report.error else ""
     words = _listed(_found_words(report)) if report.found else ""
     kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
+    by_what, ended = (
+        (NOT_IN_CATALOGUE, []) if report.ended_in is None else (NOT_SO_FAR, [_ended_words(report.ended_in)])
+    )
     if kind == NOT_EXPLAINED:
         attempt = words and f"the best attempt, {words}, is not recommended"
-        return [f"Something is missing that {NOT_IN_CATALOGUE}: {_joined(unknown, attempt, error)}."]
+        return [f"Something is missing that {by_what}: {_joined(unknown, attempt, error)}.", *ended]
     if report.found:
-        rest = [f"Something else is missing that {NOT_IN_CATALOGUE}: {unknown}."] if unknown else []
+        rest = [f"Something else is missing that {by_what}: {unknown}."] if unknown else []
         caveats = report.verdict.caveats if report.verdict is not None else ()
-        return [f"Your simulator lacks: {_joined(words, error)}.", *_alternatives_words(report), *caveats, *rest]
+        lacks = f"Your simulator lacks: {_joined(words, error)}."
+        return [lacks, *ended, *_alternatives_words(report), *caveats, *rest]
     nothing = f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
-    return [nothing, *_undetectable_words(report.verdict)]
+    return [nothing, *ended, *_undetectable_words(report.verdict)]
+
+
+def _ended_words(stage: str) -> str:
+    return (
+        f"The time for the search was up while it was {stage}: there may be further effects, and other effects that "
+        "explain these data as well."
+    )
 
 
 def _undetectable_words(verdict: Verdict | None) -> list[str]:

@@ -55,11 +55,15 @@ def trace_effects(
         known: effects from which the search begins, such as those of an unfinished run; those that are not in the
             catalogue are left out. The search begins anew without them if they predict the motion no better than the
             guess that every velocity stays as it is.
-        found: called with the preliminary result at the beginning and whenever an effect has been found.
+        found: called with the preliminary result at the beginning, whenever an effect has been found, and when others
+            have been tried in the places of all effects.
         settings: thresholds and budgets.
 
     Returns:
         The effects found, the other effects tried, and equivalent alternatives.
+
+    Raises:
+        OutOfTimeError: if the time of ``progress`` is up.
     """
     progress.stage(EFFECTS)
     horizon = choose_horizon(simulation, measured, rng, settings)
@@ -80,6 +84,7 @@ def trace_effects(
         grown, simpler = state, simplify(state, lambda: progress.closer(ENTRY_TRIED))
         state = eliminate(simpler)
         progress.show_found(state.entries)
+        report(state)
         if state is not simpler or (state.exact and not grown.exact):
             continue  # an effect was replaced by one that is not needed, or after which only rounding is left
         if state.exact:
