@@ -1,12 +1,17 @@
 """One value for all joints against one value each: decided by the data."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
-from torchrl_h2o.effects import Armature, CatalogueEntry, JointFrictionLoss
+from torchrl_h2o.effects import ActionGain, Armature, CatalogueEntry, JointFrictionLoss
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.trace.per_joint import divide_by_element
+from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = double_pendulum()
 TRIALS = ({"torque": 0.02}, {"torque": 0.1})
@@ -38,6 +43,32 @@ def test_joints_that_are_equal_share_a_value():
     effects = friction(0.08, 0.08, 0.002)
     assert [effect.joints for effect in effects] == ["*"]
     assert torques(effects) == pytest.approx([0.08, 0.08], rel=0.05)
+
+
+def each_its_own(found, catalogue):
+    """The effects found, by the division of those on several elements, in data of which they are the truth."""
+    rng = np.random.default_rng(0)
+    entries = [entry for entry, _ in found]
+    effects = [entry.effect.with_parameters(values) for entry, values in found]
+    measured = recorded(SIMULATION.with_effects(*effects), 600, noise=0.002)
+    begun = SearchState.begin(Problem.pose(SIMULATION, measured), catalogue, rng)
+    state = replace(begun.with_found(entries, begun.refitted(entries, effects)), rivals={e.name: [] for e in entries})
+    return divide_by_element(state.rescaled(state.posed_at(state.fit.effects)), rng).fit.effects
+
+
+def test_an_effect_on_all_joints_and_more_on_one_become_one_effect_on_each():
+    """Earlier, an effect on all joints was not divided beside one on a single joint."""
+    effects = each_its_own([(ALL, {"torque": 0.03}), (SHOULDER, {"torque": 0.12})], CATALOGUE)
+    assert [effect.joints for effect in effects] == ["shoulder", "elbow"]
+    assert [effect.torque for effect in effects] == pytest.approx([0.15, 0.03], rel=0.05)
+
+
+def test_factors_of_all_motors_and_of_one_are_multiplied():
+    trials = ({"scale": 0.8}, {"scale": 1.25})
+    both, first, second = (CatalogueEntry(ActionGain(actuators=which), trials) for which in (None, (0,), (1,)))
+    effects = each_its_own([(first, {"scale": 0.9}), (both, {"scale": 0.8})], (both, first, second))
+    assert [effect.actuators for effect in effects] == [(0,), (1,)]
+    assert [effect.scale for effect in effects] == pytest.approx([0.72, 0.8], rel=0.02)
 
 
 @pytest.mark.slow

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry
+from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
 from torchrl_h2o.residuals.trace.families import entries_of_elements
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.problem import matters
@@ -17,7 +18,8 @@ from torchrl_h2o.residuals.trace.state import SearchState
 def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchState:
     """Replaces effects on several joints or motors by one effect each, where that lowers the loss significantly.
 
-    One value for all is the simpler explanation and is found first; a hip and a knee may still differ. The division
+    One value for all is the simpler explanation and is found first; a hip and a knee may still differ. Effects that are
+    divided without a further value, such as one on both joints and one on the knee, need no lower loss. The division
     that lowers the loss most is tested first, because dividing one effect may compensate a wrong value of another.
 
     Args:
@@ -25,7 +27,7 @@ def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchSta
         rng: generator of synthetic noise.
 
     Returns:
-        The state with the divided effects; unchanged where one value for all explains the data as well.
+        The state with the divided effects; unchanged where fewer values explain the data as well.
     """
     while True:
         divisions = [divided for entry in state.entries if (divided := _divided(state, entry)) is not None]
@@ -36,28 +38,54 @@ def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchSta
 
 
 def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:
-    """The state with one effect for each of an entry's elements, fitted; None if that is not possible."""
-    present, index = state.fit.effects, state.entries.index(entry)
+    """The state with one effect for each of an entry's elements, fitted; None if that is not possible.
+
+    An element that already has an effect of this kind for itself keeps one effect, which starts from both together: the
+    friction of all joints and more of the knee becomes the friction of the hip and that of the knee.
+    """
     singles = entries_of_elements(entry, state.catalogue, state.problem.simulation)
-    if not singles or {single.name for single in singles} & {other.name for other in state.entries}:
+    if not singles:
         return None
-    values = {name: getattr(present[index], name) for name in free_parameters(entry)}
-    starts = tuple(single.effect.with_parameters(values) for single in singles)
-    effects = (*present[:index], *starts, *present[index + 1 :])
-    if not is_possible(state.problem, effects):
+    found = list(zip(state.entries, state.fit.effects, strict=True))
+    names = {single.name for single in singles}
+    before, whole = state.entries.index(entry), state.fit.effects[state.entries.index(entry)]
+    own = {other.name: effect for other, effect in found if other.name in names}
+    divided = [(single, _together(whole, own.get(single.name, single.effect))) for single in singles]
+    kept = [[pair for pair in part if pair[0].name not in names] for part in (found[:before], found[before + 1 :])]
+    entries, starts = zip(*kept[0], *divided, *kept[1], strict=True)
+    if not is_possible(state.problem, starts):
         return None
-    entries = (*state.entries[:index], *singles, *state.entries[index + 1 :])
-    fitted = state.refitted(entries, effects)
+    fitted = state.refitted(entries, starts)
     if not are_possible_alone(state.problem, fitted.effects):
         return None
     rivals = {**{single.name: state.rivals[entry.name] for single in singles}, **state.rivals}
     return replace(state, entries=entries, fit=fitted, rivals=rivals, groups=())
 
 
+def _together(whole: Effect, own: Effect) -> Effect:
+    """An element's own effect with the values that it has together with one on several elements."""
+    return own.with_parameters(
+        {name: _composed(parameter, whole.parameters[name].value) for name, parameter in own.parameters.items()}
+    )
+
+
+def _composed(parameter: Parameter, other: float) -> float:
+    """A parameter's value and another one together: the product of factors, the smaller limit, else the sum."""
+    if parameter.neutral == 1.0:
+        value = parameter.value * other
+    elif math.isfinite(parameter.neutral):
+        value = parameter.value + other - parameter.neutral
+    else:
+        value = min(parameter.value, other, key=abs)
+    return float(np.clip(value, *parameter.bounds))
+
+
 def _pays(state: SearchState, divided: SearchState, rng: np.random.Generator) -> bool:
     """Whether a division lowers the loss significantly, and by more than rounding or noise would make it."""
     rules, noisy = state.settings.trace, state.problem.sensor_std is not None
     before, after = (which.selection_losses(which.fit.effects) for which in (state, divided))
+    if len(divided.entries) <= len(state.entries):  # as many values, in plainer words
+        return state.p_value(after, before) >= state.settings.significance.level
     gain = 1.0 - after.mean() / before.mean()
     least = rules.min_gain_under_noise if noisy else rules.min_gain
     if gain <= least or state.p_value(before, after) >= state.settings.significance.level:
