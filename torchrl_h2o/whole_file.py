@@ -53,7 +53,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     partial = partial_name(path)
     try:
         yield partial
-        with open(partial, "rb") as file:
+        with open(partial, "r+b") as file:
             os.fsync(file.fileno())  # otherwise a power cut may leave an empty file under the final name
         os.replace(partial, path)
     finally:

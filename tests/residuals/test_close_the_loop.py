@@ -17,6 +17,7 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
 )
 from torchrl_h2o.residuals import LoopSettings, Report, Simulation, close_the_loop, residuals
+from torchrl_h2o.residuals.report.contents import UNDECIDED
 from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
@@ -168,11 +169,21 @@ def test_a_simulator_that_diverges_is_no_conclusion():
 
 
 def test_a_search_whose_time_is_up_does_not_say_that_the_catalogue_has_no_cause():
-    report = closed(recorded(SIMULATION.with_effects(Gravity(1.3)), 1500), minutes=0.0)
+    report = closed(recorded(SIMULATION.with_effects(Gravity(1.3)), 1500), minutes=1e-9)
     assert not report.found
     assert report.sentence().startswith("Something is missing that the search has not explained")
     assert "The time for the search was up while it was looking for effects" in report.sentence()
     assert Report.from_json(report.to_json()).ended_in == report.ended_in
+
+
+def test_a_search_whose_time_is_up_does_not_say_that_nothing_is_missing():
+    """No test on so few and noisy rows shows this gravity; the whole search finds it."""
+    measured = recorded(SIMULATION.with_effects(Gravity(1.07)), 600, noise=0.02)
+    report = closed(measured, catalogue=[GRAVITY], minutes=1e-9)
+    assert report.verdict.kind == UNDECIDED
+    assert not report.verdict.undetectable
+    assert report.sentence().startswith("Nothing was found so far, and no test shows that something is missing")
+    assert [type(effect) for effect in closed(measured, catalogue=[GRAVITY]).effects] == [Gravity]
 
 
 def test_a_progress_bar_is_shown_only_if_asked(capsys):

@@ -65,7 +65,7 @@ def test_what_was_found_when_the_time_was_up_is_the_explanation(monkeypatch):
         raise OutOfTimeError(OTHERS)
 
     monkeypatch.setattr(search, "simplify", end)
-    explanation = explained(Gravity(1.3), RIPPLE, noise=0.002)
+    explanation = explained(Gravity(1.3), RIPPLE, noise=0.002)  # also a last fit in longer windows
     assert explanation.ended_in == OTHERS
     assert all(part.declared for part in explanation.parts)  # no force is looked for
     assert Gravity in {type(effect) for effect in explanation.effects}

@@ -55,12 +55,18 @@ def test_the_time_left_follows_from_all_the_time_passed():
 
 
 def test_the_search_ends_when_its_time_is_up_and_the_report_does_not():
-    with LoopBar(disable=True, minutes=0.0) as bar:
+    with LoopBar(disable=True, minutes=1e-9) as bar:
         bar.stage(EFFECTS)
         with pytest.raises(OutOfTimeError, match=EFFECTS):
             bar.closer(0.5)
         bar.stage(REPORT)
         bar.closer(0.5)
+
+
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
+def test_a_time_that_is_none_is_refused(minutes):
+    with pytest.raises(ValueError, match="above 0"):
+        LoopBar(disable=True, minutes=minutes)
 
 
 def test_a_stage_that_does_not_exist_is_refused(bar):

@@ -141,7 +141,7 @@ def print_report(report: Report, directory: Path) -> None:
     if mended is not None and mended.left_out:
         where = f"not in {mended.file}" if mended.file else f"no {FILE} ({mended.failure})"
         print(f"           {where}: {'; '.join(left.words for left in mended.left_out)}")
-    if report.ended_in is not None:
+    if report.ended_in is not None and report.found:
         print(f"go on      close-the-loop ... start_from={folder}")
     if report.recommended:
         print(f"train      python recipes/h2o_plus.py ... gap_fix={folder}/report.json")

@@ -24,7 +24,7 @@ from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.offered import offered_entries
-from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar, OutOfTimeError
+from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -62,8 +62,8 @@ def close_the_loop(
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
-        minutes: time for the search, after which its present result is judged and reported as such; None for as long
-            as it takes. The step that is under way is finished, and the report comes after it.
+        minutes: time for the search, more than 0; its result until then is judged and reported. None for as long as it
+            takes. The step under way, a last fit of the effects found, and the report come after it.
         audit: findings of :func:`torchrl_h2o.data.audit`, for the report.
         known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
         so_far: called with an unfinished report whenever an effect has been found and after each stage.
@@ -74,7 +74,7 @@ def close_the_loop(
 
     Raises:
         DataError: if the data do not fit the simulator.
-        ValueError: if the simulator's state cannot be computed from its observations.
+        ValueError: if ``minutes`` is not above 0, or the simulator's state cannot be computed from its observations.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -174,7 +174,7 @@ def explain(
 def _by_catalogue(
     search: Callable[[Callable[[Trace], object]], Trace], so_far: Callable[[Explanation], object]
 ) -> Explanation:
-    """The effects of the catalogue that a search finds; those found before its time was up, or before it failed."""
+    """The effects of the catalogue that a search finds; those found before it failed, with the failure recorded."""
     explanations: list[Explanation] = []
 
     def found(trace: Trace) -> None:
@@ -183,8 +183,6 @@ def _by_catalogue(
 
     try:
         return Explanation.of(search(found))
-    except OutOfTimeError as end:
-        return replace(explanations[-1], ended_in=str(end))
     except FAILURES as error:
         if not explanations:  # the data cannot be searched at all
             raise

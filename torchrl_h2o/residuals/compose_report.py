@@ -116,6 +116,7 @@ def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) 
         ),
         failures=explanation.failures,
         unfinished=stage,
+        ended_in=explanation.ended_in,
         audit=evidence.audit,
     )
 

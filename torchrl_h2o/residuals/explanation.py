@@ -34,7 +34,7 @@ class Explanation:
         parts: the effects in the order of their composition; empty if nothing is missing.
         trace: the search over the catalogue.
         failures: attempts that failed with an error, and why.
-        ended_in: stage of the search in which its time was up; None if it came to its end.
+        ended_in: stage in which the time for the search was up, or which did not begin for that; None if all ended.
     """
 
     parts: tuple[Part, ...]
@@ -49,7 +49,7 @@ class Explanation:
             Part(effect, True, trace.fit.ci95(index), tuple(attempt.effect for attempt in trace.groups[index]))
             for index, effect in enumerate(trace.fit.effects)
         )
-        return cls(tuple(parts), trace)
+        return cls(tuple(parts), trace, ended_in=trace.ended_in)
 
     def with_failure(self, failure: str) -> Explanation:
         """The explanation with a further attempt that failed."""

@@ -29,9 +29,12 @@ class LoopBar(tqdm):
     How many effects a search will find is not known before, so the bar moves by shares of what is left of a stage.
 
     Args:
-        minutes: time for all stages before the report, after which :meth:`closer` raises :class:`OutOfTimeError`; None
-            for as long as they take.
+        minutes: time for all stages before the report, above 0, after which :meth:`check` raises
+            :class:`OutOfTimeError`; None for as long as they take.
         **options: options of ``tqdm``, such as ``disable=True`` or ``file``.
+
+    Raises:
+        ValueError: if ``minutes`` is not above 0.
 
     Examples:
         >>> with LoopBar(disable=True) as bar:
@@ -40,6 +43,8 @@ class LoopBar(tqdm):
     """
 
     def __init__(self, *, minutes: float | None = None, **options: Any) -> None:
+        if minutes is not None and not minutes > 0.0:
+            raise ValueError(f"minutes is the time for the search, above 0 or None, and not {minutes}")
         form = "{desc}{percentage:.0f}% |{bar}| {elapsed}, about {remaining} left{postfix}"
         options.setdefault("desc", MEASURING)
         options.setdefault("smoothing", 0.0)  # the time left follows from all the time passed; the last steps are tiny
@@ -71,9 +76,17 @@ class LoopBar(tqdm):
         Raises:
             OutOfTimeError: if the time for the search is up.
         """
+        self.check()
+        self.update(share * max(0.0, self._end - self.n))
+
+    def check(self) -> None:
+        """Ends a search whose time is up.
+
+        Raises:
+            OutOfTimeError: if the time for the search is up.
+        """
         if self.time_is_up:
             raise OutOfTimeError(self._stage)
-        self.update(share * max(0.0, self._end - self.n))
 
     def show_found(self, entries: Sequence[CatalogueEntry]) -> None:
         """Names the effects found so far beside the bar."""

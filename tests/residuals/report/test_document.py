@@ -26,6 +26,7 @@ from torchrl_h2o.effects import (
     paper_gap,
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, mujoco_model
+from torchrl_h2o.residuals.progress import FORCES, NOISE, OTHERS
 from torchrl_h2o.residuals.report.contents import (
     NOTHING_MISSING,
     FoundEffect,
@@ -121,6 +122,28 @@ def test_where_nothing_is_missing_the_sentence_names_what_the_data_could_not_hav
     assert report.sentence() == nothing_missing().sentence() + words
     assert Report.load(report.save(tmp_path)).verdict == report.verdict
     assert ("gravity × 1" in (tmp_path / "report.html").read_text(encoding="utf-8")) is (count > 0)
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        (
+            OTHERS,
+            "The time for the search was up while it was looking for other explanations: effects may still be added or "
+            "replaced, and others may explain these data as well.",
+        ),
+        (
+            FORCES,
+            "The time for the search was up: a force outside the catalogue, and action noise, were not looked for.",
+        ),
+        (NOISE, "The time for the search was up: action noise was not looked for."),
+    ],
+)
+def test_the_sentence_says_what_a_search_whose_time_was_up_has_not_done(stage, words, tmp_path):
+    report = dataclasses.replace(full_report(), ended_in=stage)
+    assert words in report.sentence()
+    assert Report.load(report.save(tmp_path)).ended_in == stage
+    assert words in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_an_error_that_is_not_known_is_left_out_of_the_sentence():

@@ -44,7 +44,7 @@ def test_known_effects_are_fitted_again_and_the_missing_one_is_added():
     found, seen = traced([Gravity(1.1)])
     assert found[Gravity].scale == pytest.approx(1.3, rel=1e-3)
     assert found[JointFrictionLoss].torque == pytest.approx(0.05, rel=1e-2)
-    assert [len(effects) for effects in seen] == [1, 2]  # at the beginning, and with the missing one
+    assert list(dict.fromkeys(map(len, seen))) == [1, 2]  # at the beginning, and with the missing one
 
 
 def test_every_addition_is_reported():

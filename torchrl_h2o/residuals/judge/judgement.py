@@ -22,7 +22,7 @@ from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outsid
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.contents import NOTHING_MISSING, TwoSample, Verdict
+from torchrl_h2o.residuals.report.contents import NOTHING_MISSING, UNDECIDED, TwoSample, Verdict
 from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
@@ -114,6 +114,8 @@ def judge(
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
     verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings)
+    if verdict.kind == NOTHING_MISSING and explanation.ended_in is not None:
+        verdict = replace(verdict, kind=UNDECIDED)
     if verdict.kind == NOTHING_MISSING and not explanation.failures:
         unseen = undetectable_effects(simulation, measured, catalogue, advance, settings)
         verdict = replace(verdict, undetectable=tuple(effect_words(effect, simulation.names) for effect in unseen))

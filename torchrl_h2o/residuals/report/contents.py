@@ -13,7 +13,8 @@ from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_u
 
 NOTHING_MISSING, EXPLAINED = "nothing missing", "explained"
 EXPLAINED_IN_PART, NOT_EXPLAINED = "explained in part", "not explained"
-VERDICTS = (NOTHING_MISSING, EXPLAINED, EXPLAINED_IN_PART, NOT_EXPLAINED)
+UNDECIDED = "undecided"  # nothing was found until the time for the search was up
+VERDICTS = (NOTHING_MISSING, EXPLAINED, EXPLAINED_IN_PART, NOT_EXPLAINED, UNDECIDED)
 
 Intervals = Mapping[str, tuple[float, float]]  # 95 % interval of each parameter by name, in the parameter's unit
 Fitted = tuple[tuple[Effect, Intervals], ...]  # effects that were fitted together, each with its intervals
@@ -229,7 +230,7 @@ class ReportContents:
             versions.
         failures: attempts that failed with an error, and why.
         unfinished: stage in which the run stopped or was when the report was written; None for a finished report.
-        ended_in: stage in which the time that was given to the search was up; None if the search came to its end.
+        ended_in: stage in which the time for the search was up, or which did not begin for that; None if all ended.
         audit: findings of the audit of the data; None if it was not audited.
         windows: worst, median and best window by the error with the effects, measured against simulated.
         runs: error of each run.

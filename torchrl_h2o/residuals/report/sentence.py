@@ -6,7 +6,14 @@ import math
 from collections.abc import Sequence
 from itertools import takewhile
 
-from torchrl_h2o.residuals.report.contents import EXPLAINED_IN_PART, NOT_EXPLAINED, ReportContents, Verdict
+from torchrl_h2o.residuals.progress import FORCES, NOISE
+from torchrl_h2o.residuals.report.contents import (
+    EXPLAINED_IN_PART,
+    NOT_EXPLAINED,
+    UNDECIDED,
+    ReportContents,
+    Verdict,
+)
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
 
@@ -57,13 +64,19 @@ def _verdict_words(report: ReportContents) -> list[str]:
         caveats = report.verdict.caveats if report.verdict is not None else ()
         lacks = f"Your simulator lacks: {_joined(words, error)}."
         return [lacks, *ended, *_alternatives_words(report), *caveats, *rest]
+    if kind == UNDECIDED:
+        return [f"{_joined('Nothing was found so far, and no test shows that something is missing', error)}.", *ended]
     nothing = f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
-    return [nothing, *ended, *_undetectable_words(report.verdict)]
+    return [nothing, *_undetectable_words(report.verdict)]
 
 
 def _ended_words(stage: str) -> str:
+    """What the search has not done because its time was up."""
+    if stage in (FORCES, NOISE):
+        left = "a force outside the catalogue, and action noise, were" if stage == FORCES else "action noise was"
+        return f"The time for the search was up: {left} not looked for."
     return (
-        f"The time for the search was up while it was {stage}: there may be further effects, and other effects that "
+        f"The time for the search was up while it was {stage}: effects may still be added or replaced, and others may "
         "explain these data as well."
     )
 

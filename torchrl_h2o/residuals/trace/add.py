@@ -70,7 +70,12 @@ class Additions:
     near: Sequence[Addition] = ()
 
 
-def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generator) -> Additions:
+def additions(
+    state: SearchState,
+    leads: Sequence[Lead],
+    rng: np.random.Generator,
+    advance: Callable[[], object] = lambda: None,
+) -> Additions:
     """Finds the sets of entries that lower the held-out loss by enough, and significantly.
 
     Pairs are tried if no single entry passes the tests, and sets of three if no pair does, because one of two effects
@@ -82,6 +87,7 @@ def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generato
         state: effects found so far.
         leads: screened entries, in descending order of their promise.
         rng: generator of synthetic noise.
+        advance: called before each fit.
 
     Returns:
         The additions of the smallest size of which one passes, or none.
@@ -93,17 +99,21 @@ def additions(state: SearchState, leads: Sequence[Lead], rng: np.random.Generato
         enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
         if len(among) < size or number_of_effects(state) + size > rules.max_effects or not enough_left:
             break
-        sketches = _sketches(state, leads, among, size, count)
+        sketches = _sketches(state, leads, among, size, count, advance)
         if size == 1:
             state = _remember(state, sketches)
-        found = tested(state, leads, sketches, rng)
+        found = tested(state, leads, sketches, rng, advance)
         if found.near:
             return found
     return Additions(state, leads)
 
 
 def tested(
-    state: SearchState, leads: Sequence[Lead], sketches: Sequence[Sketch], rng: np.random.Generator
+    state: SearchState,
+    leads: Sequence[Lead],
+    sketches: Sequence[Sketch],
+    rng: np.random.Generator,
+    advance: Callable[[], object],
 ) -> Additions:
     """The sketched sets that pass the tests after a full fit.
 
@@ -112,10 +122,12 @@ def tested(
         leads: screened entries.
         sketches: sets of leads, each with a quick fit.
         rng: generator of synthetic noise.
+        advance: called before each fit.
     """
     before = state.selection_losses(state.fit.effects)
     present = Addition(state.entries, state.fit, 0, before, state.first.selection_loss(state.fit.effects))
-    passed = sorted((one for one in _fitted(state, sketches) if _pays(state, present, one)), key=_loss)
+    fitted = _fitted(state, sketches, advance)
+    passed = sorted((one for one in fitted if _pays(state, present, one)), key=_loss)
     near = [
         one for one in _close_to_best(passed, state.settings.trace) if _exceeds_noise(state, one, before.mean(), rng)
     ]
@@ -161,7 +173,14 @@ def _exceeds_noise(state: SearchState, addition: Addition, before: float, rng: n
     return gain > state.settings.trace.beyond_noise * by_noise
 
 
-def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], size: int, count: int) -> list[Sketch]:
+def _sketches(
+    state: SearchState,
+    leads: Sequence[Lead],
+    among: Sequence[Lead],
+    size: int,
+    count: int,
+    advance: Callable[[], object],
+) -> list[Sketch]:
     """Quick fits of the most promising sets of one size."""
     effects = state.fit.effects
     sets = [(lead,) for lead in unlike(leads, state.settings.trace.same_change)[:count]]
@@ -169,6 +188,7 @@ def _sketches(state: SearchState, leads: Sequence[Lead], among: Sequence[Lead], 
         sets = promising_sets(state.problem, effects, among, size, state.windows.screened, count)
     sketches = []
     for chosen in sets:
+        advance()
         sketch = sketched_set(state, [*effects, *(lead.effect for lead in chosen)], chosen)
         if sketch is not None:
             sketches.append((chosen, sketch))
@@ -204,7 +224,7 @@ def _sketch_loss(sketch: Sketch) -> float:
     return sketch[1].loss
 
 
-def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[Addition]:
+def _fitted(state: SearchState, sketches: Sequence[Sketch], advance: Callable[[], object]) -> list[Addition]:
     """The sketched sets that come close to the best one, after a full fit."""
     rules = state.settings.trace
     ranked = distinct(sorted(sketches, key=_sketch_loss), _sketch_loss, rules.same_fit)
@@ -214,6 +234,7 @@ def _fitted(state: SearchState, sketches: Sequence[Sketch]) -> list[Addition]:
         gain, most = without - start.loss, without - ranked[0][1].loss
         if tried >= rules.finalists and gain < rules.close_sketch * most:
             break
+        advance()
         entries = (*state.entries, *(lead.entry for lead in chosen))
         fitted = state.refitted(entries, start.effects)
         if not are_possible_alone(state.problem, fitted.effects):

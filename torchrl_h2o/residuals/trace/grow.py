@@ -76,7 +76,7 @@ class _Beam:
             beam, rounds = [each for _, more in grown for each in more], rounds + 1
             if rounds == 2 and self.first is not None and not any(one.exact for one in beam):
                 to_beat = min(self.first.state.screened_loss(one.fit.effects) for one in [*complete, *beam])
-                beam += self._put_in(pairs_by_prediction(self.first, self.seen, to_beat, self.rng))
+                beam += self._put_in(pairs_by_prediction(self.first, self.seen, to_beat, self.rng, self.progress.check))
             if not beam:
                 return _simplest_of_best(complete)
             exact = [one for one in beam if one.exact]
@@ -93,7 +93,7 @@ class _Beam:
             return []
         one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
         leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
-        added = additions(state, leads, self.rng)
+        added = additions(state, leads, self.rng, self.progress.check)
         self.first = self.first or added
         return self._put_in(added)
 

@@ -80,6 +80,7 @@ class Trace:
         exact: True if the remaining residual is within the rounding of single-precision data.
         others: other sets of effects with an equivalent loss, the most usual ones first.
         horizon: control steps per window that were chosen for the data.
+        ended_in: stage in which the time for the search was up; None if it came to its end.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -89,3 +90,4 @@ class Trace:
     exact: bool
     others: tuple[RivalSet, ...] = ()
     horizon: int = 1
+    ended_in: str | None = None

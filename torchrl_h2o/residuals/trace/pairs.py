@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from itertools import islice
 from operator import itemgetter
 
@@ -17,7 +17,11 @@ PAIR = 2
 
 
 def pairs_by_prediction(
-    singles: Additions, seen: Collection[frozenset[str]], to_beat: float, rng: np.random.Generator
+    singles: Additions,
+    seen: Collection[frozenset[str]],
+    to_beat: float,
+    rng: np.random.Generator,
+    advance: Callable[[], object] = lambda: None,
 ) -> Additions:
     """Finds pairs whose first entry passed the tests alone, also if its loss is far above that of the best entry.
 
@@ -30,6 +34,7 @@ def pairs_by_prediction(
         seen: names of the effects of each list so far; such pairs are left out.
         to_beat: lowest loss of the screened windows that other lists leave.
         rng: generator of synthetic noise.
+        advance: called before each full fit.
 
     Returns:
         The pairs that pass the tests of an addition.
@@ -44,7 +49,7 @@ def pairs_by_prediction(
     possible = ((leads, sketch) for leads, sketch in quick if sketch is not None)
     sketches = islice(possible, dict(rules.set_sizes).get(PAIR, 0))
     close = [(leads, sketch) for leads, sketch in sketches if sketch.loss <= rules.beam_loss * to_beat]
-    return tested(state, singles.leads, close, rng)
+    return tested(state, singles.leads, close, rng, advance)
 
 
 def _predicted(singles: Additions, seen: Collection[frozenset[str]]) -> list[tuple[Addition, tuple[Lead, Lead]]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
+from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.begin import (
@@ -55,36 +55,54 @@ def trace_effects(
         known: effects from which the search begins, such as those of an unfinished run; those that are not in the
             catalogue are left out. The search begins anew without them if they predict the motion no better than the
             guess that every velocity stays as it is.
-        found: called with the preliminary result at the beginning, whenever an effect has been found, and when others
-            have been tried in the places of all effects.
+        found: called with the preliminary result at the beginning and whenever the search has come further.
         settings: thresholds and budgets.
 
     Returns:
-        The effects found, the other effects tried, and equivalent alternatives.
-
-    Raises:
-        OutOfTimeError: if the time of ``progress`` is up.
+        The effects found, the other effects tried, and equivalent alternatives; those found so far if the time of
+        ``progress`` is up.
     """
     progress.stage(EFFECTS)
     horizon = choose_horizon(simulation, measured, rng, settings)
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
-    state = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
-    found(_outcome(state))
+    best = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
+    found(_outcome(best))
 
-    def report(grown: SearchState) -> None:
-        found(_outcome(grown))
+    def keep(state: SearchState) -> None:
+        nonlocal best
+        best = state
+        found(_outcome(state))
 
-    for attempt in range(settings.trace.rounds):
-        state = grow(state, rng, progress, report)
+    others, ended_in = (), None
+    try:
+        best, others = with_most_usual_set(
+            _searched(best, catalogue, rng, progress, keep), lambda: progress.closer(SET_FITTED)
+        )
+    except OutOfTimeError as end:
+        ended_in = str(end)
+    return replace(_outcome(_fitted_to_all(best)), others=others, ended_in=ended_in)
+
+
+def _searched(
+    state: SearchState,
+    catalogue: Sequence[CatalogueEntry],
+    rng: np.random.Generator,
+    progress: LoopBar,
+    found: Callable[[SearchState], object],
+) -> SearchState:
+    """What rounds of growing and simplifying find; ``found`` is called with each better state."""
+    for attempt in range(state.settings.trace.rounds):
+        state = grow(state, rng, progress, found)
         if attempt == 0:
-            state = _from_another_beginning(state, catalogue, rng, progress, report)
+            state = _from_another_beginning(state, catalogue, rng, progress, found)
         if not state.entries:
             break
+        found(state)
         progress.stage(OTHERS)
         grown, simpler = state, simplify(state, lambda: progress.closer(ENTRY_TRIED))
         state = eliminate(simpler)
         progress.show_found(state.entries)
-        report(state)
+        found(state)
         if state is not simpler or (state.exact and not grown.exact):
             continue  # an effect was replaced by one that is not needed, or after which only rounding is left
         if state.exact:
@@ -95,8 +113,8 @@ def trace_effects(
         # alternatives of an effect depend on the other effects
         if state.entries == grown.entries:
             break
-    state, others = with_most_usual_set(state, lambda: progress.closer(SET_FITTED))
-    return replace(_outcome(_fitted_to_all(state)), others=others)
+        found(state)
+    return state
 
 
 def _from_another_beginning(
