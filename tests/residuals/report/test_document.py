@@ -142,6 +142,9 @@ def test_where_nothing_is_missing_the_sentence_names_what_the_data_could_not_hav
 def test_the_sentence_says_what_a_search_whose_time_was_up_has_not_done(stage, words, tmp_path):
     report = dataclasses.replace(full_report(), ended_in=stage)
     assert words in report.sentence()
+    assert report.sentence().startswith("The best explanation so far" if stage == OTHERS else "Your simulator lacks")
+    assert report.recommended is (stage != OTHERS)
+    assert ("its time was up while" in report.why_not_recommended()) is (stage == OTHERS)
     assert Report.load(report.save(tmp_path)).ended_in == stage
     assert words in (tmp_path / "report.html").read_text(encoding="utf-8")
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.residuals.progress import EFFECTS, OTHERS
 from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.mended_model import MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
@@ -276,9 +277,15 @@ class ReportContents:
         return tuple(found.effect for found in self.found)
 
     @property
+    def preliminary(self) -> bool:
+        """Whether the time was up before all effects had been tried, so that others may replace those found."""
+        return self.ended_in in (EFFECTS, OTHERS)
+
+    @property
     def recommended(self) -> bool:
         """Whether there are effects, and the report recommends to put them into a simulator for training."""
-        return bool(self.found) and self.unfinished is None and (self.verdict is None or self.verdict.recommended)
+        finished = self.unfinished is None and not self.preliminary
+        return bool(self.found) and finished and (self.verdict is None or self.verdict.recommended)
 
     def why_not_recommended(self) -> str:
         """The reasons against putting the effects into a simulator, as one clause; empty if there are none."""
@@ -286,4 +293,6 @@ class ReportContents:
             return ""
         if self.unfinished is not None:
             return f"the search was not finished: it ended while {self.unfinished}"
+        if self.preliminary:
+            return f"the search was not finished: its time was up while it was {self.ended_in}"
         return "; ".join(self.verdict.reasons) if self.verdict is not None else ""

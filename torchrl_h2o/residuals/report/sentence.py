@@ -62,8 +62,8 @@ def _verdict_words(report: ReportContents) -> list[str]:
     if report.found:
         rest = [f"Something else is missing that {by_what}: {unknown}."] if unknown else []
         caveats = report.verdict.caveats if report.verdict is not None else ()
-        lacks = f"Your simulator lacks: {_joined(words, error)}."
-        return [lacks, *ended, *_alternatives_words(report), *caveats, *rest]
+        lacks = "The best explanation so far" if report.preliminary else "Your simulator lacks"
+        return [f"{lacks}: {_joined(words, error)}.", *ended, *_alternatives_words(report), *caveats, *rest]
     if kind == UNDECIDED:
         return [f"{_joined('Nothing was found so far, and no test shows that something is missing', error)}.", *ended]
     nothing = f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
