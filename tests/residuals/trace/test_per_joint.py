@@ -39,8 +39,17 @@ def test_joints_that_differ_have_a_value_each(noise):
 
 
 @pytest.mark.slow
-def test_joints_that_are_equal_share_a_value():
-    effects = friction(0.08, 0.08, 0.002)
+def test_longer_windows_show_a_difference_that_noise_hides_in_short_ones():
+    """With windows of one step alone, both joints had 0.065 N·m."""
+    effects = friction(0.08, 0.06, 0.01)
+    assert [effect.joints for effect in effects] == ["shoulder", "elbow"]
+    assert torques(effects) == pytest.approx([0.08, 0.06], rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_joints_that_are_equal_share_a_value(noise):
+    effects = friction(0.08, 0.08, noise)
     assert [effect.joints for effect in effects] == ["*"]
     assert torques(effects) == pytest.approx([0.08, 0.08], rel=0.05)
 

@@ -160,12 +160,29 @@ def begin_in_longer_windows(
         The state with the same effects, refitted in longer windows; None if nothing was found, or there are no longer
         windows.
     """
+    if (longer := in_longer_windows(state, catalogue, rng)) is None:
+        return None
+    return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(longer.entries))))
+
+
+def in_longer_windows(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator
+) -> SearchState | None:
+    """The effects found, refitted in longer windows and without rivals.
+
+    Args:
+        state: what a search in shorter windows has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+
+    Returns:
+        The state; None if nothing was found, if only rounding is left, or if there are no longer windows.
+    """
     steps = longer_windows(state.problem, state.settings)
     if state.exact or not state.entries or steps is None:
         return None
     problem = Problem.pose(state.first.simulation, state.first.measured, steps, settings=state.settings.residual)
-    longer = _refitted_at(state, SearchState.begin(problem, catalogue, rng, state.settings))
-    return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(longer.entries))))
+    return _refitted_at(state, SearchState.begin(problem, catalogue, rng, state.settings))
 
 
 def _refitted_at(found: SearchState, other: SearchState) -> SearchState:

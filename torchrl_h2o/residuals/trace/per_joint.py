@@ -58,7 +58,7 @@ def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:
     fitted = state.refitted(entries, starts)
     if not are_possible_alone(state.problem, fitted.effects):
         return None
-    rivals = {**{single.name: state.rivals[entry.name] for single in singles}, **state.rivals}
+    rivals = {**{single.name: state.rivals.get(entry.name, ()) for single in singles}, **state.rivals}
     return replace(state, entries=entries, fit=fitted, rivals=rivals, groups=())
 
 

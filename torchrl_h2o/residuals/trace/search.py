@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.trace.begin import (
     begin_in_longer_windows,
     begin_noise_free,
     begin_with,
+    in_longer_windows,
 )
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
@@ -80,7 +81,8 @@ def trace_effects(
         )
     except OutOfTimeError as end:
         ended_in = str(end)
-    return replace(_outcome(_fitted_to_all(best)), others=others, ended_in=ended_in)
+    divided = _divided_in_longer_windows(best, catalogue, rng)
+    return replace(_outcome(_fitted_to_all(divided)), others=others, ended_in=ended_in)
 
 
 def _searched(
@@ -154,6 +156,24 @@ def _from_longer_windows(
         return state
     found(grown)
     return grown
+
+
+def _divided_in_longer_windows(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator
+) -> SearchState:
+    """Divides effects on several joints or motors where longer windows show that these differ.
+
+    In windows of one step, the noise of the start states hides such a difference. Effects that are divided here have no
+    list of alternatives.
+    """
+    if (longer := in_longer_windows(state, catalogue, rng)) is None:
+        return state
+    divided = divide_by_element(_rescaled(longer), rng)
+    if divided.entries == longer.entries:
+        return state
+    alternatives = dict(zip((entry.name for entry in state.entries), state.groups, strict=False))
+    groups = tuple(alternatives.get(entry.name, ()) for entry in divided.entries)
+    return replace(state, entries=divided.entries, fit=divided.fit, groups=groups)
 
 
 def _rescaled(state: SearchState) -> SearchState:
