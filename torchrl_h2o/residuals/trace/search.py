@@ -163,14 +163,15 @@ def _divided_in_longer_windows(
 ) -> SearchState:
     """Divides effects on several joints or motors where longer windows show that these differ.
 
-    In windows of one step, the noise of the start states hides such a difference. Effects that are divided here have no
-    list of alternatives.
+    In windows of one step, the noise of the start states hides such a difference. Joints that then need no effect lose
+    theirs. Effects that are divided here have no list of alternatives.
     """
     if (longer := in_longer_windows(state, catalogue, rng)) is None:
         return state
     divided = divide_by_element(_rescaled(longer), rng)
     if divided.entries == longer.entries:
         return state
+    divided = eliminate(divided)
     alternatives = dict(zip((entry.name for entry in state.entries), state.groups, strict=False))
     groups = tuple(alternatives.get(entry.name, ()) for entry in divided.entries)
     return replace(state, entries=divided.entries, fit=divided.fit, groups=groups)
