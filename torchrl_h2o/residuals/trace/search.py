@@ -21,6 +21,7 @@ from torchrl_h2o.residuals.trace.begin import (
 )
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
+from torchrl_h2o.residuals.trace.families import entries_of_elements
 from torchrl_h2o.residuals.trace.grow import grow, is_beaten_by
 from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.outcome import Trace
@@ -166,6 +167,9 @@ def _divided_in_longer_windows(
     In windows of one step, the noise of the start states hides such a difference. Joints that then need no effect lose
     theirs. Effects that are divided here have no list of alternatives.
     """
+    simulation = state.problem.simulation
+    if not any(entries_of_elements(entry, state.catalogue, simulation) for entry in state.entries):
+        return state  # spares the fit in longer windows
     if (longer := in_longer_windows(state, catalogue, rng)) is None:
         return state
     divided = divide_by_element(_rescaled(longer), rng)
