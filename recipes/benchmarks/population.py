@@ -24,6 +24,7 @@ import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.compiling import compiled
+from torchrl_h2o.training.cuda_graph import fit_to_device
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus
 from torchrl_h2o.training.populations import PopulationReplay
@@ -40,8 +41,7 @@ def make_population(cfg: DictConfig, run: DictConfig, num_members: int) -> Popul
     for seed, buffer in enumerate(replay.buffers):
         buffer.extend(some_transitions(cfg))
         learners.append(make_single(cfg, run, buffer, seed))
-    on_gpu = torch.device(cfg.device).type == "cuda"
-    return PopulationLearner(learners, replay, run.lr, run.tau, capturable=on_gpu)
+    return PopulationLearner(learners, replay, run.lr, run.tau)
 
 
 def make_single(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, seed: int = 0) -> Learner:
@@ -51,40 +51,34 @@ def make_single(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, se
 
 def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, Callable[[], object]]:
     """Build the contenders, each a function that makes one update of every member."""
+    on_gpu = torch.device(cfg.device).type == "cuda"
     chosen = {"stacked": make_population(cfg, run, num_members).update}
     if num_members == 1:
         replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
         replay.extend(some_transitions(cfg))
         chosen = {SINGLE: make_single(cfg, run, replay).update} | chosen
-    on_gpu = torch.device(cfg.device).type == "cuda"
+        if on_gpu:
+            single = make_single(cfg, run, replay)
+            single.use_cuda_graphs()
+            fit_to_device(single.optimiser, replay.device)
+            chosen |= {f"{SINGLE}, CUDA graph": single.update}
     if on_gpu:
-        chosen["CUDA graph"] = captured(make_population(cfg, run, num_members))
+        chosen["stacked, CUDA graph"] = with_cuda_graphs(make_population(cfg, run, num_members)).update
     if num_members in cfg.compiled:
         learner = make_population(cfg, run, num_members)
         learner.losses_of = compiled(learner.losses_of)
         chosen["compiled"] = learner.update
         if on_gpu:
-            chosen["compiled, CUDA graph"] = captured(learner)
+            learner = make_population(cfg, run, num_members)
+            learner.losses_of = compiled(learner.losses_of)
+            chosen["compiled, CUDA graph"] = with_cuda_graphs(learner).update
     return chosen
 
 
-def captured(learner: PopulationLearner) -> Callable[[], object]:
-    """Capture an update as one CUDA graph, without the check of the losses."""
-
-    def update() -> None:
-        learner.differentiate()
-        learner.step()
-
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(3):  # allocations and compilation of the first calls must not be captured
-            update()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        update()
-    return graph.replay
+def with_cuda_graphs(learner: PopulationLearner) -> PopulationLearner:
+    learner.use_cuda_graphs()
+    fit_to_device(learner.optimiser, learner.replay.device)
+    return learner
 
 
 def measure(cfg: DictConfig, run: DictConfig) -> list[dict]:

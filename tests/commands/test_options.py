@@ -41,8 +41,7 @@ TRAIN = {
     "seed=-1": "seed=-1: must be an integer from 0 to 4294967295",
     "gamma=1.5": "gamma=1.5: must be a number from 0 to 1",
     "num_cells=[]": "num_cells=[]: must be the sizes of at least one layer, such as [256,256]",
-    "device=cuda": "device=cuda: a single run trains on the CPU; device is an option of populations, such as "
-    "seeds=[0,1]",
+    "device=gpu": "device=gpu: must be cpu, cuda or a numbered device such as cuda:1",
     "update=100": "no option update; did you mean updates?",
     "method=h2oplus": "method=h2oplus: must be sac, cql, iql, darc, h2o, h2o_plus, rlpd or td3; did you mean h2o_plus?",
     "gap=gravty": f"gap=gravty: must be {GAPS} or null; did you mean gravity?",
@@ -119,7 +118,6 @@ OTHERS = {
     "backbones?",
     ("paper", "table=returns methods=[h2oplus]"): "methods=[h2oplus]: choose sac, cql, iql, darc, h2o, h2o_plus, rlpd, "
     "td3; did you mean h2o_plus?",
-    ("paper", "table=returns device=cuda"): "device=cuda: each run of a grid trains on the CPU; leave device out",
     ("report", "groups=[retuns]"): f"retuns: there is no {ROOT}/recipes/results/retuns.csv; did you mean returns?",
     ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
     "environment, such as +references.mine=[0,1000]",
@@ -268,20 +266,22 @@ def test_a_configuration_of_an_earlier_version_passes_but_not_with_a_wrong_value
     ("devices", "device", "said"),
     [
         (0, "cuda", "device=cuda: this machine has no CUDA device that torch can use; choose device=cpu"),
-        (1, "cuda:1", "device=cuda:1: the last CUDA device of this machine is cuda:0"),
+        (1, "cuda:1", "device=cuda:1: the last CUDA device here is cuda:0"),
         (1, "cuda", None),
         (0, "cpu", None),
     ],
 )
-def test_a_population_trains_on_a_device_that_this_machine_has(monkeypatch, devices, device, said):
+@pytest.mark.parametrize("many", [[], ["seeds=[0,1]"]])
+def test_a_run_trains_on_a_device_that_this_machine_has(monkeypatch, devices, device, said, many):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: devices > 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: devices)
-    cfg = composed("train", "seeds=[0,1]", f"device={device}")
+    cfg = composed("train", *many, f"device={device}")
     if said is None:
         check_options(cfg, TrainOptions)
     else:
         with pytest.raises(ValueError, match=f"^{said}$"):
             check_options(cfg, TrainOptions)
+    check_options(cfg, TrainOptions, saved=True)  # a run that was trained on another machine can be evaluated here
 
 
 def test_a_data_set_that_is_not_on_this_machine_may_be_downloaded_and_several_files_are_data(tmp_path, monkeypatch):

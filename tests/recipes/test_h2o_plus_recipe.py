@@ -244,3 +244,17 @@ def test_a_minari_dataset_and_a_gap_are_overrides(command, tmp_path):
     assert summary["gap"] == "gravity"
     assert summary["transitions"] == 250_001
     assert torch.isfinite(torch.tensor(summary["return_real"]["mean"]))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
+def test_a_run_from_a_gpu_is_resumed_on_a_machine_without_one(command, tmp_path):
+    run(command(*SMALL, *ROBOT, "hydra.run.dir=moved"))
+    config, shorter = tmp_path / "moved" / "config.yaml", rows(tmp_path / "moved")
+    config.write_text(config.read_text().replace("device: cpu", "device: cuda").replace("updates: 60", "updates: 80"))
+    refused = subprocess.run(**command("resume=moved"), text=True, check=False)
+    assert refused.returncode == 1
+    assert "device=cuda: this machine has no CUDA device that torch can use; choose device=cpu" in refused.stdout
+    run(command("resume=moved", "device=cpu"))
+    assert rows(tmp_path / "moved")[: len(shorter)] == shorter
+    assert rows(tmp_path / "moved")[-1]["updates"] == "80"

@@ -1,11 +1,14 @@
 """The summary of a run: which version of the library it names."""
 
+import importlib.metadata
 import json
 import shutil
 import subprocess
 
 import pytest
+import torch
 
+import torchrl_h2o
 from torchrl_h2o.training import judging
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
@@ -54,3 +57,16 @@ def test_the_commit_is_that_of_the_repository_the_library_runs_from(repository, 
 def test_without_git_no_commit_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert commit_in_summary(tmp_path) is None
+
+
+def test_a_library_that_runs_from_a_copy_and_is_not_installed_has_a_summary(tmp_path, monkeypatch):
+    def uninstalled(name, version=importlib.metadata.version):
+        if name == "torchrl_h2o":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(judging, "version", uninstalled)
+    judging.write_summary(tmp_path, {})
+    versions = json.loads((tmp_path / "summary.json").read_text())["versions"]
+    assert versions["torchrl_h2o"] == torchrl_h2o.__version__
+    assert versions["torch"] == torch.__version__

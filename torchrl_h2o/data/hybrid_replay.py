@@ -223,7 +223,8 @@ class HybridReplayBuffer:
                     f"the checkpoint holds {count} simulated transitions, this buffer has room "
                     f"for {self.sim.storage.max_size}: use the capacity of the saved buffer"
                 )
-            self.sim.extend(TensorDict(dict(zip(self.keys, state["rows"], strict=True)), [count]))
+            rows = dict(zip(self.keys, state["rows"], strict=True))
+            self.sim.extend(TensorDict(rows, [count]).to(self.device))
         self._restore_waiting_rows(state.get("waiting", []))  # states of earlier versions have none
         # the cursor is restored too, so that a restored generator draws the same rows
         self.sim.writer.load_state_dict(state["cursor"])

@@ -11,8 +11,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from torchrl_h2o.options.nearest import did_you_mean
-from torchrl_h2o.options.sources import NOT_THERE
-from torchrl_h2o.options.types import Options
+from torchrl_h2o.options.types import NOT_THERE, Options
 from torchrl_h2o.options.words import Schema, allowed, as_typed, names_in
 
 MISSING, UNKNOWN = "missing", "extra_forbidden"  # pydantic's types of errors

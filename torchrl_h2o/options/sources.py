@@ -8,20 +8,15 @@ from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
-from pydantic_core import PydanticCustomError
 
 from torchrl_h2o.data.readers.load import looks_like_a_path
 from torchrl_h2o.options.nearest import did_you_mean
+from torchrl_h2o.options.types import not_there
 
-NOT_THERE = "not_there"  # type of the error for a source that does not exist
 RECORDED = "recorded"
 PAPER_DATA = ("halfcheetah/medium-v0", "halfcheetah/medium-replay-v0", "walker2d/medium-replay-v0")
 LAYOUTS = Path(__file__).parents[1] / "data" / "readers" / "logs"
 MISSPELT = 0.9  # similarity from which a Minari name is a misspelling of a known one
-
-
-def _not_there(problem: str) -> PydanticCustomError:
-    return PydanticCustomError(NOT_THERE, "{problem}", {"problem": problem})
 
 
 def _beside(name: str) -> list[str]:
@@ -39,7 +34,7 @@ def require_path(name: str) -> str:
     """
     if Path(name).expanduser().exists():
         return name
-    raise _not_there(f"there is no such file or folder{did_you_mean(name, _beside(name))}")
+    raise not_there(f"there is no such file or folder{did_you_mean(name, _beside(name))}")
 
 
 def require_run(name: str) -> str:
@@ -51,7 +46,7 @@ def require_run(name: str) -> str:
     if (Path(name) / "config.yaml").exists():
         return name
     near = did_you_mean(name, [one for one in _beside(name) if os.path.exists(os.path.join(one, "config.yaml"))])
-    raise _not_there(f"it is not the folder of a run, which has a config.yaml{near}")
+    raise not_there(f"it is not the folder of a run, which has a config.yaml{near}")
 
 
 def require_layout(name: str) -> str:
@@ -64,7 +59,7 @@ def require_layout(name: str) -> str:
     if name in layouts or Path(name).expanduser().exists():
         return name
     near = did_you_mean(name, [*_beside(name), *layouts])
-    raise _not_there(f"there is no such file, and the library's layouts are {', '.join(sorted(layouts))}{near}")
+    raise not_there(f"there is no such file, and the library's layouts are {', '.join(sorted(layouts))}{near}")
 
 
 def require_data(name: str) -> str:
@@ -80,11 +75,11 @@ def require_data(name: str) -> str:
     if name == RECORDED or os.path.exists(path) or any(glob.iglob(path, recursive=True)):
         return name
     if looks_like_a_path(name):
-        raise _not_there(f"there is no such file or folder{did_you_mean(name, [RECORDED, *_beside(name)])}")
+        raise not_there(f"there is no such file or folder{did_you_mean(name, [RECORDED, *_beside(name)])}")
     local = _minari_names()
     others = [one for one in (*local, *PAPER_DATA) if _without_version(one) != _without_version(name)]
     if name not in (*local, *PAPER_DATA) and (near := did_you_mean(name, others, MISSPELT)):
-        raise _not_there(f"there is no such data set on this machine{near}")
+        raise not_there(f"there is no such data set on this machine{near}")
     return name
 
 

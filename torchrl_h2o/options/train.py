@@ -10,7 +10,6 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from torchrl_h2o.options.run import ExperimentOptions, RunOptions
 from torchrl_h2o.options.types import (
     Count,
-    DeviceName,
     Gap,
     Inside,
     NotNegative,
@@ -18,7 +17,6 @@ from torchrl_h2o.options.types import (
     Positive,
     Seed,
     Share,
-    require_available,
 )
 
 Method = Literal["sac", "cql", "iql", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
@@ -81,7 +79,6 @@ class AnyMethodOptions(ExperimentOptions):
     seeds: Seeds | None
     gaps: Gaps | None
     mixings: Mixings | None
-    device: DeviceName
     h2o: H2OOptions
     iql: IQLOptions
     cql: CQLOptions
@@ -128,11 +125,6 @@ class TrainOptions(AnyMethodOptions, RunOptions):
 
     def _check_population(self) -> None:
         if not self.is_population:
-            if self.device != "cpu":
-                raise ValueError(
-                    f"device={self.device}: a single run trains on the CPU; device is an option of populations, such "
-                    "as seeds=[0,1]"
-                )
             return
         if self.overlap:
             raise ValueError("overlap=true is for single runs: leave it out with a population")
@@ -141,10 +133,6 @@ class TrainOptions(AnyMethodOptions, RunOptions):
                 f"method={self.method} baselines=[{','.join(self.baselines)}]: a population trains h2o_plus alone; "
                 "use --multirun for other methods"
             )
-        try:
-            require_available(self.device)
-        except ValueError as error:
-            raise ValueError(f"device={self.device}: {error}") from None
 
     def _check_collector(self) -> None:
         if self.collector.backend == "ray" and find_spec("ray") is None:

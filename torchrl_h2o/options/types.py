@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from torchrl_h2o.effects import PAPER_GAPS
 
@@ -49,16 +49,36 @@ Trust = Annotated[bool | list[str], Field(description="true, false or names, suc
 Widths = Annotated[list[Count], Field(min_length=1, description="the sizes of at least one layer, such as [256,256]")]
 
 
+NOT_THERE = "not_there"  # type of the error for what this machine does not have: a file, a folder, a device
+
+
+def not_there(problem: str) -> PydanticCustomError:
+    """The error of an option that names what this machine does not have.
+
+    The configuration of an existing run may name such things: its files may have been moved, and it may have been
+    trained on another machine.
+    """
+    return PydanticCustomError(NOT_THERE, "{problem}", {"problem": problem})
+
+
+def why_unavailable(device: str) -> str | None:
+    """Why torch cannot use a device on this machine; None if it can."""
+    if device == "cpu":
+        return None
+    if not torch.cuda.is_available():
+        return "this machine has no CUDA device that torch can use; choose device=cpu"
+    count = torch.cuda.device_count()
+    return None if int(device.partition(":")[2] or 0) < count else f"the last CUDA device here is cuda:{count - 1}"
+
+
 def require_available(device: str) -> str:
     """Requires a device that torch can use on this machine.
 
     Raises:
-        ValueError: if there is none of that name.
+        PydanticCustomError: if there is none of that name.
     """
-    if device != "cpu" and not torch.cuda.is_available():
-        raise ValueError("this machine has no CUDA device that torch can use; choose device=cpu")
-    if device != "cpu" and int(device.partition(":")[2] or 0) >= (count := torch.cuda.device_count()):
-        raise ValueError(f"the last CUDA device of this machine is cuda:{count - 1}")
+    if problem := why_unavailable(device):
+        raise not_there(problem)
     return device
 
 

@@ -52,5 +52,7 @@ def not_finite_losses(terms: Mapping[str, Tensor]) -> str | None:
 @torch.no_grad()
 def are_finite(modules: Iterable[nn.Module]) -> bool:
     """Whether all parameters of some modules are finite."""
-    finite = [parameter.isfinite().all() for module in modules for parameter in module.parameters()]
-    return not finite or bool(torch.stack(finite).all())
+    finite: dict[torch.device, list[Tensor]] = {}
+    for parameter in (parameter for module in modules for parameter in module.parameters()):
+        finite.setdefault(parameter.device, []).append(parameter.isfinite().all())
+    return all(bool(torch.stack(some).all()) for some in finite.values())

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+import torchrl_h2o
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
 from torchrl_h2o.training.mending import lines_of_mending, summary_of_mending
 from torchrl_h2o.training.preprocessing import Preprocessing
@@ -26,7 +27,7 @@ from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
 from torchrl_h2o.whole_file import write_text
 
-PACKAGES = ("torchrl_h2o", "torch", "torchrl", "tensordict", "gymnasium", "mujoco")
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 DATA = "the data's behaviour"
 
 
@@ -135,11 +136,16 @@ def write_summary(directory: Path, summary: dict) -> None:
         summary
         | summary_of_mending(directory)
         | {
-            "versions": {"python": sys.version.split()[0], **{name: version(name) for name in PACKAGES}, **_commit()},
+            "versions": _versions() | _commit(),
             "command": shlex.join(["python", *sys.argv]),
         }
     )
     write_text(directory / "summary.json", json.dumps(summary, indent=2) + "\n")
+
+
+def _versions() -> dict[str, str]:
+    own = {"python": sys.version.split()[0], "torchrl_h2o": torchrl_h2o.__version__}  # it need not be installed
+    return own | {name: version(name) for name in PACKAGES}
 
 
 def _commit() -> dict[str, str]:

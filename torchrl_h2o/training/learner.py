@@ -13,6 +13,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
 from torchrl_h2o.objectives import make_actor, make_qvalue, total_loss
+from torchrl_h2o.training.cuda_graph import as_cuda_graph
 
 
 @dataclass
@@ -33,6 +34,9 @@ class Learner:
             tensors of their forward pass, which prevents that.
         pairs: source of the second batch, which trains the discriminators; the replay buffer if None.
         batches: the batches of the last update.
+
+    Attributes:
+        learn: changes all networks by means of some batches and returns the terms.
     """
 
     actor: torch.nn.Module
@@ -47,6 +51,14 @@ class Learner:
     one_graph: bool = False
     pairs: PairedTransitions | None = None
     batches: list[TensorDictBase] = field(default_factory=list)
+    learn: Callable[..., dict[str, torch.Tensor]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.learn = self._learn
+
+    def use_cuda_graphs(self) -> None:
+        """Makes the updates on a GPU with a CUDA graph, all but drawing the batches."""
+        self.learn = as_cuda_graph(self._learn, self.replay.device)
 
     def sample(self) -> list[TensorDictBase]:
         """Draws the batches of one update."""
@@ -58,12 +70,15 @@ class Learner:
     def update(self) -> dict[str, torch.Tensor]:
         """Makes one update of all networks and returns the terms."""
         self.batches = self.sample()
-        losses = self.terms_of(*self.batches)
+        return self.learn(*self.batches)
+
+    def _learn(self, *batches: TensorDictBase) -> dict[str, torch.Tensor]:
+        losses = self.terms_of(*batches)
         self.optimiser.zero_grad()
         total_loss(losses).backward()
         self.optimiser.step()
         self.targets.step()
-        return losses
+        return {name: loss.detach() for name, loss in losses.items()}
 
     @property
     def parameters(self) -> list[torch.nn.Parameter]:

@@ -20,6 +20,7 @@ from torchrl.data import TensorSpec
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.cuda_graph import fit_to_device
 from torchrl_h2o.training.environments import make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.learner import Learner
@@ -150,12 +151,16 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     if learner.trains_discriminators:
         learner.pairs = trainee.make_pairs(real)
     learner.terms_of = at_precision(learner.terms_of, cfg.precision)
-    parameters = learner.parameters if learner.one_graph else None
-    learner.terms_of = maybe_compiled(
-        learner.terms_of, cfg.compiled, cfg.updates, parameters=parameters, pays=learner.pays_to_compile
-    )
+    if replay.device.type == "cpu":
+        parameters = learner.parameters if learner.one_graph else None
+        learner.terms_of = maybe_compiled(
+            learner.terms_of, cfg.compiled, cfg.updates, parameters=parameters, pays=learner.pays_to_compile
+        )
+    elif cfg.compiled is not False:
+        learner.use_cuda_graphs()
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
     training = Training(method.title, directory, budget, **trainee.components, schedule=schedule)
+    fit_to_device(learner.optimiser, replay.device)
     with closing(trainee):
         for epoch, evaluating in training.epochs():
             trainee.begin_epoch(epoch)

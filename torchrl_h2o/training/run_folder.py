@@ -18,10 +18,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
 from torchrl_h2o.options import TrainOptions, check_options
+from torchrl_h2o.options.types import why_unavailable
 from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.mending import prepare_mending
 from torchrl_h2o.training.remnants import remove_remnants
 from torchrl_h2o.training.targets import foreign_names
+
+CHANGEABLE = ("overlap", "device")  # options that may change when a run is resumed
 
 
 def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]:
@@ -30,7 +33,7 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
     Args:
         cfg: configuration from the command line. A resumed run uses the configuration in its folder instead, in which
             it allows the names that ``trust`` lists, see :mod:`torchrl_h2o.training.targets`. ``overlap`` may change,
-            because results do not depend on it.
+            because results do not depend on it, and ``device``, because the run may have been moved.
         go_on: whether to continue a run that exists in the folder, as with ``resume``.
 
     Returns:
@@ -44,18 +47,20 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
     if not OmegaConf.is_missing(cfg, "resume"):
-        allowed = ("resume=", "trust=", "results=", "overlap=")
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith(allowed)]
+        overrides = HydraConfig.get().overrides.task
+        others = [o for o in overrides if o.partition("=")[0] not in ("resume", "trust", "results", *CHANGEABLE)]
         if others:
             raise ValueError(f"a resumed run keeps its configuration: leave out {' '.join(others)}, or start a new run")
         if not any(directory.iterdir()):
             directory.rmdir()  # Hydra has made it; a mistyped name shall not leave a folder
-        results, overlap = cfg.get("results"), cfg.get("overlap")
-        cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
-        if any(o.startswith("overlap=") for o in HydraConfig.get().overrides.task):
-            cfg.overlap = overlap
+        typed, cfg = cfg, load_config(directory, trust=cfg.get("trust"), typed=cfg)
+        for option in CHANGEABLE:
+            if any(o.startswith(f"{option}=") for o in overrides):
+                cfg[option] = typed[option]
         check_options(cfg, TrainOptions, saved=True)
-        _name_results(cfg, results)
+        if problem := why_unavailable(cfg.device):
+            raise ValueError(f"device={cfg.device}: {problem}")
+        _name_results(cfg, typed.get("results"))
     elif (directory / "config.yaml").exists():
         if not go_on:
             raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")

@@ -23,11 +23,16 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     loss trains a policy with that range which shares the actor's network.
     """
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
-    unit_spec = Bounded(-1.0, 1.0, action_spec.shape)
+    unit_spec = Bounded(-1.0, 1.0, action_spec.shape, device=action_spec.device)
+    unit_space, space = cast(ContinuousBox, unit_spec.space), cast(ContinuousBox, action_spec.space)
     unit_actor = ProbabilisticActor(
-        cast(TensorDictModule, actor.module[0]), in_keys=["loc", "scale"], spec=unit_spec, distribution_class=TanhNormal
+        cast(TensorDictModule, actor.module[0]),
+        in_keys=["loc", "scale"],
+        spec=unit_spec,
+        distribution_class=TanhNormal,
+        # as tensors, because a CUDA graph cannot contain the copy of a number to the GPU
+        distribution_kwargs={"low": unit_space.low, "high": unit_space.high},
     )
-    space = cast(ContinuousBox, action_spec.space)
     low, high = space.low, space.high
 
     loss = AcceleratedCQLLoss(unit_actor, qvalues, loss_function="l2", target_entropy=cfg.target_entropy, **cfg.cql)

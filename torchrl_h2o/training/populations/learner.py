@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchrl_h2o.data import PairedTransitions
 from torchrl_h2o.objectives import total_loss
+from torchrl_h2o.training.cuda_graph import as_cuda_graph
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.populations.population import Population
 from torchrl_h2o.training.populations.replay import PopulationReplay
@@ -25,21 +26,24 @@ class PopulationLearner:
         replay: the members' data.
         lr: learning rate of Adam.
         tau: weight of the online networks in an update of the target networks.
-        capturable: whether a CUDA graph may capture the optimiser's step.
     """
 
-    def __init__(
-        self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float, capturable: bool = False
-    ) -> None:
+    def __init__(self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float) -> None:
         self.learners, self.replay, self.tau = learners, replay, tau
         self.population = Population([cast(nn.Module, learner.terms_of) for learner in learners])  # H2O+'s are its loss
         self.losses_of: Callable[..., dict[str, Tensor]] = self.population  # may be compiled
-        self.optimiser = torch.optim.Adam(self.population.parameters(), lr=lr, fused=True, capturable=capturable)
+        self.optimiser = torch.optim.Adam(self.population.parameters(), lr=lr, fused=True)
         on_cpu = replay.device.type == "cpu"
         self.generators = [torch.Generator() for _ in learners] if on_cpu else None
         self.updates = 0
         self.failures: dict[int, dict] = {}
         self._batches: list[TensorDictBase] = []
+        self._halves: tuple[Callable, Callable] = self._differentiate, self._step
+
+    def use_cuda_graphs(self) -> None:
+        """Makes both halves of each update with a CUDA graph."""
+        first, second = (as_cuda_graph(half, self.replay.device) for half in (self._differentiate, self._step))
+        self._halves = first, second
 
     def start_stream(self, number: int) -> None:
         """Copy the state of torch's global generator to a member's random stream."""
@@ -48,26 +52,29 @@ class PopulationLearner:
 
     def update(self) -> dict[str, Tensor]:
         """Make one update and return the terms by name, ``[N]`` each."""
-        terms = self.differentiate()
+        differentiate, step = self._halves
+        self.replay.find_lengths()  # a graph repeats how it draws, and cannot find that the buffers have grown
+        terms = differentiate()
         healthy = total_loss(terms).isfinite()
         if not healthy.all():
             self._note_failures(healthy, terms)
         for number in self.failures:
             self.population.stop(number, self.optimiser)
-        self.step()
+        step()
         self.updates += 1
         return terms
 
-    def differentiate(self) -> dict[str, Tensor]:
+    def _differentiate(self) -> dict[str, Tensor]:
         """Make the first half of an update: compute losses and gradients."""
         self._batches = self.sample()
         noise = self.population.draw(*self._batches, generators=self.generators)
         terms = self.losses_of(*self._batches, noise=noise)
-        self.optimiser.zero_grad()
+        # on a GPU the gradients stay in the same memory, where a graph of the step reads them
+        self.optimiser.zero_grad(set_to_none=self.replay.device.type == "cpu")
         total_loss(terms).sum().backward()  # a member's loss depends on its own parameters only
-        return terms
+        return {name: term.detach() for name, term in terms.items()}
 
-    def step(self) -> None:
+    def _step(self) -> None:
         """Make the second half of an update: the optimiser's step and the update of the target networks."""
         self.optimiser.step()
         self.population.move_targets(self.tau)

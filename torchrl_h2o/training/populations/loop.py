@@ -23,6 +23,7 @@ from torchrl_h2o.data.transition_checks import UnstableSimulatorError
 from torchrl_h2o.training.checkpoint import make_checkpoint, save_checkpoint
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.config_file import save_config
+from torchrl_h2o.training.cuda_graph import fit_to_device
 from torchrl_h2o.training.divergence import are_finite
 from torchrl_h2o.training.environments import as_observed, sim_capacity_of
 from torchrl_h2o.training.loop import MakeLearner, Trainee
@@ -136,11 +137,14 @@ def train_population(
             pairs[own.gap] = trainees[name].make_pairs(real)
         trainees[name].learner.pairs = pairs[own.gap]
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    # pays=False: on a CPU, compiled losses of stacked networks are slower.
-    learner.losses_of = maybe_compiled(learner.losses_of, cfg.compiled, cfg.updates, pays=False)
+    if replay.device.type == "cpu":  # pays=False: there, compiled losses of stacked networks are slower
+        learner.losses_of = maybe_compiled(learner.losses_of, cfg.compiled, cfg.updates, pays=False)
+    elif cfg.compiled is not False:
+        learner.use_cuda_graphs()
     budget = Budget.from_config(cfg)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
     training = PopulationTraining("H2O+", directory, budget, **_components(trainees, learner), schedule=schedule)
+    fit_to_device(learner.optimiser, replay.device)
     learner.updates = training.progress["epoch"] * cfg.updates_per_epoch
     learner.failures = {n: training.failures[name] for n, name in enumerate(members) if name in training.failures}
 

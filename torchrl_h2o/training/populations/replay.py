@@ -98,7 +98,12 @@ class PopulationReplay:
             rows come first.
         """
         n_real, n_sim = self.batch_size if batch_size is None else batch_size
-        self._find_lengths(n_sim)
+        self.find_lengths()
+        if n_sim and not all(self._known_lengths[1]):
+            raise RuntimeError(
+                f"member {self._known_lengths[1].index(0)} has no simulated transitions yet; extend() its buffer "
+                "first, or sample((n, 0)) for real rows alone"
+            )
         index_real = self._draw(0, n_real, generators)
         index_sim = self._draw(1, n_sim, generators) + self._first_sim
         batch = {
@@ -109,14 +114,12 @@ class PopulationReplay:
         batch["real"] = (torch.arange(size[1], device=self.device) < n_real).expand(size)
         return TensorDict(batch, batch_size=size, device=self.device)
 
-    def _find_lengths(self, n_sim: int) -> None:
-        """Copy the buffers' lengths to the device if they changed, to avoid a synchronising copy for every batch."""
+    def find_lengths(self) -> None:
+        """Copy the buffers' lengths to the device if they changed, to avoid a synchronising copy for every batch.
+
+        :meth:`sample` does so itself. Where a CUDA graph replays it, call this method first.
+        """
         lengths = [len(buffer.real) for buffer in self.buffers], [len(buffer.sim) for buffer in self.buffers]
-        if n_sim and not all(lengths[1]):
-            raise RuntimeError(
-                f"member {lengths[1].index(0)} has no simulated transitions yet; extend() its buffer first, or "
-                "sample((n, 0)) for real rows alone"
-            )
         if lengths != self._known_lengths:
             self._known_lengths = lengths
             self._lengths.copy_(torch.tensor(lengths)[..., None])
