@@ -1,7 +1,7 @@
 """Measures a population's updates per second, summed over members, and estimates the time of the paper's main table.
 
 python recipes/benchmarks/population.py                                # on a CPU
-python recipes/benchmarks/population.py device=cuda compiled=[1,8,32,128]   # and with CUDA graphs, as there is CUDA
+python recipes/benchmarks/population.py device=cuda compiled=[1,8,32,128]   # on a GPU, also with CUDA graphs
 
 In the same session it measures a single run with the losses of `recipes/h2o_plus.py`. All figures include sampling and
 exclude the simulator. Writes population.json to the run's folder.

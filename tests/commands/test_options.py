@@ -41,7 +41,7 @@ TRAIN = {
     "seed=-1": "seed=-1: must be an integer from 0 to 4294967295",
     "gamma=1.5": "gamma=1.5: must be a number from 0 to 1",
     "num_cells=[]": "num_cells=[]: must be the sizes of at least one layer, such as [256,256]",
-    "device=gpu": "device=gpu: must be cpu, cuda or a numbered device such as cuda:1",
+    "device=gpu": "device=gpu: must be cpu or cuda",
     "update=100": "no option update; did you mean updates?",
     "method=h2oplus": "method=h2oplus: must be sac, cql, iql, darc, h2o, h2o_plus, rlpd or td3; did you mean h2o_plus?",
     "gap=gravty": f"gap=gravty: must be {GAPS} or null; did you mean gravity?",
@@ -122,7 +122,7 @@ OTHERS = {
     ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
     "environment, such as +references.mine=[0,1000]",
     ("simulator", "seconds=0"): "seconds=0: must be a number above 0",
-    ("population", "device=gpu"): "device=gpu: must be cpu, cuda or a numbered device such as cuda:1",
+    ("population", "device=gpu"): "device=gpu: must be cpu or cuda",
 }
 
 
@@ -266,7 +266,6 @@ def test_a_configuration_of_an_earlier_version_passes_but_not_with_a_wrong_value
     ("devices", "device", "said"),
     [
         (0, "cuda", "device=cuda: this machine has no CUDA device that torch can use; choose device=cpu"),
-        (1, "cuda:1", "device=cuda:1: the last CUDA device here is cuda:0"),
         (1, "cuda", None),
         (0, "cpu", None),
     ],
@@ -274,7 +273,6 @@ def test_a_configuration_of_an_earlier_version_passes_but_not_with_a_wrong_value
 @pytest.mark.parametrize("many", [[], ["seeds=[0,1]"]])
 def test_a_run_trains_on_a_device_that_this_machine_has(monkeypatch, devices, device, said, many):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: devices > 0)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: devices)
     cfg = composed("train", *many, f"device={device}")
     if said is None:
         check_options(cfg, TrainOptions)

@@ -1,10 +1,12 @@
 """The main job as a command: its files, and its resumption after an interruption."""
 
 import importlib
+import io
 import json
 import os
 import signal
 import subprocess
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -246,15 +248,40 @@ def test_a_minari_dataset_and_a_gap_are_overrides(command, tmp_path):
     assert torch.isfinite(torch.tensor(summary["return_real"]["mean"]))
 
 
+def as_if_from_a_gpu(directory):
+    """Rewrites a run's folder as if it had been trained on a GPU: its device, and the devices in its checkpoint."""
+    config = directory / "config.yaml"
+    config.write_text(config.read_text().replace("device: cpu", "device: cuda"))
+    (checkpoint,) = directory.glob("checkpoints/*/*.torchrl")
+    original = checkpoint.read_bytes()
+
+    def moved(data):
+        rewritten = io.BytesIO()
+        with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(rewritten, "w") as new:
+            for name in old.namelist():
+                held = old.read(name)
+                held = moved(held) if name.endswith(".tdz") else held.replace(b'"cpu"', b'"cuda:0"')
+                new.writestr(old.getinfo(name), held)
+        return rewritten.getvalue()
+
+    checkpoint.write_bytes(moved(original))
+    assert checkpoint.read_bytes() != original
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
-def test_a_run_from_a_gpu_is_resumed_on_a_machine_without_one(command, tmp_path):
-    run(command(*SMALL, *ROBOT, "hydra.run.dir=moved"))
+def test_a_run_from_a_gpu_is_evaluated_and_resumed_on_a_machine_without_one(command, tmp_path):
+    run(command(*SMALL, *ROBOT, "hydra.run.dir=moved", script="train.py"))
+    as_if_from_a_gpu(tmp_path / "moved")
     config, shorter = tmp_path / "moved" / "config.yaml", rows(tmp_path / "moved")
-    config.write_text(config.read_text().replace("device: cpu", "device: cuda").replace("updates: 60", "updates: 80"))
-    refused = subprocess.run(**command("resume=moved"), text=True, check=False)
+    assert "in reality" in run(command("checkpoint=moved", "film=null", script="evaluate.py"))
+    config.write_text(config.read_text().replace("updates: 60", "updates: 80"))
+    (tmp_path / "moved" / "summary.json").unlink()  # a run with a summary is finished
+    refused = subprocess.run(**command("resume=moved", script="train.py"), text=True, check=False)
     assert refused.returncode == 1
     assert "device=cuda: this machine has no CUDA device that torch can use; choose device=cpu" in refused.stdout
-    run(command("resume=moved", "device=cpu"))
+    run(command("resume=moved", "device=cpu", "results=results.csv", script="train.py"))
     assert rows(tmp_path / "moved")[: len(shorter)] == shorter
     assert rows(tmp_path / "moved")[-1]["updates"] == "80"
+    assert "device=cpu" in (tmp_path / "results.csv").read_text()
+    assert json.loads((tmp_path / "moved" / "summary.json").read_text())["device"] == "cpu"

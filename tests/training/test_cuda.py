@@ -1,5 +1,7 @@
 """Training on a GPU: the same losses as on the CPU, and whole runs. Skipped on machines without one."""
 
+import pickle
+
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -23,12 +25,12 @@ from torchrl_h2o.training.trained_policy import load_policy
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="this machine has no CUDA device")
 
 
-def learner_on(device, cfg, real, seed=0):
-    """Builds H2O+ on a device, with simulated rows that equal the real ones."""
+def learner_on(device, cfg, real, seed=0, make_learner=h2o_plus.make_learner):
+    """Builds a method, H2O+ by default, on a device, with simulated rows that equal the real ones."""
     replay = HybridReplayBuffer(real, sim_capacity=len(real), batch_size=cfg.batch_size, device=device)
     replay.extend(real)
     with torch.device(device):
-        return h2o_plus.make_learner(OmegaConf.merge(cfg, {"seed": seed}), 4, Bounded(-1.0, 1.0, (1,)), replay)
+        return make_learner(OmegaConf.merge(cfg, {"seed": seed}), 4, Bounded(-1.0, 1.0, (1,)), replay)
 
 
 def population_of(count, cfg, real):
@@ -66,19 +68,19 @@ def test_a_gpu_computes_the_losses_and_gradients_of_the_cpu(compose):
             torch.testing.assert_close(its.grad.cpu(), mine.grad, rtol=1e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("members", [1, 3])
-def test_cuda_graphs_change_the_parameters_as_updates_without_them_do(compose, members):
+@pytest.mark.parametrize("name", [*METHODS, "a population"])
+def test_cuda_graphs_change_the_parameters_as_updates_without_them_do(compose, name):
     cfg, real = compose("n_steps=1")
     results = []
     for graphs in (False, True):
-        if members == 1:
-            learner = learner_on("cuda", cfg, real)
-            parameters, optimiser = learner.losses["loss"].parameters(), learner.optimiser
+        if name in METHODS:
+            learner = learner_on("cuda", cfg, real, make_learner=METHODS[name].make_learner)
+            parameters = learner.parameters
         else:
-            learner = population_of(members, cfg, real)
-            parameters, optimiser = learner.population.parameters(), learner.optimiser
-        fit_to_device(optimiser, torch.device("cuda"))
-        schedule = LinearLR(optimiser, 1.0, 0.1, total_iters=8)
+            learner = population_of(3, cfg, real)
+            parameters = learner.population.parameters()
+        fit_to_device(learner.optimiser, torch.device("cuda"))
+        schedule = LinearLR(learner.optimiser, 1.0, 0.1, total_iters=8)
         if graphs:
             learner.use_cuda_graphs()
         torch.manual_seed(1)
@@ -111,6 +113,7 @@ def test_every_method_trains_on_a_gpu_and_its_policy_runs_on_the_cpu(compose, tm
     policy, training = train(METHODS[name], cfg, real, tmp_path)
     assert len(training.rows) == 3
     assert all(parameter.device.type == "cpu" for parameter in policy.parameters())
+    assert b"cuda" not in pickle.dumps(policy)  # nothing of it is on the GPU, as bounds of the action could be
     reality = make_reality(cfg, 2)
     loaded = load_policy(cfg, tmp_path, METHODS[name].title)
     assert evaluate(reality, loaded, 2, TRIAL_SEED).mean == evaluate(reality, policy, 2, TRIAL_SEED).mean

@@ -26,7 +26,8 @@ def check_options(cfg: DictConfig, model: type[Options], *, saved: bool = False)
         cfg: the command's configuration; entries that are ``???`` count as not given.
         model: the options with their types and bounds.
         saved: whether this is the configuration of an existing run. An earlier version may have written it, so missing
-            and unknown entries are accepted, and its files may have been moved since.
+            and unknown entries are accepted. Its files may have been moved since, and it may name a device that this
+            machine does not have.
 
     Raises:
         ValueError: in one line, for each wrong option: its value, what is allowed, and the most similar name.

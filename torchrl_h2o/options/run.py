@@ -10,7 +10,6 @@ from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_v
 from torchrl_h2o.options.sources import AnyPath, Data, Layout, RunFolder
 from torchrl_h2o.options.types import (
     Count,
-    Device,
     Gap,
     Inside,
     NotNegative,
@@ -123,7 +122,6 @@ class ExperimentOptions(Options):
     compiled: Literal["auto"] | bool | None
     precision: Literal["float32", "bf16"] = "float32"
     threads: Count
-    device: Device = "cpu"
 
     reward_offset: float
     reward_scale: float
@@ -188,8 +186,6 @@ class RunOptions(ExperimentOptions):
             )
 
     def _check_precision(self) -> None:
-        if self.precision == "bf16" and self.device != "cpu":
-            raise ValueError(f"precision=bf16 device={self.device}: bf16 is for the CPU; leave one of them out")
         if self.precision == "bf16" and not has_bf16():
             raise ValueError(
                 "precision=bf16: this processor has no bfloat16 instructions; choose float32, which is faster on it"

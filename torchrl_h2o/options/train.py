@@ -10,6 +10,8 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 from torchrl_h2o.options.run import ExperimentOptions, RunOptions
 from torchrl_h2o.options.types import (
     Count,
+    Device,
+    DeviceName,
     Gap,
     Inside,
     NotNegative,
@@ -79,6 +81,7 @@ class AnyMethodOptions(ExperimentOptions):
     seeds: Seeds | None
     gaps: Gaps | None
     mixings: Mixings | None
+    device: DeviceName = "cpu"
     h2o: H2OOptions
     iql: IQLOptions
     cql: CQLOptions
@@ -88,6 +91,8 @@ class AnyMethodOptions(ExperimentOptions):
 
 class TrainOptions(AnyMethodOptions, RunOptions):
     """Options of train.py, with the relations between them."""
+
+    device: Device = "cpu"
 
     @model_validator(mode="after")
     def _fit_the_method(self) -> TrainOptions:
@@ -116,6 +121,8 @@ class TrainOptions(AnyMethodOptions, RunOptions):
                 "precision=bf16 is for single runs of h2o_plus and rlpd: leave it out with "
                 f"{', '.join(sorted(others)) or 'a population'}"
             )
+        if self.precision == "bf16" and self.device != "cpu":
+            raise ValueError(f"precision=bf16 device={self.device}: bf16 is for the CPU; leave one of them out")
         super()._check_precision()
 
     @property

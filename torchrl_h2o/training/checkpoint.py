@@ -77,7 +77,7 @@ def load_checkpoint(path: Path, checkpoint: Checkpoint) -> dict[str, Any]:
         torchrl.checkpoint.CheckpointError: if a component does not fit.
     """
     _require_plain(path)
-    checkpoint.load(path)
+    checkpoint.load(path, map_location="cpu")  # it may come from a machine with a GPU; each component copies from there
     return Checkpoint.manifest(path)["metadata"]
 
 

@@ -127,6 +127,7 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
         "transitions": len(real),
         **({key: cfg[key] for key in of_h2o_plus} if cfg.get("method", "h2o_plus") == "h2o_plus" else {}),
         "seed": cfg.seed,
+        "device": cfg.get("device", "cpu"),
     }
 
 

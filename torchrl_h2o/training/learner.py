@@ -57,7 +57,7 @@ class Learner:
         self.learn = self._learn
 
     def use_cuda_graphs(self) -> None:
-        """Makes the updates on a GPU with a CUDA graph, all but drawing the batches."""
+        """Makes the updates with a CUDA graph, all but the batches; needs ``fit_to_device`` before the first update."""
         self.learn = as_cuda_graph(self._learn, self.replay.device)
 
     def sample(self) -> list[TensorDictBase]:

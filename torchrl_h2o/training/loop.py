@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.data import TensorSpec
 
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.objectives import make_actor
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.cuda_graph import fit_to_device
@@ -68,7 +68,10 @@ class Trainee:
         with replay.device:
             action_spec = reality.action_spec_unbatched.to(replay.device)
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
-        self._actor = self.learner.actor if replay.device.type == "cpu" else deepcopy(self.learner.actor).cpu()
+        self._actor = self.learner.actor
+        if replay.device.type != "cpu":  # not a copy of the learner's, whose bounds of the action stay on the GPU
+            self._actor = make_actor(observation_dim, reality.action_spec_unbatched, cfg.num_cells)
+            self._copy_to_cpu()
         self.components = self.learner.components
         self.make_pairs = partial(make_pairs, cfg, task, preprocessing=self._preprocessing, replay=replay)
         self._open = ExitStack()

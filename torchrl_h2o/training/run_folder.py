@@ -40,7 +40,8 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         The run's configuration and its folder.
 
     Raises:
-        ValueError: for other overrides together with ``resume``, or wrong options in the folder's configuration.
+        ValueError: for other overrides together with ``resume``, for wrong options in the folder's configuration, and
+            for a device that this machine does not have.
         FileNotFoundError: if the folder given by ``resume`` is not the folder of a run.
         FileExistsError: if the folder of a new run already contains a run.
         torchrl_h2o.data.DataError: if the configuration in the folder cannot be read, or names what must not be built.
@@ -57,9 +58,8 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         for option in CHANGEABLE:
             if any(o.startswith(f"{option}=") for o in overrides):
                 cfg[option] = typed[option]
+                _note_override(cfg, f"{option}={typed[option]}")
         check_options(cfg, TrainOptions, saved=True)
-        if problem := why_unavailable(cfg.device):
-            raise ValueError(f"device={cfg.device}: {problem}")
         _name_results(cfg, typed.get("results"))
     elif (directory / "config.yaml").exists():
         if not go_on:
@@ -70,9 +70,18 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         prepare_mending(cfg)
         resolve_paths(cfg)
         save_config(cfg, directory)
+    if problem := why_unavailable(cfg.get("device", "cpu")):
+        raise ValueError(f"device={cfg.device}: {problem}")
     torch.set_num_threads(cfg.threads)
     tqdm.write(f"run folder: {os.path.relpath(directory)}")
     return cfg, directory
+
+
+def _note_override(cfg: DictConfig, override: str) -> None:
+    """Replaces an override among those that the results file shows."""
+    if cfg.get("overrides") is not None:
+        option = override.partition("=")[0]
+        cfg.overrides = [*(o for o in cfg.overrides if not o.startswith(f"{option}=")), override]
 
 
 def _name_results(cfg: DictConfig, results: str | None) -> None:

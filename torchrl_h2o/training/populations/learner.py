@@ -41,7 +41,7 @@ class PopulationLearner:
         self._halves: tuple[Callable, Callable] = self._differentiate, self._step
 
     def use_cuda_graphs(self) -> None:
-        """Makes both halves of each update with a CUDA graph."""
+        """Makes both halves of each update with a CUDA graph; needs ``fit_to_device`` before the first update."""
         first, second = (as_cuda_graph(half, self.replay.device) for half in (self._differentiate, self._step))
         self._halves = first, second
 
@@ -54,7 +54,7 @@ class PopulationLearner:
         """Make one update and return the terms by name, ``[N]`` each."""
         differentiate, step = self._halves
         self.replay.find_lengths()  # a graph repeats how it draws, and cannot find that the buffers have grown
-        terms = differentiate()
+        terms, self._batches = differentiate()
         healthy = total_loss(terms).isfinite()
         if not healthy.all():
             self._note_failures(healthy, terms)
@@ -64,15 +64,15 @@ class PopulationLearner:
         self.updates += 1
         return terms
 
-    def _differentiate(self) -> dict[str, Tensor]:
-        """Make the first half of an update: compute losses and gradients."""
-        self._batches = self.sample()
-        noise = self.population.draw(*self._batches, generators=self.generators)
-        terms = self.losses_of(*self._batches, noise=noise)
+    def _differentiate(self) -> tuple[dict[str, Tensor], list[TensorDictBase]]:
+        """Make the first half of an update: compute losses and gradients. Return the terms and the batches."""
+        batches = self.sample()
+        noise = self.population.draw(*batches, generators=self.generators)
+        terms = self.losses_of(*batches, noise=noise)
         # on a GPU the gradients stay in the same memory, where a graph of the step reads them
         self.optimiser.zero_grad(set_to_none=self.replay.device.type == "cpu")
         total_loss(terms).sum().backward()  # a member's loss depends on its own parameters only
-        return {name: term.detach() for name, term in terms.items()}
+        return {name: term.detach() for name, term in terms.items()}, batches
 
     def _step(self) -> None:
         """Make the second half of an update: the optimiser's step and the update of the target networks."""

@@ -1,0 +1,52 @@
+"""What CUDA graphs need of an update, on any machine: a graph reads the tensors that it was captured with."""
+
+import pytest
+import torch
+from torch.optim.lr_scheduler import LinearLR
+from torchrl.data import Bounded
+
+from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training import cuda_graph
+from torchrl_h2o.training.cuda_graph import fit_to_device
+from torchrl_h2o.training.methods import METHODS
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+def test_an_update_leaves_its_batches_as_they_are(compose, monkeypatch, name):
+    kept = []
+
+    def watching(function, device):
+        def call(*batches):
+            before = [dict(batch.items(True, True)) for batch in batches]
+            result = function(*batches)
+            after = [dict(batch.items(True, True)) for batch in batches]
+            kept.append(
+                all(now[key] is tensor for now, then in zip(after, before, strict=True) for key, tensor in then.items())
+            )
+            return result
+
+        return call
+
+    monkeypatch.setattr(cuda_graph, "CudaGraphModule", watching)
+    cfg, real = compose("n_steps=1")
+    replay = HybridReplayBuffer(real, sim_capacity=len(real), batch_size=cfg.batch_size)
+    replay.extend(real)
+    learner = METHODS[name].make_learner(cfg, 4, Bounded(-1.0, 1.0, (1,)), replay)
+    learner.use_cuda_graphs()
+    assert not any(term.requires_grad for term in learner.update().values())
+    assert kept == [True]
+
+
+def test_an_optimiser_saved_on_a_gpu_goes_on_with_numbers_on_a_cpu():
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimiser = torch.optim.Adam([weight], lr=0.1, fused=True)
+    schedule = LinearLR(optimiser, 1.0, 0.0, total_iters=2)
+    optimiser.param_groups[0].update(capturable=True, lr=torch.tensor(0.1))
+    fit_to_device(optimiser, torch.device("cpu"))
+    for _ in range(2):
+        optimiser.zero_grad()
+        weight.sum().backward()
+        optimiser.step()
+        schedule.step()
+    torch.testing.assert_close(weight.detach(), torch.full((2,), 1 - 0.1 - 0.05))
+    assert optimiser.param_groups[0]["lr"] == 0.0
