@@ -37,7 +37,6 @@ ADDED = {
     "lr_end_factor": 1.0,
     "compiled": False,
     "precision": "float32",
-    "device": "cpu",
     "reward_offset": 0.0,
     "frames": 1,
     "action_history": 0,

@@ -84,5 +84,5 @@ def make_replay(cfg: DictConfig, real: TensorDictBase) -> HybridReplayBuffer:
         batch_size=cfg.batch_size,
         n_steps=cfg.n_steps,
         gamma=cfg.gamma,
-        device=cfg.device,
+        device=cfg.get("device", "cpu"),  # not an option of h2o_plus.py
     )
