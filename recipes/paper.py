@@ -23,10 +23,16 @@ from torchrl_h2o.comparison.grids import check_overrides, chosen_grid, group_nam
 from torchrl_h2o.comparison.launching import GridLauncher, shared_overrides
 from torchrl_h2o.comparison.options import PaperOptions
 from torchrl_h2o.comparison.recorded_run import train_grid_run
+from torchrl_h2o.options.types import why_unavailable
+
+ON_THIS_MACHINE = ("basic", "joblib")  # Hydra's launchers that train here
 
 
 @hydra_main("config", "paper", PaperOptions)
 def main(cfg: DictConfig) -> None:
+    launcher = HydraConfig.get().runtime.choices["hydra/launcher"]
+    if launcher in ON_THIS_MACHINE and (problem := why_unavailable(cfg.device)):
+        raise ValueError(f"device={cfg.device}: {problem}, or a launcher of machines that have one")
     shared = shared_overrides(HydraConfig.get().overrides.task)
     results = Path(cfg.results or Path(__file__).parent / "results" / f"{group_name(cfg)}.csv").resolve()
     runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))

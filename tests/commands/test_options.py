@@ -118,6 +118,7 @@ OTHERS = {
     "backbones?",
     ("paper", "table=returns methods=[h2oplus]"): "methods=[h2oplus]: choose sac, cql, iql, darc, h2o, h2o_plus, rlpd, "
     "td3; did you mean h2o_plus?",
+    ("paper", "table=returns device=gpu"): "device=gpu: must be cpu or cuda",
     ("report", "groups=[retuns]"): f"retuns: there is no {ROOT}/recipes/results/retuns.csv; did you mean returns?",
     ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
     "environment, such as +references.mine=[0,1000]",
