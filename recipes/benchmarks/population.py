@@ -58,10 +58,7 @@ def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, 
         replay.extend(some_transitions(cfg))
         chosen = {SINGLE: make_single(cfg, run, replay).update} | chosen
         if on_gpu:
-            single = make_single(cfg, run, replay)
-            single.use_cuda_graphs()
-            fit_to_device(single.optimiser, replay.device)
-            chosen |= {f"{SINGLE}, CUDA graph": single.update}
+            chosen[f"{SINGLE}, CUDA graph"] = with_cuda_graphs(make_single(cfg, run, replay)).update
     if on_gpu:
         chosen["stacked, CUDA graph"] = with_cuda_graphs(make_population(cfg, run, num_members)).update
     if num_members in cfg.compiled:
@@ -75,7 +72,7 @@ def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, 
     return chosen
 
 
-def with_cuda_graphs(learner: PopulationLearner) -> PopulationLearner:
+def with_cuda_graphs(learner: Learner | PopulationLearner) -> Learner | PopulationLearner:
     learner.use_cuda_graphs()
     fit_to_device(learner.optimiser, learner.replay.device)
     return learner

@@ -283,6 +283,12 @@ def test_a_run_trains_on_a_device_that_this_machine_has(monkeypatch, devices, de
     check_options(cfg, TrainOptions, saved=True)  # a run that was trained on another machine can be evaluated here
 
 
+def test_bf16_on_a_gpu_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(ValueError, match=r"^precision=bf16 device=cuda: bf16 is for the CPU; leave one of them out$"):
+        check_options(composed("train", "precision=bf16", "device=cuda"), TrainOptions)
+
+
 def test_a_data_set_that_is_not_on_this_machine_may_be_downloaded_and_several_files_are_data(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     (tmp_path / "mine" / "quiet-v1" / "data").mkdir(parents=True)

@@ -9,6 +9,8 @@ from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training import cuda_graph
 from torchrl_h2o.training.cuda_graph import fit_to_device
 from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.training.populations import PopulationReplay
+from torchrl_h2o.training.populations.learner import PopulationLearner
 
 
 @pytest.mark.parametrize("name", list(METHODS))
@@ -50,3 +52,28 @@ def test_an_optimiser_saved_on_a_gpu_goes_on_with_numbers_on_a_cpu():
         schedule.step()
     torch.testing.assert_close(weight.detach(), torch.full((2,), 1 - 0.1 - 0.05))
     assert optimiser.param_groups[0]["lr"] == 0.0
+
+
+def test_a_replayed_graph_draws_from_buffers_that_have_grown(compose, monkeypatch):
+    def replaying(function, device):
+        first = []
+
+        def call():  # runs the Python code once, as a graph does
+            first[:] = first or [function()]
+            return first[0]
+
+        return call
+
+    monkeypatch.setattr(cuda_graph, "CudaGraphModule", replaying)
+    cfg, real = compose("n_steps=1")
+    replay = PopulationReplay(real, 2 * len(real), cfg.batch_size, 2)
+    for buffer in replay.buffers:
+        buffer.extend(real)
+    make = METHODS["h2o_plus"].make_learner
+    spec = Bounded(-1.0, 1.0, (1,))
+    population = PopulationLearner([make(cfg, 4, spec, buffer) for buffer in replay.buffers], replay, cfg.lr, cfg.tau)
+    population.use_cuda_graphs()
+    population.update()
+    replay.buffers[1].extend(real)
+    population.update()
+    assert replay._lengths[1].flatten().tolist() == [len(real), 2 * len(real)]

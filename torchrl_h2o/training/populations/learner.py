@@ -1,7 +1,7 @@
 """One update of many runs together: batches, losses, one optimiser step, one update of all target networks."""
 
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -42,8 +42,13 @@ class PopulationLearner:
 
     def use_cuda_graphs(self) -> None:
         """Makes both halves of each update with a CUDA graph; needs ``fit_to_device`` before the first update."""
-        first, second = (as_cuda_graph(half, self.replay.device) for half in (self._differentiate, self._step))
-        self._halves = first, second
+        differentiate, step = (as_cuda_graph(half, self.replay.device) for half in (self._differentiate, self._step))
+
+        def with_present_lengths() -> Any:
+            self.replay.find_lengths()  # a graph repeats how it draws, and cannot find that the buffers have grown
+            return differentiate()
+
+        self._halves = with_present_lengths, step
 
     def start_stream(self, number: int) -> None:
         """Copy the state of torch's global generator to a member's random stream."""
@@ -53,7 +58,6 @@ class PopulationLearner:
     def update(self) -> dict[str, Tensor]:
         """Make one update and return the terms by name, ``[N]`` each."""
         differentiate, step = self._halves
-        self.replay.find_lengths()  # a graph repeats how it draws, and cannot find that the buffers have grown
         terms, self._batches = differentiate()
         healthy = total_loss(terms).isfinite()
         if not healthy.all():
