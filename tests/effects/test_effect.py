@@ -13,13 +13,17 @@ from hypothesis import strategies as st
 
 from torchrl_h2o import effects
 from torchrl_h2o.effects import (
+    ActionBias,
+    ActionGain,
     ActionNoise,
+    ActionSaturation,
     BodyMass,
     Effect,
     GeomSize,
     Gravity,
     JointDamping,
     ObservationBias,
+    ObservationNoise,
     paper_gap,
 )
 
@@ -121,3 +125,22 @@ def test_a_gap_of_strength_zero_is_not_one_of_the_default_strength():
 def test_effects_need_no_torch():
     code = "import sys, torchrl_h2o.effects; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("effect", "words"),
+    [
+        (ActionSaturation(3.8), "saturation at 3.8 V of all actuators"),
+        (ActionBias(0.1, (1,)), "bias of 0.1 V on actuators motor"),
+        (ObservationBias(0.1, (0,)), "bias of 0.1 rad on entries angle of the observation"),
+        (ObservationNoise(0.1), "noise of standard deviation 0.1 on all entries of the observation"),  # rad and rad/s
+        (ActionGain(0.5), "all actuators × 0.5"),
+        (ActionSaturation(3.8, (4,)), "saturation at 3.8 of actuators 4"),  # there is none
+    ],
+)
+def test_what_is_added_to_a_signal_or_limits_it_has_the_signals_unit(effect, words):
+    names = {
+        **{"entries": ["angle", "rate"], "entry_units": ["rad", "rad/s"]},
+        **{"actuators": ["pump", "motor"], "actuator_units": ["V", "V"]},
+    }
+    assert effect.describe(names) == words

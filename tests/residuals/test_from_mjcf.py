@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchrl_h2o.effects import JointDamping
+from torchrl_h2o.effects import Gravity, JointDamping
 from torchrl_h2o.residuals import Simulation, StateMap
 
 PENDULUM = Path(__file__).parents[2] / "recipes" / "models" / "simple_pendulum.xml"
@@ -81,11 +81,21 @@ def test_a_state_map_of_another_model_is_refused():
         Simulation.from_mjcf(PENDULUM, StateMap.of_coordinates(("q",), ("rad",), (0,), num_states=4), 0.005)
 
 
-@pytest.mark.parametrize("step", [0.004, 0.0005, 0.0, -0.005])
-def test_a_control_step_that_is_no_multiple_is_refused_with_advice(step):
-    advice = "set timestep=" if step > 0 else "give the time"
-    with pytest.raises(ValueError, match=f"no multiple of the timestep.*{advice}"):
+@pytest.mark.parametrize("step", [0.0, -0.005])
+def test_a_control_step_that_is_not_positive_is_refused(step):
+    with pytest.raises(ValueError, match="give the time between two rows"):
         Simulation.from_mjcf(PENDULUM, COLUMNS, step)
+
+
+@pytest.mark.parametrize(
+    ("step", "frame_skip", "timestep"), [(0.004, 2, 0.002), (0.0005, 1, 0.0005), (0.01, 4, 0.0025)]
+)
+def test_the_timestep_is_reduced_to_the_next_one_that_fits_the_log(step, frame_skip, timestep, tmp_path):
+    model = tmp_path / "pendulum.xml"
+    model.write_text(PENDULUM.read_text().replace("0.0016666666666666668", "0.003"))
+    simulation = Simulation.from_mjcf(model, COLUMNS, step)
+    assert (simulation.frame_skip, simulation.model.opt.timestep) == (frame_skip, pytest.approx(timestep))
+    assert simulation.with_effects(Gravity(2.0)).control_step == pytest.approx(step)
 
 
 def test_a_file_that_is_not_there_or_no_model_is_named(tmp_path):

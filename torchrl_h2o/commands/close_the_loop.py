@@ -51,8 +51,9 @@ def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
         names, step = recording.coordinates(cfg.simulator.coordinates), cfg.simulator.control_step
         simulation = Simulation.from_mjcf(cfg.simulator.path, names, step or recording.control_step(), effects)
         recording.check_actuators(simulation.model)
-        return simulation
-    return Simulation.from_env(TransformedEnv(instantiate(cfg.simulator.make), DynamicsGap(*effects)))
+    else:
+        simulation = Simulation.from_env(TransformedEnv(instantiate(cfg.simulator.make), DynamicsGap(*effects)))
+    return replace(simulation, action_units=recording.action_units)
 
 
 def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEntry] | None:

@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 from torchrl_h2o.data import LogColumns, load, sources_of
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
 from torchrl_h2o.data.readers.sources import Source, is_log, names_of, unique, words_of
+from torchrl_h2o.data.readers.units import to_si
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT
 from torchrl_h2o.training.real_data import RECORDED
 from torchrl_h2o.training.task import Task
@@ -58,6 +59,14 @@ class Recording:
     def estimated(self) -> tuple[EstimatedVelocity, ...]:
         """Observed velocities that were not measured but estimated from positions."""
         return () if self.columns is None else estimated_velocities(self.transitions, self.columns)
+
+    @property
+    def action_units(self) -> tuple[str, ...]:
+        """Units of the actions in the data, SI; empty if the data are not a log."""
+        if self.columns is None:
+            return ()
+        units = {column.name: to_si(column.unit)[0] for column in self.columns.columns}
+        return tuple(units[name] for name in self.columns.action)
 
     def for_model(self, model: mujoco.MjModel) -> Recording:
         """Returns the recording of a free motion with the model's actuators at zero; any other recording unchanged."""

@@ -36,7 +36,8 @@ class Effect(ABC):
     A subclass is a frozen dataclass. Fields made by :func:`parameter` are its parameters; all other fields select what
     it acts on, by name patterns (``Names``) or indices (``Indices``). The class attribute ``wording`` describes the
     effect, with the fields' names in braces, and ``{load}`` for "torque" or "force". ``random`` marks effects that draw
-    from the generator that :meth:`process` receives.
+    from the generator that :meth:`process` receives. ``of_signal`` names the parameter that has the unit of the
+    actions or observations that the effect acts on, if there is one.
 
     Raises:
         ValueError: for a parameter that is not a number within its bounds, or a field of type ``Names`` or
@@ -56,6 +57,7 @@ class Effect(ABC):
 
     wording: ClassVar[str]
     random: ClassVar[bool] = False
+    of_signal: ClassVar[str | None] = None
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
@@ -98,22 +100,36 @@ class Effect(ABC):
         }
 
     def parameters_on(self, names: EntryNames) -> dict[str, Parameter]:
-        """The parameters by name, with the units of the joints that the effect acts on.
+        """The parameters by name, with the units of the joints, actions or observations that the effect acts on.
 
         Args:
-            names: the joints of the model, as for :meth:`describe`.
+            names: the joints of the model and the units, as for :meth:`describe`.
 
         Examples:
-            >>> from torchrl_h2o.effects import JointDamping
+            >>> from torchrl_h2o.effects import ActionSaturation, JointDamping
             >>> joints = {"joints": ["rail"], "joint_bodies": ["cart"], "joint_types": ["slide"]}
             >>> str(JointDamping(0.1, "rail").parameters_on(joints)["damping"])
             '0.1 N·s/m'
+            >>> str(ActionSaturation(3.8).parameters_on({"actuator_units": ["V"]})["limit"])
+            '3.8 V'
         """
         moving = motion(getattr(self, "joints", None), names)
         return {
-            name: dataclasses.replace(parameter, unit=unit_under(moving, parameter.unit))
+            name: dataclasses.replace(
+                parameter,
+                unit=self._unit_of_signal(names) if name == self.of_signal else unit_under(moving, parameter.unit),
+            )
             for name, parameter in self.parameters.items()
         }
+
+    def _unit_of_signal(self, names: EntryNames) -> str:
+        """The unit of the actions or observations that the effect acts on; "1" if not known, or if they differ."""
+        for chosen, of in (("actuators", "actuator_units"), ("entries", "entry_units")):
+            if hasattr(self, chosen):
+                units, indices = names.get(of, ()), getattr(self, chosen)
+                found = {units[i] for i in (range(len(units)) if indices is None else indices) if i < len(units)}
+                return found.pop() if len(found) == 1 else "1"
+        return "1"
 
     @property
     def is_neutral(self) -> bool:
@@ -132,9 +148,9 @@ class Effect(ABC):
         """Describes the effect in words with units.
 
         Args:
-            names: names for the entries that are selected by index, by field (``"actuators"``, ``"entries"``), and
-                the joints of the model, from :func:`~torchrl_h2o.effects.joint_names`. Without the joints, units are
-                those of hinges.
+            names: names for the entries that are selected by index, by field (``"actuators"``, ``"entries"``), their
+                units (``"actuator_units"``, ``"entry_units"``), and the joints of the model, from
+                :func:`~torchrl_h2o.effects.joint_names`. Without the joints, units are those of hinges.
 
         Examples:
             >>> from torchrl_h2o.effects import ActionGain

@@ -32,6 +32,8 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
         ("motor1_pos_deg", "position", "deg"),
         ("kneeTorque_Nm", "action", "Nm"),
         ("i_q current", "action", "A"),
+        ("motor_volts", "action", "V"),
+        ("pwm", "action", "1"),
         ("tau_des", "action", "N·m"),
         ("pos_des", "desired position", "rad"),
         ("target_moment_shoulder", "action", "N·m"),
@@ -45,6 +47,13 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
 def test_kinds_and_units_by_name(name, kind, unit):
     (guess,) = guess_columns({name: 0.01 * np.arange(10.0)})
     assert (guess.kind, guess.unit) == (kind, unit)
+
+
+@pytest.mark.parametrize(("volts", "kind"), [([7.3, 7.4, 8.5], "unknown"), ([-7.3, 7.4, 7.4], "action")])
+def test_a_voltage_that_hardly_changes_is_that_of_a_supply(volts, kind):
+    pwm, supply = guess_columns({"pwm": np.array([0.0, 885.0, -885.0]), "input_volts": np.array(volts)})
+    assert (pwm.kind, supply.kind) == ("action", kind)
+    assert "scale" in pwm.note
 
 
 def test_names_of_the_model_say_what_a_column_is(tmp_path):

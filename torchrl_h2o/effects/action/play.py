@@ -28,6 +28,7 @@ class ActionDeadBand(ActionEffect):
 
     wording: ClassVar[str] = "dead band of {width} on {actuators}"
     memoryless: ClassVar[bool] = True
+    of_signal: ClassVar[str | None] = "width"
     width: float = parameter(unit="1", bounds=ANY_AMOUNT, neutral=0.0)
     actuators: Indices = None
 
@@ -57,6 +58,7 @@ class ActionSaturation(ActionEffect):
 
     wording: ClassVar[str] = "saturation at {limit} of {actuators}"
     memoryless: ClassVar[bool] = True
+    of_signal: ClassVar[str | None] = "limit"
     limit: float = parameter(unit="1", bounds=(0.0, math.inf), neutral=math.inf)
     actuators: Indices = None
 
@@ -87,6 +89,7 @@ class ActionBacklash(ActionEffect):
     """
 
     wording: ClassVar[str] = "backlash of {width} on {actuators}"
+    of_signal: ClassVar[str | None] = "width"
     width: float = parameter(unit="1", bounds=ANY_AMOUNT, neutral=0.0)
     actuators: Indices = None
 

@@ -39,6 +39,7 @@ class ActionNoise(ActionEffect):
     wording: ClassVar[str] = "noise of standard deviation {std} on {actuators}"
     random: ClassVar[bool] = True
     memoryless: ClassVar[bool] = True
+    of_signal: ClassVar[str | None] = "std"
     std: float = parameter(unit="1", bounds=ANY_SIZE, neutral=0.0)
     actuators: Indices = None
 
@@ -106,6 +107,7 @@ class ActionBias(ActionEffect):
 
     wording: ClassVar[str] = "bias of {bias} on {actuators}"
     memoryless: ClassVar[bool] = True
+    of_signal: ClassVar[str | None] = "bias"
     bias: float = parameter(unit="1", bounds=ANY_SIZE, neutral=0.0)
     actuators: Indices = None
 

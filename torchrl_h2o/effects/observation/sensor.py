@@ -29,6 +29,7 @@ class ObservationNoise(ObservationEffect):
     wording: ClassVar[str] = "noise of standard deviation {std} on {entries} of the observation"
     memoryless: ClassVar[bool] = True
     random: ClassVar[bool] = True
+    of_signal: ClassVar[str | None] = "std"
     std: float = parameter(unit="1", bounds=ANY_AMOUNT, neutral=0.0)
     entries: Indices = None
 
@@ -56,6 +57,7 @@ class ObservationBias(ObservationEffect):
 
     wording: ClassVar[str] = "bias of {bias} on {entries} of the observation"
     memoryless: ClassVar[bool] = True
+    of_signal: ClassVar[str | None] = "bias"
     bias: float = parameter(unit="1", bounds=ANY_SIZE, neutral=0.0)
     entries: Indices = None
 

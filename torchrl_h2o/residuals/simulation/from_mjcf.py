@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
 import mujoco
+from torchrl import torchrl_logger
 
 from torchrl_h2o.effects import Effect, compile_model
 from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
@@ -32,15 +34,18 @@ def source_of_mjcf(
         settings: the tolerance of the control step.
 
     Raises:
-        ValueError: for a file that is not a model, names that the model does not have, or a control step that is not a
-            multiple of its timestep.
+        ValueError: for a file that is not a model, names that the model does not have, or a control step that is not
+            positive.
     """
     path = Path(path)
+    model = _compiled(path)
+    frame_skip, timestep = _steps(control_step, model.opt.timestep, settings.clock_tolerance, path)
 
     def spec() -> mujoco.MjSpec:
-        return mujoco.MjSpec.from_file(str(path))
+        parsed = mujoco.MjSpec.from_file(str(path))
+        parsed.option.timestep = timestep
+        return parsed
 
-    model = _compiled(path, spec)
     if not isinstance(state_map, StateMap):
         state_map = _map_of(state_map, model, path)
     elif state_map.observe.shape[1] != model.nq + model.nv:
@@ -48,15 +53,14 @@ def source_of_mjcf(
             f"the state map is for {state_map.observe.shape[1]} coordinates, {path} has {model.nq} positions and "
             f"{model.nv} velocities"
         )
-    frame_skip = _frame_skip(control_step, model.opt.timestep, settings.clock_tolerance, path)
     return SimulatorSource(spec, frame_skip, state_map, tuple(effects), path.stem)
 
 
-def _compiled(path: Path, spec: Callable[[], mujoco.MjSpec]) -> mujoco.MjModel:
+def _compiled(path: Path) -> mujoco.MjModel:
     if not path.is_file():
         raise ValueError(f"there is no file {path}; give the path of an MJCF file")
     try:
-        return compile_model(spec())
+        return compile_model(mujoco.MjSpec.from_file(str(path)))
     except ValueError as error:
         raise ValueError(f"MuJoCo cannot make a model of {path}: {error}") from error
 
@@ -89,12 +93,16 @@ def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjMode
     return found
 
 
-def _frame_skip(control_step: float, timestep: float, tolerance: float, path: Path) -> int:
-    frame_skip = round(control_step / timestep) if control_step > 0.0 else 0
-    if frame_skip < 1 or abs(frame_skip * timestep - control_step) > tolerance * control_step:
-        fitting = control_step / max(1, -(-control_step // timestep)) if control_step > 0.0 else None
-        advice = f"set timestep={fitting:.6g} in the file's <option>" if fitting else "give the time between two rows"
-        raise ValueError(
-            f"a control step of {control_step:g} s is no multiple of the timestep of {path}, {timestep:g} s; {advice}"
-        )
-    return frame_skip
+def _steps(control_step: float, timestep: float, tolerance: float, path: Path) -> tuple[int, float]:
+    """Physics steps per control step, and the timestep: the file's, or the next smaller one that fits the log."""
+    if not control_step > 0.0:
+        raise ValueError(f"a control step of {control_step:g} s is not possible; give the time between two rows")
+    frame_skip = round(control_step / timestep)
+    if frame_skip >= 1 and abs(frame_skip * timestep - control_step) <= tolerance * control_step:
+        return frame_skip, timestep
+    frame_skip = math.ceil(control_step / timestep)
+    torchrl_logger.info(
+        f"{path}: {frame_skip} steps of {control_step / frame_skip:.6g} s between two rows of the log, which are "
+        f"{control_step:.6g} s apart, instead of steps of {timestep:g} s"
+    )
+    return frame_skip, control_step / frame_skip

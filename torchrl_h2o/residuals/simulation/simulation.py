@@ -41,6 +41,7 @@ class Simulation:
         state_map: the map between observations and states.
         effects: the effects in the simulator, in their order.
         name: the name for reports.
+        action_units: units of the action's entries, (nu), for reports; empty if they are not known.
         settings: tolerances and limits.
 
     Examples:
@@ -57,6 +58,7 @@ class Simulation:
     state_map: StateMap
     effects: tuple[Effect, ...] = ()
     name: str = "simulator"
+    action_units: tuple[str, ...] = ()
     settings: SimulationSettings = SIMULATION_SETTINGS
     _pool: Rollout = field(default_factory=lambda: Rollout(nthread=cpu_count()), repr=False)
 
@@ -87,11 +89,12 @@ class Simulation:
             state_map: a map; or the names of the observed coordinates, in the order of the data, where a joint's name
                 stands for its position and the name with ``_velocity`` appended for its velocity; or a mapping
                 from the columns of a log to these names.
-            control_step: the time between two rows of the data, in s; a multiple of the model's timestep.
+            control_step: the time between two rows of the data, in s. If it is no multiple of the model's timestep, the
+                timestep is reduced to the next one that fits.
             effects: effects to put into the simulator.
 
         Raises:
-            ValueError: for names that the model does not have, or a control step that is no multiple of the timestep.
+            ValueError: for names that the model does not have, or a control step that is not positive.
         """
         return cls._from_source(source_of_mjcf(path, state_map, control_step, effects))
 
@@ -135,8 +138,14 @@ class Simulation:
 
     @property
     def names(self) -> dict[str, Sequence[str]]:
-        """The names of observations, actuators and joints, for :meth:`Effect.describe`."""
-        return {"entries": self.state_map.names, "actuators": self.actuators, **joint_names(self.model)}
+        """The names and units of observations, actuators and joints, for :meth:`Effect.describe`."""
+        return {
+            "entries": self.state_map.names,
+            "entry_units": self.state_map.units,
+            "actuators": self.actuators,
+            "actuator_units": self.action_units,
+            **joint_names(self.model),
+        }
 
     @cached_property
     def _scratch(self) -> threading.local:

@@ -47,12 +47,13 @@ class Fit:
         return replace(self, effects=effects, free=free, half_widths=half_widths)
 
     def ci95(self, index: int) -> dict[str, tuple[float, float]]:
-        """95 % intervals (low, high) of one effect's fitted parameters, in their units."""
-        parameters = self.effects[index].parameters
-        return {
-            name: (float(parameters[name].value - half), float(parameters[name].value + half))
-            for name, half in self.half_widths[index].items()
-        }
+        """95 % intervals (low, high) of one effect's fitted parameters, in their units and within their bounds."""
+        intervals = {}
+        for name, half in self.half_widths[index].items():
+            parameter = self.effects[index].parameters[name]
+            ends = np.clip([parameter.value - half, parameter.value + half], *parameter.bounds)
+            intervals[name] = (float(ends[0]), float(ends[1]))
+        return intervals
 
 
 def fit(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.effects import Effect, ResidualForce
-from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
+from torchrl_h2o.effects import ActionBacklash, ActionDeadBand, ActionSaturation, Effect, ResidualForce
+from torchrl_h2o.effects.force.residual_force import coordinate, degrees_of_freedom
+from torchrl_h2o.effects.force.term import Factor, ForceTerm
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -135,7 +136,7 @@ def _nothing_to_explain(problem: Problem, starts: np.ndarray, settings: LoopSett
 
 
 def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | None:
-    """Adds terms while they lower the loss enough; after each addition, refits all terms and removes redundant ones."""
+    """Adds terms while they lower the loss enough; after each addition, refits all terms and makes them simpler."""
     rules, level = regression.settings.undeclared, regression.settings.significance.level
     best, left = None, regression.before
     barred = set()  # degrees of freedom on which a new term did not lower the loss enough
@@ -146,6 +147,7 @@ def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | 
         if exhausted or not added.terms or len(effect.terms) >= rules.max_terms:
             break
         candidate = _pruned(regression, _fitted(regression, ResidualForce((*effect.terms, *map(str, added.terms)))))
+        candidate = _straightened(regression, candidate)
         pays = left - candidate.loss > rules.min_term_gain * regression.before
         if pays and _p_value_further(regression, (effect,), candidate.effects, held_out=False) < level:
             best, left = candidate, candidate.loss
@@ -174,9 +176,10 @@ def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]
         simulation, problem.measured, starts, residual=residual, response=regression.response, settings=settings
     )
     observed = cast("np.ndarray", simulation.state_map.restore.any(1))
+    controls = _linear_controls(simulation)
     found = [
         sparse_force(
-            TermLibrary(freedom, regression.path, observed, settings),
+            TermLibrary(freedom, regression.path, observed, controls, settings),
             forces.force[:, freedom.velocity],
             forces.weight[:, freedom.velocity],
         )
@@ -184,6 +187,21 @@ def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]
         if freedom.name not in barred
     ]
     return max(found, key=lambda candidate: candidate.gain, default=SparseForce())
+
+
+def _linear_controls(simulation: Simulation) -> list[int]:
+    """The controls on which no effect of the simulation is nonlinear.
+
+    Powers of a control imitate its saturation or dead band; a fit of both would leave the values of both open.
+    """
+    nonlinear = [effect for effect in simulation.effects if _bends(effect)]
+    chosen = [getattr(effect, "actuators", None) for effect in nonlinear]
+    controls = range(simulation.model.nu)
+    return [index for index in controls if not any(some is None or index in some for some in chosen)]
+
+
+def _bends(effect: Effect) -> bool:
+    return isinstance(effect, ActionSaturation | ActionDeadBand | ActionBacklash) and not effect.is_neutral
 
 
 def _force_of(fitted: Fit) -> ResidualForce:
@@ -212,3 +230,37 @@ def _pruned(regression: _Regression, best: Fit) -> Fit:
             break
         best = candidate
     return best
+
+
+def _straightened(regression: _Regression, best: Fit) -> Fit:
+    """Replaces waves that are nearly straight over the measured positions by lines if these fit as well.
+
+    0.68 · sin(0.12 q) is 0.08 · q for angles of less than a turn, and a reader knows what a spring is.
+    """
+    terms = [part for term in _force_of(best).parsed for part in _line_of(term, regression)]
+    simpler: dict[tuple, ForceTerm] = {}
+    for term in terms:
+        same = simpler.get((term.joint, term.factors), replace(term, coefficient=0.0))
+        simpler[term.joint, term.factors] = replace(term, coefficient=same.coefficient + term.coefficient)
+    effect = ResidualForce(tuple(map(str, simpler.values())))
+    if effect == _force_of(best):
+        return best
+    candidate = _pruned(regression, _fitted(regression, effect))
+    cost = candidate.loss - best.loss
+    return best if cost > regression.settings.undeclared.min_term_gain * (regression.before - best.loss) else candidate
+
+
+def _line_of(term: ForceTerm, regression: _Regression) -> tuple[ForceTerm, ...]:
+    """A constant and a line in the place of a wave that is nearly straight; any other term as it is."""
+    *carrier, last = term.factors or (None,)
+    if last is None or last.function != "sin" or last.coordinate != "q":
+        return (term,)
+    path, freedoms = regression.path, degrees_of_freedom(regression.problem.simulation.model)
+    freedom = next(one for one in freedoms if one.name == term.joint)
+    position = coordinate("q", freedom, path.qpos, path.qvel, path.ctrl, path.time)
+    frequency, phase = last.numbers
+    if abs(frequency) * np.ptp(position) > regression.settings.undeclared.straight:
+        return (term,)
+    constant = replace(term, coefficient=term.coefficient * np.sin(phase), factors=tuple(carrier))
+    slope = term.coefficient * frequency * np.cos(phase)
+    return constant, replace(term, coefficient=slope, factors=(*carrier, Factor("power", "q")))

@@ -22,6 +22,8 @@ class UndeclaredSettings:
     """Control steps ahead at which the force must also lower the loss; a fit to sensor noise does not."""
     max_terms: int = 6
     """Largest number of terms of the whole force."""
+    straight: float = 1.0
+    """Part of a wave, in rad, over the measured positions, up to which it may be a straight line."""
     negligible: float = 1e-6
     """Residual, in spreads, that counts as rounding."""
     min_gain_over_catalogue: float = 0.05

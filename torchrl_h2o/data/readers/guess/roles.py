@@ -11,6 +11,8 @@ import numpy as np
 from torchrl_h2o.data.readers.units import UNITS, to_si
 
 _FORCES = ("tau", "torque", "torques", "effort", "force", "current", "moment")  # a commanded one is no desired position
+_VOLTS = ("volt", "volts", "voltage")
+_DUTY = ("pwm", "duty")
 _WORDS = {
     "time": ("t", "time", "timestamp", "stamp", "secs", "seconds", "millis", "clock"),
     "done": ("done", "terminal", "terminated", "fallen"),
@@ -32,7 +34,7 @@ _WORDS = {
         "v",
         "w",
     ),
-    "action": (*_FORCES, "u", "input", "action", "act"),
+    "action": (*_FORCES, *_VOLTS, *_DUTY, "u", "input", "action", "act"),
     "position": (
         *("pos", "position", "positions", "angle", "q", "theta", "phi", "psi", "roll", "pitch", "yaw", "alpha", "beta"),
         *("x", "y", "z", "height", "encoder", "enc", "joint", "hip", "knee", "ankle", "elbow", "shoulder", "wrist"),
@@ -41,6 +43,7 @@ _WORDS = {
 _WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
 _SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
+_STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 _LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 
 
@@ -98,6 +101,8 @@ def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str,
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
     if kind == "time":
         return Guess(name, kind, *_unit_of_time(numbers, unit))
+    if kind == "action" and any(word in _VOLTS for word in words) and _is_steady(numbers):
+        return Guess(name, "unknown", note="hardly changes, as the voltage of a supply")
     if unit is not None:
         return Guess(name, kind, unit, stem)
     unit, note = _unit_of(kind, si, words, numbers)
@@ -112,6 +117,11 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
         motion = () if any(word in _FORCES for word in words) else ("velocity", "position")
         return next((f"desired {kind}" for kind in motion if kind in fits), "action")
     return next((kind for kind in _WORDS if kind in fits), "unknown")
+
+
+def _is_steady(numbers: np.ndarray) -> bool:
+    least, most = np.quantile(np.abs(numbers), (0.05, 0.95))
+    return bool(np.ptp(np.sign(numbers)) == 0 and least > (1.0 - _STEADY) * most)
 
 
 def _words(name: str) -> list[str]:
@@ -153,8 +163,14 @@ def _unit_of(kind: str, si: str | None, words: Iterable[str], numbers: np.ndarra
     unit, largest = si or _SI.get(kind, "1"), float(np.abs(numbers).max())
     if si is not None and (kind != "position" or si != "rad"):
         return unit, f"check the unit: the largest value is {largest:.3g}"
+    if kind == "action" and any(word in _DUTY for word in words):
+        return (
+            "1",
+            f"the largest value is {largest:.3g}; for an actuator that takes volts: unit V, scale: volts per count",
+        )
     if kind == "action":
-        unit = "A" if "current" in words else "N" if "force" in words else "N·m"
+        units = {"A": ("current",), "N": ("force",), "V": _VOLTS}
+        unit = next((unit for unit, known in units.items() if any(word in known for word in words)), "N·m")
     elif kind not in _SI:
         return unit, ""
     elif si is None and any(word in _LENGTHS for word in words):
