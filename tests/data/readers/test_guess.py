@@ -78,3 +78,11 @@ def test_names_of_the_model_say_what_a_column_is(tmp_path):
         assert line in text
     assert "role: ignore" not in text
     assert "ignore" in guess_layout(tmp_path / "log.csv").text
+
+
+def test_the_command_of_a_servo_has_the_unit_of_its_position(tmp_path):
+    rows = np.cumsum(np.ones((50, 3)), axis=0) * [0.02, 2.0, 1.9]
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time,command,angle", comments="")
+    model = Coordinates({"arm": "rad", "arm_velocity": "rad/s"}, ["servo"], servos=True)
+    text = guess_layout(tmp_path / "log.csv", model).text
+    assert '{name: "command", role: action, unit: "deg"}  # the model\'s actuators are servos' in text

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.residual import activations, executed_actions, start_states
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -42,7 +42,8 @@ class Linearised:
         spread = np.nanstd(observed, axis=0)
         spread = np.where(spread > 0.0, spread, 1.0)
         actions = executed_actions(simulation, measured)
-        reached, slope = one_step(simulation, states, actions, measured.time, measured.settings.state_nudge * spread)
+        at = {"time": measured.time, "activations": activations(simulation, measured, actions)}
+        reached, slope = one_step(simulation, states, actions, measured.settings.state_nudge * spread, **at)
         slope = slope * spread / spread[:, None]
         follows = np.append(measured.run[1:] == measured.run[:-1], False)
         return cls(spread, observed / spread, reached / spread, slope, follows, states)
@@ -65,7 +66,13 @@ class Linearised:
 
 
 def one_step(
-    simulation: Simulation, states: np.ndarray, actions: np.ndarray, time: np.ndarray, nudge: np.ndarray
+    simulation: Simulation,
+    states: np.ndarray,
+    actions: np.ndarray,
+    nudge: np.ndarray,
+    *,
+    time: np.ndarray,
+    activations: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulates one control step and differentiates it by the previous observation, with finite differences.
 
@@ -73,8 +80,9 @@ def one_step(
         simulation: the simulator.
         states: (B, nq + nv), start states.
         actions: (B, nu), executed actions.
-        time: (B), start times in s.
         nudge: (n), steps of the differences, in the units of the observations.
+        time: (B), start times in s.
+        activations: (B, na), the actuators' activations at the start.
 
     Returns:
         Observations (B, n) and their derivatives by the previous observations (B, n, n); NaN where the simulation
@@ -83,6 +91,11 @@ def one_step(
     steps = nudge * simulation.state_map.restore_observed
     begun = np.concatenate([states, *(states + step for step in steps.T)])
     copies = 1 + len(nudge)
-    reached = simulation.rollout(begun, np.tile(actions, (copies, 1))[:, None], time=np.tile(time, copies))[:, 0]
+    reached = simulation.rollout(
+        begun,
+        np.tile(actions, (copies, 1))[:, None],
+        time=np.tile(time, copies),
+        activations=np.tile(activations, (copies, 1)),
+    )[:, 0]
     reached = simulation.state_map.observations(reached).reshape(copies, len(states), -1)
     return reached[0], np.moveaxis(reached[1:] - reached[0], 0, -1) / nudge

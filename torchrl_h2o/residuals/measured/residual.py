@@ -36,8 +36,13 @@ def residuals(
     if states is None:
         states = start_states(simulation, measured, starts)
     rows = starts[:, None] + np.arange(horizon)
+    actions = executed_actions(simulation, measured, rng)
     reached = simulation.rollout(
-        states[starts], executed_actions(simulation, measured, rng)[rows], time=measured.time[starts], applied=applied
+        states[starts],
+        actions[rows],
+        time=measured.time[starts],
+        activations=activations(simulation, measured, actions)[starts],
+        applied=applied,
     )
     return undelayed_following(simulation, measured)[rows] - simulation.observed(reached)
 
@@ -58,6 +63,13 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
 def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:
     """Actions after the action effects, (T, nu), run by run; random effects are left out without a generator."""
     return np.concatenate([simulation.executed(measured.action[run], rng) for run in measured.runs])
+
+
+def activations(simulation: Simulation, measured: Measured, actions: np.ndarray) -> np.ndarray:
+    """Activations of the actuators before each row, (T, na), under executed actions (T, nu), run by run."""
+    if not simulation.model.na:
+        return np.zeros((len(measured), 0))
+    return np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
 
 
 def undelayed_following(simulation: Simulation, measured: Measured) -> np.ndarray:

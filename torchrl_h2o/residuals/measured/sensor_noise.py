@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.residuals.measured.initial_states import noise_levels
-from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.residual import activations, executed_actions, start_states
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -61,9 +61,12 @@ def stand_in(
         states = start_states(simulation, measured)
     following = measured.following.copy()
     actions = executed_actions(simulation, measured)
+    before = activations(simulation, measured, actions)
     for starts in (measured.fitted(horizon), measured.selected_on(horizon)):
         rows = starts[:, None] + np.arange(horizon)
-        reached = simulation.rollout(states[starts], actions[rows], time=measured.time[starts])
+        reached = simulation.rollout(
+            states[starts], actions[rows], time=measured.time[starts], activations=before[starts]
+        )
         following[rows] = simulation.state_map.observations(reached)
     noise = rng.standard_normal((2, *following.shape)) * sensor_std
     true = simulation.state_map.observations(states)

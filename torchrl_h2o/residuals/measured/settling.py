@@ -33,7 +33,8 @@ def settle(
     first, last = _chains(np.unique(rows), begins, settings.settling_steps, settings.settled_rows)
     steps = np.arange(-settings.settling_steps, (last - first).max())[:, None]
     path = np.clip(first + steps, begins[first], last)
-    after = simulation.follow(states[path], actions[path], measured.time[path])
+    before = np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
+    after = simulation.follow(states[path], actions[path], measured.time[path], before[path])
     reached = (steps >= -1) & (first + steps < last)
     found = states.copy()
     found[(first + steps + 1)[reached][:, None], hidden] = after[reached]

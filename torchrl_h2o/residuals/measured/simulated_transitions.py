@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_h2o.effects import ActionEffect, ObservationDelay, ObservationEffect
-from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.residual import activations, executed_actions, start_states
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -58,7 +58,8 @@ def simulate_transitions(simulation: Simulation, real: TensorDictBase, *, seed: 
             noise = effect.process(simulation.control_step, rng)(noise)
     states = start_states(simulation, replace(measured, observation=measured.observation - noise))
     actions = executed_actions(simulation, measured, rng)
-    reached = simulation.rollout(states, actions[:, None], time=measured.time)[:, 0]
+    at = {"time": measured.time, "activations": activations(simulation, measured, actions)}
+    reached = simulation.rollout(states, actions[:, None], **at)[:, 0]
     following = simulation.state_map.observations(reached)
     for effect in sensors:
         if effect.memoryless:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import norm
 
 from torchrl_h2o.residuals.measured.linearised import one_step
-from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.residual import activations, executed_actions, residuals, start_states
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, NoiseSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -98,14 +98,16 @@ def derivatives(
     Returns:
         Derivatives by the executed action, (W, n, nu), and by the previous observation, (W, n, n), in their units.
     """
-    start, actions, time = states[rows], executed_actions(simulation, measured)[rows], measured.time[rows]
-    base, by_sensor = one_step(simulation, start, actions, time, nudge * (measured.observation.std(0) + 1e-9))
+    start, executed = states[rows], executed_actions(simulation, measured)
+    actions = executed[rows]
+    at = {"time": measured.time[rows], "activations": activations(simulation, measured, executed)[rows]}
+    base, by_sensor = one_step(simulation, start, actions, nudge * (measured.observation.std(0) + 1e-9), **at)
     by_action = []
     for index in range(actions.shape[1]):
         # a step towards zero, because the control range may clamp a step outwards
         step = np.zeros_like(actions)
         size = nudge * (np.abs(actions[:, index]).max() + 1e-6)
         step[:, index] = np.where(actions[:, index] > 0.0, -size, size)
-        reached = simulation.rollout(start, (actions + step)[:, None], time=time)[:, 0]
+        reached = simulation.rollout(start, (actions + step)[:, None], **at)[:, 0]
         by_action.append((simulation.state_map.observations(reached) - base) / step[:, index, None])
     return np.stack(by_action, axis=-1), by_sensor

@@ -21,6 +21,7 @@ from torchrl_h2o.data.audit.log import find_pairs
 from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
 from torchrl_h2o.effects.effect import BatchedForce
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
+from torchrl_h2o.residuals.simulation.activations import activations_along, settled_activations
 from torchrl_h2o.residuals.simulation.from_env import source_of_env
 from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
 from torchrl_h2o.residuals.simulation.observability import hidden_coordinates
@@ -184,6 +185,10 @@ class Simulation:
         """
         return self.pipeline.executed_run(actions, self.control_step, rng)
 
+    def activations(self, actions: np.ndarray) -> np.ndarray:
+        """Returns the actuators' activations, (T, na), before each executed action, (T, nu), of one recorded run."""
+        return activations_along(self.model, actions, self.frame_skip)
+
     def true_observations(self, observations: np.ndarray) -> np.ndarray:
         """Undoes the sensor effects of a recorded run, (T, n); NaN if impossible; see :meth:`Pipeline.restore_run`."""
         return self.pipeline.restore_run(observations, self.control_step)
@@ -202,6 +207,7 @@ class Simulation:
         actions: np.ndarray,
         *,
         time: np.ndarray | None = None,
+        activations: np.ndarray | None = None,
         applied: np.ndarray | None = None,
     ) -> np.ndarray:
         """Steps many states at once.
@@ -210,13 +216,15 @@ class Simulation:
             states: initial states, (B, nq + nv).
             actions: executed actions of H control steps, (B, H, nu).
             time: initial time in s, (B,); 0 by default.
+            activations: initial activations of the actuators, (B, na); by default those after a long time under the
+                first actions.
             applied: generalised forces in N or N·m, (B, H, nv), added to those of the effects.
 
         Returns:
             The states after each control step, (B, H, nq + nv); NaN from the step on at which the simulation diverges.
         """
         batch, horizon, _ = actions.shape
-        full = self._full(states, np.zeros(batch) if time is None else time)
+        full = self._full(states, np.zeros(batch) if time is None else time, activations, actions[:, 0])
         forces = self.pipeline.batched_forces(self.model)
         chunk = max(1, self.settings.rollout_numbers // (horizon * self.frame_skip * full.shape[-1]))
         parts = []
@@ -226,7 +234,9 @@ class Simulation:
                 parts.append(self._stepped(full[rows], actions[rows], forces, own))
         return np.concatenate(parts) if parts else np.zeros((0, horizon, states.shape[1]))
 
-    def follow(self, states: np.ndarray, actions: np.ndarray, time: np.ndarray) -> np.ndarray:
+    def follow(
+        self, states: np.ndarray, actions: np.ndarray, time: np.ndarray, activations: np.ndarray | None = None
+    ) -> np.ndarray:
         """Simulates the hidden coordinates of many recordings side by side.
 
         At each step the observed coordinates begin at the recorded values, and the hidden ones where the step before
@@ -236,12 +246,13 @@ class Simulation:
             states: recorded states, (L, B, nq + nv); their hidden coordinates are those to begin with.
             actions: executed actions, (L, B, nu).
             time: time of the states in s, (L, B).
+            activations: activations of the actuators, (L, B, na); by default those after a long time under the actions.
 
         Returns:
             The hidden coordinates after each step, (L, B, hidden).
         """
         hidden = np.asarray(self.state_map.hidden, int)
-        full, places = self._full(states, time), 1 + hidden
+        full, places = self._full(states, time, activations, actions), 1 + hidden
         forces = self.pipeline.batched_forces(self.model)
         reached = np.empty((*states.shape[:2], len(hidden)))
         carried = states[0][:, hidden]
@@ -254,11 +265,17 @@ class Simulation:
                 reached[step] = carried
         return reached
 
-    def _full(self, states: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Full physics states, (..., size), of states (..., nq + nv) at times (...)."""
+    def _full(
+        self, states: np.ndarray, time: np.ndarray, activations: np.ndarray | None, actions: np.ndarray
+    ) -> np.ndarray:
+        """Full physics states, (..., size), of states (..., nq + nv) at times (...), before actions (..., nu)."""
         full = np.zeros((*states.shape[:-1], mujoco.mj_stateSize(self.model, FULL_PHYSICS)))
         full[..., 0] = time
-        full[..., 1 : 1 + states.shape[-1]] = states
+        after = 1 + states.shape[-1]
+        full[..., 1:after] = states
+        if self.model.na:
+            settled = settled_activations(self.model, actions) if activations is None else activations
+            full[..., after : after + self.model.na] = settled
         return full
 
     def _stepped(

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.residual import activations, executed_actions, residuals, start_states
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, RegressionSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -83,7 +83,9 @@ def force_response(
     model, state_map = simulation.model, simulation.state_map
     states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0]
-    states, actions = states[starts], executed_actions(simulation, measured)[starts][:, None]
+    executed = executed_actions(simulation, measured)
+    states, actions = states[starts], executed[starts][:, None]
+    at = {"time": measured.time[starts], "activations": activations(simulation, measured, executed)[starts]}
     change = np.nanstd(missed @ state_map.restore.T, axis=0)[model.nq :]
     change = np.maximum(change, 1e-6 + 1e-4 * np.nanstd(states[:, model.nq :], axis=0))
     size = settings.force_nudge * model.dof_M0 * change / simulation.control_step
@@ -92,7 +94,7 @@ def force_response(
         push = np.zeros((len(starts), 1, model.nv))
         push[..., dof] = size[dof]
         ends = [
-            state_map.observations(simulation.rollout(states, actions, time=measured.time[starts], applied=sign * push))
+            state_map.observations(simulation.rollout(states, actions, **at, applied=sign * push))
             for sign in (1.0, -1.0)
         ]
         columns.append((ends[0] - ends[1])[:, 0] / (2.0 * size[dof]))
@@ -124,12 +126,13 @@ def step_path(
     states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0] @ simulation.state_map.restore.T
     states = states[starts]
-    actions = np.repeat(executed_actions(simulation, measured)[starts][:, None], steps, axis=1)
-    time = measured.time[starts]
-    finely = replace(simulation, frame_skip=1).rollout(states, actions, time=time)
+    executed = executed_actions(simulation, measured)
+    actions = np.repeat(executed[starts][:, None], steps, axis=1)
+    at = {"time": measured.time[starts], "activations": activations(simulation, measured, executed)[starts]}
+    finely = replace(simulation, frame_skip=1).rollout(states, actions, **at)
     path = np.concatenate([states[:, None], finely[:, :-1]], axis=1)
     path = path + np.linspace(0.0, 1.0, steps, endpoint=False)[:, None] * missed[:, None]
-    moments = time[:, None] + model.opt.timestep * np.arange(steps)
+    moments = at["time"][:, None] + model.opt.timestep * np.arange(steps)
     return StepPath(path[..., : model.nq], path[..., model.nq :], actions, moments)
 
 

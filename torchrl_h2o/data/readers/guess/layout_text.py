@@ -102,9 +102,16 @@ def _one_set(columns: Sequence[Guess]) -> list[Guess]:
 
 
 def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
-    """Desired positions as the actions of servos, and no torques beside them."""
+    """Desired positions as the actions of servos, and no torques beside them; without any, other commands."""
     if not any(column.kind == "desired position" for column in columns):
-        return list(columns)
+        note = "the model's actuators are servos, which take positions: check the unit"
+        positions = [column for column in columns if column.kind == "position"]
+        unit = positions[0].unit if positions else "rad"
+        torques = [column.kind == "action" and column.unit == "N·m" for column in columns]
+        return [
+            replace(column, unit=unit, note=note) if torque else column
+            for column, torque in zip(columns, torques, strict=True)
+        ]
     result = []
     for column in columns:
         if column.kind == "desired position":
