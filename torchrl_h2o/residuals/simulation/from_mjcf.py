@@ -11,7 +11,6 @@ import mujoco
 from torchrl import torchrl_logger
 
 from torchrl_h2o.effects import Effect, compile_model
-from torchrl_h2o.residuals.simulation.activations import actuators_of_unknown_activation
 from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
 from torchrl_h2o.residuals.simulation.source import SimulatorSource
 from torchrl_h2o.residuals.simulation.state_map import StateMap, coordinate_names
@@ -40,11 +39,6 @@ def source_of_mjcf(
     """
     path = Path(path)
     model = _compiled(path)
-    if unknown := actuators_of_unknown_activation(model):
-        raise ValueError(
-            f"{path}: the activation of {', '.join(unknown)} is not in the data and does not follow from the commands; "
-            "use actuators without dynamics, or with dyntype integrator, filter or filterexact"
-        )
     frame_skip, timestep = _steps(control_step, model.opt.timestep, settings.clock_tolerance, path)
 
     def spec() -> mujoco.MjSpec:

@@ -21,7 +21,11 @@ from torchrl_h2o.data.audit.log import find_pairs
 from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
 from torchrl_h2o.effects.effect import BatchedForce
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
-from torchrl_h2o.residuals.simulation.activations import activations_along, settled_activations
+from torchrl_h2o.residuals.simulation.activations import (
+    activations_along,
+    actuators_of_unknown_activation,
+    settled_activations,
+)
 from torchrl_h2o.residuals.simulation.from_env import source_of_env
 from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
 from torchrl_h2o.residuals.simulation.observability import hidden_coordinates
@@ -71,7 +75,8 @@ class Simulation:
             env: a GymEnv of a MuJoCo task, with or without transforms.
 
         Raises:
-            ValueError: if the env is no Gymnasium MuJoCo task or its observation is not linear in the state.
+            ValueError: if the env is no Gymnasium MuJoCo task, its observation is not linear in the state, or an
+                actuator's activation does not follow from the commands, such as a muscle's.
         """
         return cls._from_source(source_of_env(env))
 
@@ -95,7 +100,8 @@ class Simulation:
             effects: effects to put into the simulator.
 
         Raises:
-            ValueError: for names that the model does not have, or a control step that is not positive.
+            ValueError: for names that the model does not have, a control step that is not positive, or an actuator
+                whose activation does not follow from the commands, such as a muscle.
         """
         return cls._from_source(source_of_mjcf(path, state_map, control_step, effects))
 
@@ -103,6 +109,11 @@ class Simulation:
     def _from_source(cls, source: SimulatorSource) -> Simulation:
         """Builds the simulation of a source and marks the hidden coordinates in its state map."""
         simulation = cls(*source)
+        if unknown := actuators_of_unknown_activation(simulation.model):
+            raise ValueError(
+                f"{source.name}: the activation of {', '.join(unknown)} is not in the data and does not follow from "
+                "the commands; use actuators without dynamics, or with dyntype integrator, filter or filterexact"
+            )
         state_map = source.state_map
         hidden = hidden_coordinates(state_map, simulation.model.nu, simulation.rollout, simulation.settings)
         return replace(simulation, state_map=replace(state_map, hidden=hidden))
