@@ -10,6 +10,7 @@ from tests.effects.models import ASSETS, as_bytes, spec
 from torchrl_h2o import envs
 from torchrl_h2o.effects import (
     ActionGain,
+    ActuatorTimeConstant,
     BodyMass,
     CatalogueEntry,
     ForceEffect,
@@ -196,14 +197,19 @@ def test_servos_may_be_stiffer_or_weaker():
       </body></worldbody><actuator>{}</actuator></mujoco>"""
     servos = '<position joint="a" kp="9"/><position joint="b" kp="9"/>'
 
-    def stiffness(actuators):
+    def offered(actuators, effect):
         entries = catalogue(mujoco.MjSpec.from_string(arm.format(actuators)), num_observations=0, dt=0.01)
-        return [entry.effect.actuators for entry in entries if isinstance(entry.effect, ServoStiffness)]
+        return [entry.effect.actuators for entry in entries if isinstance(entry.effect, effect)]
+
+    def stiffness(actuators):
+        return offered(actuators, ServoStiffness)
 
     assert stiffness(servos) == [(0,), (1,), None]
     assert stiffness(servos + '<motor joint="a"/>') == [(0,), (1,), None]
     assert stiffness('<position joint="a" kp="9"/>') == [None]
     assert stiffness('<motor joint="a"/>') == []
+    assert offered(servos, ActuatorTimeConstant) == []
+    assert offered(servos.replace('kp="9"', 'kp="9" timeconst="0.1"'), ActuatorTimeConstant) == [(0,), (1,), None]
 
 
 def test_velocities_may_be_late_together():

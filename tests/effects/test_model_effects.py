@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from tests.effects.models import CART, FILES, as_bytes, spec
 from torchrl_h2o.effects import (
+    ActuatorTimeConstant,
     Armature,
     BodyCentreOfMass,
     BodyInertia,
@@ -204,6 +205,22 @@ def test_servo_stiffness_scales_servos_and_leaves_motors_and_damping(actuators, 
 def test_servo_stiffness_needs_a_servo(actuators, complaint):
     with pytest.raises(ValueError, match=complaint):
         compile_model(mujoco.MjSpec.from_string(SERVO), [ServoStiffness(0.7, actuators)])
+
+
+FILTERED = SERVO.replace('kp="30" kv="1"', 'kp="30" timeconst="0.1"')
+
+
+def test_time_constants_of_filters_are_scaled_and_other_actuators_are_left():
+    after = compile_model(mujoco.MjSpec.from_string(FILTERED), [ActuatorTimeConstant(0.2)])
+    before = compile_model(mujoco.MjSpec.from_string(FILTERED))
+    np.testing.assert_allclose(after.actuator_dynprm[1, 0], 0.02)
+    np.testing.assert_array_equal(after.actuator_dynprm[[0, 2]], before.actuator_dynprm[[0, 2]])
+
+
+@pytest.mark.parametrize(("actuators", "complaint"), [((2,), "has a filter"), ((3,), "not all indices of 3 actuators")])
+def test_a_time_constant_needs_a_filter(actuators, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        compile_model(mujoco.MjSpec.from_string(FILTERED), [ActuatorTimeConstant(0.2, actuators)])
 
 
 def test_neutral_servo_stiffness_leaves_the_model_bit_identical():

@@ -31,7 +31,7 @@ from torchrl_h2o.effects.model.joint import (
     JointFrictionLoss,
     JointRange,
 )
-from torchrl_h2o.effects.model.servo import ServoStiffness
+from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness
 from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
 from torchrl_h2o.effects.model.timestep import Timestep
 from torchrl_h2o.effects.negligible import is_negligible
@@ -55,6 +55,7 @@ __all__ = [
     "ActionLag",
     "ActionNoise",
     "ActionSaturation",
+    "ActuatorTimeConstant",
     "Armature",
     "BodyCentreOfMass",
     "BodyInertia",

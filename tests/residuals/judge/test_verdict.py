@@ -92,7 +92,7 @@ def test_an_effect_that_does_not_lower_the_error_is_not_recommended():
 def test_effects_that_make_a_quantity_worse_are_said_to_be_wrong():
     """Gravity is right, but no reading is scaled: the sum of all errors falls, that of the position rises."""
     wrong = verdict((Gravity(1.5),), (Gravity(1.5), ObservationGain(1.3, (1,))))
-    assert wrong.kind != EXPLAINED
+    assert (wrong.kind, wrong.recommended) == (NOT_EXPLAINED, False)
     (reason,) = [reason for reason in wrong.reasons if "is wrong: they raise" in reason]
     assert "error of elbow 100 ms ahead: 24 → 30 mrad (+25 %)" in reason
 

@@ -21,7 +21,7 @@ from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.indices import Indices
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
-from torchrl_h2o.effects.model.servo import ServoStiffness, is_servo
+from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness, is_filter, is_servo
 from torchrl_h2o.effects.model.timestep import Timestep
 from torchrl_h2o.effects.observation.sensor import (
     ObservationBias,
@@ -94,11 +94,18 @@ def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
 
 
 def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
-    servos = tuple(index for index, actuator in enumerate(spec.actuators) if is_servo(actuator))
-    choices: dict[Indices, tuple[int, ...]] = {(index,): (index,) for index in servos} if len(servos) > 1 else {}
-    if servos:
-        choices[None] = servos
-    yield from entries_of(ServoStiffness, "actuators", choices, lambda _: each("scale", *mechanism.settings.factors))
+    factors = mechanism.settings.factors
+    yield from entries_of(ServoStiffness, "actuators", _where(is_servo, spec), lambda _: each("scale", *factors))
+    yield from entries_of(
+        ActuatorTimeConstant, "actuators", _where(is_filter, spec), lambda _: each("scale", 0.1, *factors, 4.0)
+    )
+
+
+def _where(applies: Callable[[mujoco.MjsActuator], bool], spec: mujoco.MjSpec) -> dict[Indices, tuple[int, ...]]:
+    """The actuators of one kind: each alone, and all together."""
+    chosen = tuple(index for index, actuator in enumerate(spec.actuators) if applies(actuator))
+    choices: dict[Indices, tuple[int, ...]] = {(index,): (index,) for index in chosen} if len(chosen) > 1 else {}
+    return choices | ({None: chosen} if chosen else {})
 
 
 def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]:

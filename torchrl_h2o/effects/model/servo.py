@@ -1,4 +1,4 @@
-"""Effect on the position servos of a model."""
+"""Effects on the position servos and the filters of a model's actuators."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -33,16 +33,56 @@ class ServoStiffness(ModelEffect):
     actuators: Indices = None
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        count = len(spec.actuators)
-        chosen = range(count) if self.actuators is None else self.actuators
-        if any(index >= count for index in chosen):
-            raise ValueError(f"{chosen} are not all indices of {count} actuators")
-        servos = [spec.actuators[index] for index in chosen if is_servo(spec.actuators[index])]
+        servos = [actuator for actuator in _chosen(spec, self.actuators) if is_servo(actuator)]
         if not servos:
             raise ValueError("none of the actuators is a position servo, whose stiffness could be scaled")
         for servo in servos:
             servo.gainprm[0] *= self.scale
             servo.biasprm[1] *= self.scale
+
+
+@dataclass(frozen=True)
+class ActuatorTimeConstant(ModelEffect):
+    """Scales the time constants of the filters in a model's actuators.
+
+    :class:`ActionLag` adds a filter; this effect makes one that the model has faster or slower.
+
+    Args:
+        scale: factor on the time constant, which MJCF calls ``timeconst`` or ``dynprm``.
+        actuators: indices of the actuators; all by default. Actuators without a filter are skipped.
+
+    Raises:
+        ValueError: when put into a model that has no such actuator.
+
+    Examples:
+        >>> ActuatorTimeConstant(0.1).describe()
+        'time constant of the filters of all actuators × 0.1'
+    """
+
+    wording: ClassVar[str] = "time constant of the filters of {actuators} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.01, 100.0), neutral=1.0)
+    actuators: Indices = None
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        filters = [actuator for actuator in _chosen(spec, self.actuators) if is_filter(actuator)]
+        if not filters:
+            raise ValueError("none of the actuators has a filter, whose time constant could be scaled")
+        for actuator in filters:
+            actuator.dynprm[0] *= self.scale
+
+
+def _chosen(spec: mujoco.MjSpec, actuators: Indices) -> list[mujoco.MjsActuator]:
+    count = len(spec.actuators)
+    chosen = range(count) if actuators is None else actuators
+    if any(index >= count for index in chosen):
+        raise ValueError(f"{chosen} are not all indices of {count} actuators")
+    return [spec.actuators[index] for index in chosen]
+
+
+def is_filter(actuator: mujoco.MjsActuator) -> bool:
+    """Whether the command of an actuator passes a filter of first order."""
+    filters = (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+    return actuator.dyntype in filters and actuator.dynprm[0] > 0.0
 
 
 def is_servo(actuator: mujoco.MjsActuator) -> bool:

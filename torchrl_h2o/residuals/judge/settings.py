@@ -88,6 +88,8 @@ class VerdictSettings:
     """Median error ahead up to which effects explain the motion, in errors of the guess of constant velocities."""
     auc_near_one: float = 0.95
     """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
+    raised: float = 1.1
+    """Factor of the sentence's error from which on effects raise it, and are not recommended."""
     much_lower: float = 0.5
     """Share of the error ahead below which an explanation counts in spite of such an AUC."""
     extreme_factor: float = 20.0

@@ -26,6 +26,7 @@ from torchrl_h2o.residuals.report.contents import (
     Verdict,
 )
 from torchrl_h2o.residuals.report.errors import ErrorSummary
+from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -62,10 +63,15 @@ def reach_verdict(
         if not signs:
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
-    if error.headline is not None:
-        steps = max(1, round(error.headline.seconds / simulation.control_step))
-        signs = (*made_worse(simulation, mended, measured, steps, settings), *signs)
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
+    if (head := error.headline) is not None:
+        steps = max(1, round(head.seconds / simulation.control_step))
+        worse = made_worse(simulation, mended, measured, steps, settings)
+        acting = any(not effect.random for effect in effects)
+        if acting and head.after > rules.raised * head.before:
+            against = (*against, *(worse or (f"the effects found raise the error of {headline_words(head)}",)))
+        else:
+            signs = (*worse, *signs)
     caveats = short_delays(effects, measured, simulation.control_step)
     if signs and not _leaves_little(error, two_sample, rules):
         where = where_most(mended, measured, settings)
