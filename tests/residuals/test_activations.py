@@ -4,13 +4,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from torchrl_h2o.effects import JointFrictionLoss
+from torchrl_h2o.data import audit
+from torchrl_h2o.effects import ActionSaturation, JointFrictionLoss, ResidualForce
 from torchrl_h2o.residuals import Measured, Simulation, residuals
 from torchrl_h2o.residuals.simulation.activations import activations_along
+from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 ARM = """
 <mujoco>
-  <option timestep="0.002"/>
+  <option timestep="0.002" integrator="{integrator}"/>
   <worldbody>
     <body>
       <joint name="hinge" type="hinge" axis="0 1 0"/>
@@ -26,7 +28,6 @@ ACTUATORS = {
     "filter": SERVO.format(kind="filter", act="", gain=STIFF),
     "filterexact": SERVO.format(kind="filterexact", act="", gain=STIFF),
     "bounded filter": SERVO.format(kind="filter", act='actlimited="true" actrange="-.5 .5"', gain=STIFF),
-    "integrator": SERVO.format(kind="integrator", act='actlimited="true" actrange="-.02 .02"', gain=STIFF),
     "none": '<motor joint="hinge"/>',
 }
 FRAME_SKIP = 5
@@ -39,13 +40,16 @@ def commands(rows=300, seed=0):
 
 def write(tmp_path, actuator):
     path = tmp_path / "arm.xml"
-    path.write_text(ARM.format(actuator=actuator))
+    path.write_text(ARM.format(actuator=actuator, integrator="Euler"))
     return path
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+@pytest.mark.parametrize("constant", ["0.1", "0.003"])
 @pytest.mark.parametrize("name", ACTUATORS)
-def test_activations_are_those_of_mujoco(name):
-    model = mujoco.MjModel.from_xml_string(ARM.format(actuator=ACTUATORS[name]))
+def test_activations_are_those_of_mujoco(name, constant, integrator):
+    actuator = ACTUATORS[name].replace('dynprm="0.1"', f'dynprm="{constant}"')
+    model = mujoco.MjModel.from_xml_string(ARM.format(actuator=actuator, integrator=integrator))
     data, action = mujoco.MjData(model), commands()
     along = activations_along(model, action, FRAME_SKIP)
     data.act[:] = along[0]
@@ -73,7 +77,7 @@ def recording(simulation, seed=0):
     )
 
 
-@pytest.mark.parametrize("name", ["filter", "filterexact", "integrator"])
+@pytest.mark.parametrize("name", ["filter", "filterexact"])
 def test_windows_in_the_middle_of_a_run_continue_it(name, tmp_path):
     simulation = Simulation.from_mjcf(write(tmp_path, ACTUATORS[name]), ["hinge", "hinge_velocity"], 0.01)
     measured = recording(simulation)
@@ -83,7 +87,27 @@ def test_windows_in_the_middle_of_a_run_continue_it(name, tmp_path):
     assert np.abs(residuals(friction, measured, np.arange(0, 590, 7), 5)).max() > 1e-3
 
 
-def test_an_activation_that_no_formula_gives_is_refused(tmp_path):
-    muscle = '<muscle name="biceps" joint="hinge" lengthrange="0 1"/>'
-    with pytest.raises(ValueError, match=r"activation of biceps .*dyntype integrator, filter or filterexact"):
-        Simulation.from_mjcf(write(tmp_path, muscle), ["hinge", "hinge_velocity"], 0.01)
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<muscle name="biceps" joint="hinge" lengthrange="0 1"/>',
+        '<intvelocity name="biceps" joint="hinge" kp="2" actrange="-1 1"/>',  # unknown when the log begins
+        '<position name="biceps" joint="hinge" timeconst="0.1" delay="0.03" nsample="20"/>',
+    ],
+)
+def test_an_activation_that_the_commands_do_not_tell_is_refused(actuator, tmp_path):
+    with pytest.raises(ValueError, match=r"activation of biceps .*dyntype filter or filterexact"):
+        Simulation.from_mjcf(write(tmp_path, actuator), ["hinge", "hinge_velocity"], 0.01)
+
+
+def test_the_audit_finds_no_lag_of_the_actions_behind_the_filter_of_a_right_model(tmp_path):
+    simulation = Simulation.from_mjcf(write(tmp_path, ACTUATORS["filter"]), ["hinge", "hinge_velocity"], 0.01)
+    found = audit(recording(simulation), simulation).findings
+    assert not [finding for finding in found if "later than" in finding.words or finding.check == "model"]
+
+
+def test_a_control_times_a_position_may_stand_beside_a_saturation_that_is_never_reached(tmp_path):
+    simulation = Simulation.from_mjcf(write(tmp_path, ACTUATORS["none"]), ["hinge", "hinge_velocity"], 0.01)
+    truth = ResidualForce(("torque on hinge: 0.1 · a0 · q",))
+    beside = find_undeclared(simulation.with_effects(ActionSaturation(9.0)), recording(simulation.with_effects(truth)))
+    assert "a0 · q" in beside.effect.describe() or "q · a0" in beside.effect.describe()

@@ -49,11 +49,20 @@ def test_kinds_and_units_by_name(name, kind, unit):
     assert (guess.kind, guess.unit) == (kind, unit)
 
 
-@pytest.mark.parametrize(("volts", "kind"), [([7.3, 7.4, 8.5], "unknown"), ([-7.3, 7.4, 7.4], "action")])
+STEADY, TURNING = [7.3, 7.4, np.nan, 8.5], [-7.3, 7.4, 7.4, 7.4]
+
+
+@pytest.mark.parametrize(("volts", "kind"), [(STEADY, "unknown"), (TURNING, "action")])
 def test_a_voltage_that_hardly_changes_is_that_of_a_supply(volts, kind):
-    pwm, supply = guess_columns({"pwm": np.array([0.0, 885.0, -885.0]), "input_volts": np.array(volts)})
+    pwm, supply = guess_columns({"pwm": np.array([0.0, 885.0, -885.0, 0.0]), "input_volts": np.array(volts)})
     assert (pwm.kind, supply.kind) == ("action", kind)
     assert "scale" in pwm.note
+
+
+def test_a_steady_voltage_is_the_action_where_it_is_the_only_one_or_the_models():
+    (alone,) = guess_columns({"motor_voltage": np.full(5, 6.0)})
+    named, _ = guess_columns({"voltage": np.full(5, 6.0), "tau": np.arange(5.0)}, {"voltage": ("action", None)})
+    assert (alone.kind, alone.unit, named.kind) == ("action", "V", "action")
 
 
 def test_names_of_the_model_say_what_a_column_is(tmp_path):
@@ -81,8 +90,9 @@ def test_names_of_the_model_say_what_a_column_is(tmp_path):
 
 
 def test_the_command_of_a_servo_has_the_unit_of_its_position(tmp_path):
-    rows = np.cumsum(np.ones((50, 3)), axis=0) * [0.02, 2.0, 1.9]
-    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time,command,angle", comments="")
+    rows = np.cumsum(np.ones((50, 4)), axis=0) * [0.02, 2.0, 1.9, 0.1]
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time,command,angle,effort", comments="")
     model = Coordinates({"arm": "rad", "arm_velocity": "rad/s"}, ["servo"], servos=True)
     text = guess_layout(tmp_path / "log.csv", model).text
     assert '{name: "command", role: action, unit: "deg"}  # the model\'s actuators are servos' in text
+    assert '{name: "effort", role: ignore}' in text

@@ -24,6 +24,7 @@ class Response:
         starts: first row of each window, (W,).
         states: start states, (W, nq + nv).
         actions: executed actions of all rows, (T, nu).
+        activations: activations of the actuators before each row, (T, na).
         moving: columns of the observed velocities, (m,).
         noise: standard deviation of the noise of each observation, (n,); None if it is not known.
     """
@@ -35,6 +36,7 @@ class Response:
     starts: np.ndarray
     states: np.ndarray
     actions: np.ndarray
+    activations: np.ndarray
     moving: np.ndarray
     noise: np.ndarray | None = None
 
@@ -64,8 +66,9 @@ class Response:
         true = np.concatenate([simulation.true_observations(log.observation[run]) for run in log.runs])
         actions = np.concatenate([simulation.executed(log.action[run]) for run in log.runs])
         states = simulation.state_map.states(true)
-        chosen = _settled(log, simulation, states, actions, starts, margin)
-        return cls(log, simulation, settings, horizon, starts, chosen, actions, moving, noise)
+        activations = np.concatenate([simulation.activations(actions[run]) for run in log.runs])
+        chosen = _settled(log, simulation, states, actions, activations, starts, margin)
+        return cls(log, simulation, settings, horizon, starts, chosen, actions, activations, moving, noise)
 
     @property
     def rows(self) -> np.ndarray:
@@ -142,10 +145,16 @@ class Response:
         actions: np.ndarray,
         applied: np.ndarray | None = None,
         simulation: AuditedSimulation | None = None,
+        lag: int = 0,
     ) -> np.ndarray:
-        """Simulated observations at the end of windows, (B, n), from states (B, nq + nv) and actions (B, H, nu)."""
+        """Simulated observations at the end of windows, (B, n), from states (B, nq + nv) and actions (B, H, nu).
+
+        The states are those of all windows, once or several times; their activations are those ``lag`` rows before.
+        """
         chosen = self.simulation if simulation is None else simulation
-        end = chosen.rollout(states, actions, applied=applied)[:, -1]
+        activations = self.activations[np.clip(self.starts - lag, 0, None)]
+        activations = np.tile(activations, (len(states) // len(self.starts), 1))
+        end = chosen.rollout(states, actions, activations=activations, applied=applied)[:, -1]
         return self.simulation.state_map.observations(end)
 
     @cached_property
@@ -224,18 +233,20 @@ class Response:
     def misfit_at_lag(self, lag: int) -> float:
         """:meth:`misfit` if actions act some rows later than their rows say."""
         rows = np.clip(self.rows - lag, 0, len(self.log) - 1)
-        return self.misfit(actions=lambda _: self.limited[rows])
+        return self.misfit(actions=lambda _: self.limited[rows], lag=lag)
 
     def misfit(
         self,
         actions: Callable[[np.ndarray], np.ndarray] | None = None,
         observations: Callable[[np.ndarray], np.ndarray] | None = None,
+        lag: int = 0,
     ) -> float:
         """Unexplained share of the change of the velocities: median error over median change, mean over velocities.
 
         Args:
             actions: changes the actions (W, H, nu) first, also to another number of steps; None for none.
             observations: changes the observations (..., n) first; None for none.
+            lag: rows by which the actions are late, for the activations.
         """
         executed = self.limited[self.rows]
         if actions is not None:
@@ -248,7 +259,7 @@ class Response:
             states = states + (moved - first) @ self.simulation.state_map.restore.T
             before = moved[:, self.moving]
             change = observations(last)[:, self.moving] - before
-        error = np.abs(change - (self.reached(states, executed)[:, self.moving] - before))
+        error = np.abs(change - (self.reached(states, executed, lag=lag)[:, self.moving] - before))
         error = np.where(np.isfinite(error), error, np.inf)
         usual = np.median(np.abs(change), axis=0)
         share = np.median(error, axis=0) / np.where(usual > 0.0, usual, np.inf)
@@ -272,14 +283,21 @@ def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, settings: AuditSet
 
 
 def _settled(
-    log: Log, simulation: AuditedSimulation, states: np.ndarray, actions: np.ndarray, starts: np.ndarray, steps: int
+    log: Log,
+    simulation: AuditedSimulation,
+    states: np.ndarray,
+    actions: np.ndarray,
+    activations: np.ndarray,
+    starts: np.ndarray,
+    steps: int,
 ) -> np.ndarray:
     """Start states of windows; unobserved coordinates are simulated over the steps before, with the others measured."""
     chosen = states[starts]
     if steps:
         before = starts + np.arange(-steps, 0)[:, None]
         time = simulation.control_step * before if log.time is None else log.time[before]
-        chosen[:, list(simulation.state_map.hidden)] = simulation.follow(states[before], actions[before], time)[-1]
+        after = simulation.follow(states[before], actions[before], time, activations[before])
+        chosen[:, list(simulation.state_map.hidden)] = after[-1]
     return chosen
 
 

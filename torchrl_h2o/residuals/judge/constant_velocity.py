@@ -42,7 +42,7 @@ def no_better_than_constant_velocity(
         own = _quantities_of_joints(mended, effect)
         known = [error for error in errors if own and np.isfinite(error.guessed[own]).any()]
         if known and min(float(np.nanmin(error.relative[own])) for error in known) > most:
-            joints = f"with {effect_words(effect)}, the motion of these joints is predicted"
+            joints = f"with {effect_words(effect, mended.names)}, the motion of these joints is predicted"
             clauses.append(f"{joints} {_hardly_better(mended, known[0], own)}")
     return tuple(clauses)
 

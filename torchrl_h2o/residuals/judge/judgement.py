@@ -174,7 +174,8 @@ def _rejected(
             error = overall_error(simulation.with_effects(attempt.effect), measured)
         except (ValueError, np.linalg.LinAlgError) as reason:  # it was fitted beside other effects, and needs them
             error = math.nan
-            failures.append(f"{effect_words(attempt.effect)} cannot be put into the model alone: {reason}")
+            words = effect_words(attempt.effect, simulation.names)
+            failures.append(f"{words} cannot be put into the model alone: {reason}")
         rejected.append((attempt, error))
     return tuple(rejected), tuple(failures)
 

@@ -89,7 +89,7 @@ class VerdictSettings:
     auc_near_one: float = 0.95
     """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
     raised: float = 1.1
-    """Factor of the sentence's error from which on effects raise it, and are not recommended."""
+    """Factor by which effects may raise the error in the report's sentence; beyond it they are not recommended."""
     much_lower: float = 0.5
     """Share of the error ahead below which an explanation counts in spite of such an AUC."""
     extreme_factor: float = 20.0

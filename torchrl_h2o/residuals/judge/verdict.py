@@ -25,7 +25,7 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
     Verdict,
 )
-from torchrl_h2o.residuals.report.errors import ErrorSummary
+from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
@@ -46,6 +46,7 @@ def reach_verdict(
 
     Nothing is missing if there are no effects and neither a classifier, nor the autocorrelation of the residuals, nor
     the error far ahead shows a difference. Otherwise the effects explain what is missing wholly, in part or not at all.
+    Effects that raise the error of the report's sentence explain nothing.
 
     Args:
         simulation: the simulator before effects are put in.
@@ -64,20 +65,33 @@ def reach_verdict(
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
+    raised = False
     if (head := error.headline) is not None:
         steps = max(1, round(head.seconds / simulation.control_step))
         worse = made_worse(simulation, mended, measured, steps, settings)
-        acting = any(not effect.random for effect in effects)
-        if acting and head.after > rules.raised * head.before:
+        if raised := _raises(head, measured, simulation, effects, rules):
             against = (*against, *(worse or (f"the effects found raise the error of {headline_words(head)}",)))
         else:
             signs = (*worse, *signs)
     caveats = short_delays(effects, measured, simulation.control_step)
-    if signs and not _leaves_little(error, two_sample, rules):
+    if raised or (signs and not _leaves_little(error, two_sample, rules)):
         where = where_most(mended, measured, settings)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
         return Verdict(kind, (*against, *signs), recommended=not against, where=where, caveats=caveats)
     return Verdict(NOT_EXPLAINED if against else EXPLAINED, against, recommended=not against, caveats=caveats)
+
+
+def _raises(
+    head: HeadlineError,
+    measured: Measured,
+    simulation: Simulation,
+    effects: Sequence[Effect],
+    rules: VerdictSettings,
+) -> bool:
+    """Whether effects other than noise raise the error of the sentence, beyond what is negligible."""
+    spread = float(measured.observation[:, simulation.state_map.names.index(head.name)].std())
+    acting = any(not effect.random for effect in effects)
+    return acting and head.after > max(rules.raised * head.before, rules.worse_negligible * spread)
 
 
 def _leaves_little(error: ErrorSummary, two_sample: TwoSample, rules: VerdictSettings) -> bool:
@@ -161,7 +175,10 @@ def reasons_against(
     halved = head is not None and head.after < rules.much_lower * head.before
     if auc is not None and auc > rules.auc_near_one and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")
-    reasons += [f"{effect_words(effect)} is {why}" for effect in effects if (why := _why_implausible(effect, rules))]
+    names = simulation.names
+    reasons += [
+        f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect, rules))
+    ]
     return tuple(reasons)
 
 

@@ -1,6 +1,6 @@
-"""Activations of actuators with dynamics, such as a servo whose command passes a filter, from the commands alone.
+"""Activations of actuators whose command passes a filter of first order, such as many servos, from the commands.
 
-A log holds no activations. Those of filters and integrators follow from the commands before, so they are computed.
+A log holds no activations. That of a filter follows from the commands before, so it is computed.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 _FILTERS = (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
-_INTEGRATOR = mujoco.mjtDyn.mjDYN_INTEGRATOR
+_RK4 = mujoco.mjtIntegrator.mjINT_RK4
 
 
 def settled_activations(model: mujoco.MjModel, actions: np.ndarray) -> np.ndarray:
-    """Activations after the same actions for a long time: filters have followed, integrators are at zero.
+    """Activations after the same actions for a long time.
 
     Args:
         model: the model.
@@ -25,8 +25,7 @@ def settled_activations(model: mujoco.MjModel, actions: np.ndarray) -> np.ndarra
     """
     settled = np.zeros((*actions.shape[:-1], model.na))
     for actuator, place in _stateful(model):
-        if _dynamics(model, actuator) in _FILTERS:
-            settled[..., place] = _bounded(model, actuator, _commands(model, actuator, actions))
+        settled[..., place] = _bounded(model, actuator, _commands(model, actuator, actions))
     return settled
 
 
@@ -59,13 +58,24 @@ def activations_along(model: mujoco.MjModel, actions: np.ndarray, physics_steps:
 
 
 def actuators_of_unknown_activation(model: mujoco.MjModel) -> list[str]:
-    """Names of the actuators whose activation does not follow from the commands by a formula, such as muscles."""
-    known = (*_FILTERS, _INTEGRATOR)
+    """Names of the actuators whose activation the commands do not tell: all but filters that act on every command.
+
+    An integrator's activation also depends on its value when the log began.
+    """
     return [
         model.actuator(actuator).name or str(actuator)
         for actuator, _ in _stateful(model)
-        if _dynamics(model, actuator) not in known or model.actuator_actnum[actuator] != 1
+        if _dynamics(model, actuator) not in _FILTERS
+        or model.actuator_actnum[actuator] != 1
+        or model.actuator_delay[actuator] > 0.0
+        or _is_disabled(model, actuator)
     ]
+
+
+def _is_disabled(model: mujoco.MjModel, actuator: int) -> bool:
+    all_of_them = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    group = int(model.actuator_group[actuator])
+    return bool(all_of_them or (0 <= group < 31 and model.opt.disableactuator >> group & 1))
 
 
 def _stateful(model: mujoco.MjModel) -> list[tuple[int, int]]:
@@ -91,18 +101,22 @@ def _bounded(model: mujoco.MjModel, actuator: int, activation: np.ndarray) -> np
 
 
 def _after(model: mujoco.MjModel, actuator: int, commands: np.ndarray, start: float, physics_steps: int) -> np.ndarray:
-    """Activation after each command, (T,): of a filter a linear recursion, of an integrator a sum."""
-    timestep, kind = model.opt.timestep, _dynamics(model, actuator)
-    if kind == _INTEGRATOR:
-        keeps, takes = 1.0, physics_steps * timestep
-    else:
-        constant = max(float(model.actuator_dynprm[actuator, 0]), mujoco.mjMINVAL)
-        exact = kind == mujoco.mjtDyn.mjDYN_FILTEREXACT
-        keeps = (np.exp(-timestep / constant) if exact else 1.0 - timestep / constant) ** physics_steps
-        takes = 1.0 - keeps
+    """Activation after each command, (T,): a linear recursion, unless it is cut at its bounds."""
+    keeps = (1.0 - _share_of_step(model, actuator)) ** physics_steps
+    takes = 1.0 - keeps
     if not model.actuator_actlimited[actuator]:
         return lfilter([takes], [1.0, -keeps], commands, zi=[keeps * start])[0]
     after, activation = np.empty(len(commands)), start
     for row, command in enumerate(commands):
         after[row] = activation = float(_bounded(model, actuator, keeps * activation + takes * command))
     return after
+
+
+def _share_of_step(model: mujoco.MjModel, actuator: int) -> float:
+    """Share of the difference to the command by which an activation comes closer in one physics step."""
+    ratio = model.opt.timestep / max(float(model.actuator_dynprm[actuator, 0]), mujoco.mjMINVAL)
+    exact = _dynamics(model, actuator) == mujoco.mjtDyn.mjDYN_FILTEREXACT
+    share = 1.0 - np.exp(-ratio) if exact else ratio
+    if model.opt.integrator == _RK4:  # the rate is a mean over the step
+        share *= 1.0 - ratio / 2.0 + ratio**2 / 6.0 - ratio**3 / 24.0
+    return float(share)

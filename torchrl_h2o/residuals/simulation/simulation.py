@@ -76,7 +76,7 @@ class Simulation:
 
         Raises:
             ValueError: if the env is no Gymnasium MuJoCo task, its observation is not linear in the state, or an
-                actuator's activation does not follow from the commands, such as a muscle's.
+                actuator has an activation that the commands do not tell, such as a muscle.
         """
         return cls._from_source(source_of_env(env))
 
@@ -101,7 +101,7 @@ class Simulation:
 
         Raises:
             ValueError: for names that the model does not have, a control step that is not positive, or an actuator
-                whose activation does not follow from the commands, such as a muscle.
+                whose activation the commands do not tell, such as a muscle.
         """
         return cls._from_source(source_of_mjcf(path, state_map, control_step, effects))
 
@@ -111,8 +111,8 @@ class Simulation:
         simulation = cls(*source)
         if unknown := actuators_of_unknown_activation(simulation.model):
             raise ValueError(
-                f"{source.name}: the activation of {', '.join(unknown)} is not in the data and does not follow from "
-                "the commands; use actuators without dynamics, or with dyntype integrator, filter or filterexact"
+                f"{source.name}: the activation of {', '.join(unknown)} is not in the data, and the commands do not "
+                "tell it; use actuators without dynamics, or enabled ones with dyntype filter or filterexact, no delay"
             )
         state_map = source.state_map
         hidden = hidden_coordinates(state_map, simulation.model.nu, simulation.rollout, simulation.settings)

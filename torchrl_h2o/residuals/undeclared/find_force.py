@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.effects import ActionBacklash, ActionDeadBand, ActionSaturation, Effect, ResidualForce
+from torchrl_h2o.effects import ActionBacklash, ActionDeadBand, ActionSaturation, Effect, Pipeline, ResidualForce
 from torchrl_h2o.effects.force.residual_force import coordinate, degrees_of_freedom
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -136,7 +136,10 @@ def _nothing_to_explain(problem: Problem, starts: np.ndarray, settings: LoopSett
 
 
 def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | None:
-    """Adds terms while they lower the loss enough; after each addition, refits all terms and makes them simpler."""
+    """Adds terms while they lower the loss enough.
+
+    After each addition, all terms are fitted again. Redundant ones are removed, nearly straight waves become lines.
+    """
     rules, level = regression.settings.undeclared, regression.settings.significance.level
     best, left = None, regression.before
     barred = set()  # degrees of freedom on which a new term did not lower the loss enough
@@ -176,10 +179,10 @@ def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]
         simulation, problem.measured, starts, residual=residual, response=regression.response, settings=settings
     )
     observed = cast("np.ndarray", simulation.state_map.restore.any(1))
-    controls = _linear_controls(simulation)
+    bent = _bent_controls(simulation, problem.measured.action[starts])
     found = [
         sparse_force(
-            TermLibrary(freedom, regression.path, observed, controls, settings),
+            TermLibrary(freedom, regression.path, observed, bent, settings),
             forces.force[:, freedom.velocity],
             forces.weight[:, freedom.velocity],
         )
@@ -189,19 +192,18 @@ def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]
     return max(found, key=lambda candidate: candidate.gain, default=SparseForce())
 
 
-def _linear_controls(simulation: Simulation) -> list[int]:
-    """The controls on which no effect of the simulation is nonlinear.
+def _bent_controls(simulation: Simulation, actions: np.ndarray) -> list[int]:
+    """The controls that a saturation, dead band or backlash of the simulator changes for some of the actions (W, nu).
 
-    Powers of a control imitate its saturation or dead band; a fit of both would leave the values of both open.
+    Powers of such a control imitate the effect; a fit of both would leave the values of both open.
     """
-    nonlinear = [effect for effect in simulation.effects if _bends(effect)]
-    chosen = [getattr(effect, "actuators", None) for effect in nonlinear]
-    controls = range(simulation.model.nu)
-    return [index for index in controls if not any(some is None or index in some for some in chosen)]
-
-
-def _bends(effect: Effect) -> bool:
-    return isinstance(effect, ActionSaturation | ActionDeadBand | ActionBacklash) and not effect.is_neutral
+    bending = ActionSaturation | ActionDeadBand | ActionBacklash
+    changed = np.zeros(simulation.model.nu, bool)
+    for effect in simulation.effects:
+        if isinstance(effect, bending):
+            executed = Pipeline((effect,)).executed_run(actions, simulation.control_step)
+            changed |= (executed != actions).any(0)
+    return np.flatnonzero(changed).tolist()
 
 
 def _force_of(fitted: Fit) -> ResidualForce:
@@ -247,6 +249,8 @@ def _straightened(regression: _Regression, best: Fit) -> Fit:
         return best
     candidate = _pruned(regression, _fitted(regression, effect))
     cost = candidate.loss - best.loss
+    if len(_force_of(candidate).terms) > max(len(_force_of(best).terms), regression.settings.undeclared.max_terms):
+        return best
     return best if cost > regression.settings.undeclared.min_term_gain * (regression.before - best.loss) else candidate
 
 

@@ -23,7 +23,7 @@ class UndeclaredSettings:
     max_terms: int = 6
     """Largest number of terms of the whole force."""
     straight: float = 1.0
-    """Part of a wave, in rad, over the measured positions, up to which it may be a straight line."""
+    """Largest phase, in rad, that a wave runs through over the measured positions for a line to be tried instead."""
     negligible: float = 1e-6
     """Residual, in spreads, that counts as rounding."""
     min_gain_over_catalogue: float = 0.05

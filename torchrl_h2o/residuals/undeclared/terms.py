@@ -5,7 +5,7 @@ Frequencies, phases and start times of terms are scanned over a range and then r
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -28,14 +28,14 @@ class TermLibrary:
         freedom: the degree of freedom.
         path: states and controls within the transitions.
         observed: (nq + nv), True for observed coordinates of the state.
-        controls: indices of the controls that terms may contain; all by default.
+        bent: indices of the controls whose powers are left out, because an effect of the simulator imitates them.
         settings: range and resolution of the scans.
     """
 
     freedom: DegreeOfFreedom
     path: StepPath
     observed: np.ndarray
-    controls: Sequence[int] | None = None
+    bent: Collection[int] = ()
     settings: RegressionSettings = DEFAULTS.regression
 
     @property
@@ -69,9 +69,9 @@ class TermLibrary:
             yield (sign,)
         if has_q and has_v:
             yield from ((moving, replace(q, exponent=n)) for moving in (sign, v) for n in (1, 2))
-        for index in range(self.path.ctrl.shape[-1]) if self.controls is None else self.controls:
+        for index in range(self.path.ctrl.shape[-1]):
             a = Factor("power", f"a{index}")
-            yield from ((replace(a, exponent=n),) for n in (1, 2, 3))
+            yield from ((replace(a, exponent=n),) for n in (1, 2, 3) if index not in self.bent)
             yield from ((a, other) for other, there in ((q, has_q), (v, has_v)) if there)
 
     def scanned(self, force: np.ndarray, weight: np.ndarray) -> Iterator[Factors]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
-from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns
+from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force
 from torchrl_h2o.data.readers.units import to_si
 
 
@@ -107,10 +107,15 @@ def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
         note = "the model's actuators are servos, which take positions: check the unit"
         positions = [column for column in columns if column.kind == "position"]
         unit = positions[0].unit if positions else "rad"
-        torques = [column.kind == "action" and column.unit == "N·m" for column in columns]
+        commands = [column.kind == "action" and not is_force(column.name) for column in columns]
+        torque = "the model's actuators are servos, which take positions"
         return [
-            replace(column, unit=unit, note=note) if torque else column
-            for column, torque in zip(columns, torques, strict=True)
+            replace(column, unit=unit, note=note)
+            if command
+            else replace(column, kind="unknown", note=torque)
+            if column.kind == "action" and any(commands)
+            else column
+            for column, command in zip(columns, commands, strict=True)
         ]
     result = []
     for column in columns:

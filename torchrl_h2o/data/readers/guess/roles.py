@@ -85,6 +85,11 @@ def guess_columns(
     """
     known = {_letters(name): quantity for name, quantity in (model_names or {}).items()}
     found = [_guess(name, numbers, known) for name, numbers in values.items()]
+    actions = [guess for guess in found if guess.kind == "action"]
+    supplies = [guess for guess in actions if _letters(guess.name) not in known and _is_supply(guess, values)]
+    if len(supplies) < len(actions):
+        note = "hardly changes, as the voltage of a supply"
+        found = [replace(guess, kind="unknown", note=note) if guess in supplies else guess for guess in found]
     for kind in ("time", "done", "reward"):
         same = [i for i, guess in enumerate(found) if guess.kind == kind]
         for i in same[1:]:
@@ -101,8 +106,6 @@ def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str,
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
     if kind == "time":
         return Guess(name, kind, *_unit_of_time(numbers, unit))
-    if kind == "action" and any(word in _VOLTS for word in words) and _is_steady(numbers):
-        return Guess(name, "unknown", note="hardly changes, as the voltage of a supply")
     if unit is not None:
         return Guess(name, kind, unit, stem)
     unit, note = _unit_of(kind, si, words, numbers)
@@ -119,9 +122,19 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
     return next((kind for kind in _WORDS if kind in fits), "unknown")
 
 
-def _is_steady(numbers: np.ndarray) -> bool:
-    least, most = np.quantile(np.abs(numbers), (0.05, 0.95))
-    return bool(np.ptp(np.sign(numbers)) == 0 and least > (1.0 - _STEADY) * most)
+def is_force(name: str) -> bool:
+    """Whether a column's name is that of a force, a torque or a current."""
+    return any(word in _FORCES for word in _words(name))
+
+
+def _is_supply(guess: Guess, values: Mapping[str, np.ndarray | None]) -> bool:
+    """Whether a voltage has one sign and hardly changes."""
+    numbers = values[guess.name]
+    finite = np.zeros(0) if numbers is None else numbers[np.isfinite(numbers)]
+    if not len(finite) or not any(word in _VOLTS for word in _words(guess.name)):
+        return False
+    least, most = np.quantile(np.abs(finite), (0.05, 0.95))
+    return bool(np.ptp(np.sign(finite)) == 0 and least > (1.0 - _STEADY) * most)
 
 
 def _words(name: str) -> list[str]:
