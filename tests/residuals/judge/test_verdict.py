@@ -97,6 +97,17 @@ def test_effects_that_make_a_quantity_worse_are_said_to_be_wrong():
     assert "error of elbow 100 ms ahead: 24 → 30 mrad (+25 %)" in reason
 
 
+@pytest.mark.parametrize(("factor", "recommended"), [(1.05, True), (1.2, False)])
+def test_effects_that_raise_the_error_of_the_sentence_are_not_recommended(factor, recommended):
+    """No other test sees a fault here: the effect is right."""
+    found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
+    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
+    error = replace(error, headline=replace(error.headline, after=factor * error.headline.before))
+    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.9, 0.5))
+    assert reached.recommended == recommended
+    assert any("raise the error of elbow" in reason for reason in reached.reasons) != recommended
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_right_effects_make_nothing_worse(noise):
     truth = (Gravity(1.3), JointFrictionLoss(0.05))

@@ -86,11 +86,14 @@ def test_values_that_the_model_cannot_have_do_not_stop_a_fit():
     assert np.isfinite(result.loss)
 
 
-def test_bounds_of_a_parameter_are_kept():
+def test_bounds_of_a_parameter_are_kept_by_its_value_and_its_interval():
     """The best fit would be a negative delay."""
     real = recorded(SIMULATION, 300)
     early = replace(real, action=np.vstack([np.zeros((1, 1)), real.action[:-1]]))
-    assert fitted(Problem.pose(SIMULATION, early), ActionDelay(0.006)).effects[0].delay == pytest.approx(0.0, abs=1e-3)
+    result = fitted(Problem.pose(SIMULATION, early), ActionDelay(0.006))
+    assert result.effects[0].delay == pytest.approx(0.0, abs=1e-3)
+    assert result.half_widths[0]["delay"] > result.effects[0].delay
+    assert result.ci95(0)["delay"][0] == 0.0
 
 
 def test_other_parameters_and_the_effects_that_were_given_stay_as_they_are():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.settling import settle
+from torchrl_h2o.residuals.measured.settling import activations, settle
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -63,13 +63,6 @@ def start_states(simulation: Simulation, measured: Measured, rows: np.ndarray | 
 def executed_actions(simulation: Simulation, measured: Measured, rng: np.random.Generator | None = None) -> np.ndarray:
     """Actions after the action effects, (T, nu), run by run; random effects are left out without a generator."""
     return np.concatenate([simulation.executed(measured.action[run], rng) for run in measured.runs])
-
-
-def activations(simulation: Simulation, measured: Measured, actions: np.ndarray) -> np.ndarray:
-    """Activations of the actuators before each row, (T, na), under executed actions (T, nu), run by run."""
-    if not simulation.model.na:
-        return np.zeros((len(measured), 0))
-    return np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
 
 
 def undelayed_following(simulation: Simulation, measured: Measured) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Simulates unobserved coordinates along the data, with the observed ones reset at every step."""
+"""What a log does not hold: unobserved coordinates, simulated along the data, and activations of actuators."""
 
 from __future__ import annotations
 
@@ -33,12 +33,19 @@ def settle(
     first, last = _chains(np.unique(rows), begins, settings.settling_steps, settings.settled_rows)
     steps = np.arange(-settings.settling_steps, (last - first).max())[:, None]
     path = np.clip(first + steps, begins[first], last)
-    before = np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
-    after = simulation.follow(states[path], actions[path], measured.time[path], before[path])
+    before = activations(simulation, measured, actions)[path]
+    after = simulation.follow(states[path], actions[path], measured.time[path], before)
     reached = (steps >= -1) & (first + steps < last)
     found = states.copy()
     found[(first + steps + 1)[reached][:, None], hidden] = after[reached]
     return found
+
+
+def activations(simulation: Simulation, measured: Measured, actions: np.ndarray) -> np.ndarray:
+    """Activations of the actuators before each row, (T, na), under executed actions (T, nu), run by run."""
+    if not simulation.model.na:
+        return np.zeros((len(measured), 0))
+    return np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
 
 
 def _chains(rows: np.ndarray, begins: np.ndarray, far: int, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,8 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_h2o.effects import ActionEffect, ObservationDelay, ObservationEffect
-from torchrl_h2o.residuals.measured.residual import activations, executed_actions, start_states
+from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.stats import norm
 
 from torchrl_h2o.residuals.measured.linearised import one_step
-from torchrl_h2o.residuals.measured.residual import activations, executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, NoiseSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation

@@ -7,7 +7,8 @@ from typing import cast
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.residual import activations, executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
+from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, RegressionSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation

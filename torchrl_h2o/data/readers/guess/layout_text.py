@@ -102,27 +102,20 @@ def _one_set(columns: Sequence[Guess]) -> list[Guess]:
 
 
 def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
-    """Desired positions as the actions of servos, and no torques beside them; without any, other commands."""
-    if not any(column.kind == "desired position" for column in columns):
-        note = "the model's actuators are servos, which take positions: check the unit"
-        positions = [column for column in columns if column.kind == "position"]
+    """Desired positions, or else other commands than forces, as the actions of servos, and no torques beside them."""
+    positions = [column for column in columns if column.kind == "position"]
+    commands = {column.name: column.unit for column in columns if column.kind == "desired position"}
+    if not commands:
         unit = positions[0].unit if positions else "rad"
-        commands = [column.kind == "action" and not is_force(column.name) for column in columns]
-        torque = "the model's actuators are servos, which take positions"
-        return [
-            replace(column, unit=unit, note=note)
-            if command
-            else replace(column, kind="unknown", note=torque)
-            if column.kind == "action" and any(commands)
-            else column
-            for column, command in zip(columns, commands, strict=True)
-        ]
+        named = [column.name for column in columns if column.kind == "action" and not is_force(column.name)]
+        commands = dict.fromkeys(named, unit)
+    if not commands:
+        return list(columns)
     result = []
     for column in columns:
-        if column.kind == "desired position":
-            column = replace(
-                column, kind="action", note=f"the model's actuators are servos; {column.note}".rstrip("; ")
-            )
+        if column.name in commands:
+            note = "the model's actuators are servos, which take positions: check the unit"
+            column = replace(column, kind="action", unit=commands[column.name], note=note)
         elif column.kind == "action":
             column = replace(column, kind="unknown", note="the model's actuators are servos, which take positions")
         result.append(column)
