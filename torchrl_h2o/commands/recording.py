@@ -108,8 +108,8 @@ class Recording:
         Raises:
             ValueError: if neither is available.
         """
-        if self.columns is not None and self.columns.dt is not None:
-            return self.columns.dt
+        if self.columns is not None and (step := self.columns.resample or self.columns.dt) is not None:
+            return step
         if "time" in self.transitions.keys():
             return float(torch.diff(self.transitions["time"].flatten()).median())
         raise ValueError(f"{self.source} has no time stamps; give simulator.control_step, in s")
@@ -165,6 +165,8 @@ def read_recording(cfg: DictConfig) -> Recording:
         rows = f"rows {first} to {last - 1} of {count}"
     else:
         rows = f"{len(transitions)} of {count} rows, from row {first} of each"
+    if columns is not None and columns.resample is not None:
+        rows = f"{rows}, resampled to steps of {columns.resample:g} s"
     if isinstance(held_out, tuple):
         rows = f"{rows}; held out: {', '.join(held_out)}"
     return Recording(transitions, f"{words_of(cfg.data)}, {rows}", columns, logs, held_out)

@@ -9,8 +9,8 @@ import pytest
 from tests.residuals.pendulum import DOUBLE, double_pendulum, recorded
 from torchrl_h2o.effects import Armature, Gravity, JointDamping, JointForce, ObservationDelay
 from torchrl_h2o.residuals import Simulation, Split, StateMap
-from torchrl_h2o.residuals.judge.constant_velocity import _quantities_of_joints, no_better_than_constant_velocity
-from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
+from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
+from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion, quantities_of_joints
 
 SIMULATION = double_pendulum()
 SLOW_ELBOW = (JointDamping(0.3, "shoulder"), JointDamping(1.0, "elbow"))
@@ -53,10 +53,10 @@ def test_an_effect_of_both_joints_is_judged_by_both():
 def test_joints_without_names_and_with_several_coordinates_are_found():
     xml = DOUBLE.replace('name="elbow" ', "").replace('<motor joint="elbow" ctrlrange="-0.3 0.3"/>', "")
     nameless = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(xml))
-    assert _quantities_of_joints(nameless, Armature(0.1, "lower/*")) == [1, 3]
+    assert quantities_of_joints(nameless, Armature(0.1, "lower/*")) == [1, 3]
     body = '<mujoco><worldbody><body><freejoint name="free"/><geom size="0.1"/></body></worldbody></mujoco>'
     names = tuple(map(str, range(13)))
     every = StateMap.of_coordinates(names, ("1",) * 13, range(13), num_states=13)
     flying = Simulation(lambda: mujoco.MjSpec.from_string(body), 1, every)
-    assert _quantities_of_joints(flying, JointForce(0.1, "free")) == list(range(13))
-    assert _quantities_of_joints(flying, Gravity(0.5)) == []
+    assert quantities_of_joints(flying, JointForce(0.1, "free")) == list(range(13))
+    assert quantities_of_joints(flying, Gravity(0.5)) == []

@@ -19,11 +19,12 @@ from torchrl_h2o.effects import (
     Payload,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
-from torchrl_h2o.residuals import StateMap, trace_effects
+from torchrl_h2o.residuals import Split, StateMap, trace_effects
+from torchrl_h2o.residuals.measured.missing_force import measured_motion
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.begin import begin_anew
-from torchrl_h2o.residuals.trace.inverse_dynamics import _rows, propose_effects
+from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -37,7 +38,7 @@ CATALOGUE = tuple(entry for entry in SIMULATION.catalogue() if isinstance(entry.
 
 def test_friction_of_each_joint_is_proposed():
     found = propose_effects(SIMULATION, MEASURED, CATALOGUE)
-    proposed = {(type(effect), effect.joints): effect for _, effect in found}
+    proposed = {(type(effect), effect.joints): effect for effect in found.effects}
     assert proposed.keys() == {(type(effect), effect.joints) for effect in FRICTION}
     for true in FRICTION:
         (name,) = true.parameters
@@ -48,7 +49,7 @@ def test_a_payload_is_proposed_with_its_mass():
     damped = SIMULATION.with_effects(JointDamping(1.0))
     measured = recorded(damped.with_effects(Payload(0.2, z=-0.15, bodies="lower")), 3000, noise=0.002)
     trials = ({"mass": 0.05, "x": 0.0, "z": -0.15},)
-    ((_, payload),) = propose_effects(damped, measured, [CatalogueEntry(Payload(bodies="lower"), trials)])
+    (payload,) = propose_effects(damped, measured, [CatalogueEntry(Payload(bodies="lower"), trials)]).effects
     assert (payload.mass, payload.z) == pytest.approx((0.2, -0.15), rel=0.05)
 
 
@@ -57,8 +58,8 @@ def test_nothing_is_proposed_for_properties_of_the_world_or_of_several_joints():
         CatalogueEntry(Gravity(), ({"scale": 0.8},)),
         CatalogueEntry(JointFrictionLoss(joints="*"), ({"torque": 0.1},)),
     ]
-    assert propose_effects(SIMULATION, MEASURED, entries) == ()
-    assert propose_effects(SIMULATION, MEASURED.part(slice(0, 100)), CATALOGUE) == ()
+    assert propose_effects(SIMULATION, MEASURED, entries).entries == ()
+    assert propose_effects(SIMULATION, MEASURED.part(slice(0, 100)), CATALOGUE).entries == ()
 
 
 def begun_anew(measured, found):
@@ -75,8 +76,8 @@ def test_a_search_that_has_found_only_heavy_rotors_begins_anew_and_finds_the_fri
     slow = recorded(SIMULATION.with_effects(*truth), 2000, noise=0.002)
     other = begun_anew(slow, (Armature(30.0, "*"),))
     assert other is not None
-    assert not any(isinstance(effect, Armature) for effect in other.fit.effects)
     model = SIMULATION.with_effects(*other.fit.effects).model
+    assert (model.dof_armature < 0.2 * SIMULATION.model.dof_M0).all()
     assert model.dof_frictionloss == pytest.approx([0.1, 0.0], rel=0.15, abs=0.01)
     assert model.dof_damping == pytest.approx([1.0, 1.0], rel=0.15)
 
@@ -102,35 +103,38 @@ def test_a_search_for_effects_begins_anew_after_its_first_growth():
 def test_friction_that_the_model_has_can_be_reduced_and_a_rotor_that_it_lacks_cannot():
     """Without these bounds, the missing gravity and the light link would make the rotor's inertia negative."""
     rough, smooth = (SIMULATION.with_effects(JointDamping(damping, "*")) for damping in (0.8, 0.5))
-    less = [effect.damping for _, effect in propose_effects(rough, recorded(smooth, 3000, noise=0.002), CATALOGUE)]
-    assert less == pytest.approx([-0.3, -0.3], rel=0.15)
+    found = propose_effects(rough, recorded(smooth, 3000, noise=0.002), CATALOGUE)
+    model = rough.with_effects(*found.effects).model
+    assert model.dof_damping == pytest.approx([0.5, 0.5], rel=0.02)
+    assert (model.dof_armature < 0.05 * model.dof_M0).all()
     light = (JointDamping(0.3, "*"), BodyMass(0.6, "lower"), Gravity(1.3))
     found = propose_effects(SIMULATION, recorded(SIMULATION.with_effects(*light), 3000, noise=0.002), CATALOGUE)
-    assert found
-    assert is_possible(Problem.pose(SIMULATION, MEASURED), [effect for _, effect in found])
+    assert found.entries
+    assert is_possible(Problem.pose(SIMULATION, MEASURED), found.effects)
 
 
 def test_nothing_is_proposed_for_an_equal_simulator():
     (elbow,) = (entry for entry in SIMULATION.catalogue() if entry.effect == JointForce(0.0, "elbow"))
-    assert propose_effects(SIMULATION, recorded(SIMULATION, 3000, noise=0.002), [elbow]) == ()
+    assert propose_effects(SIMULATION, recorded(SIMULATION, 3000, noise=0.002), [elbow]).entries == ()
 
 
-def test_differences_do_not_cross_runs_nor_reach_unknown_states():
+def test_windows_do_not_cross_runs_nor_reach_unknown_states():
     runs = replace(MEASURED, run=np.arange(3000) // 30)
-    half = 2
-    rows = _rows(runs, half, DEFAULTS.inverse_dynamics)
-    assert (runs.run[rows - half] == runs.run[rows + half]).all()
+    motion = measured_motion(SIMULATION, runs, Split.FIT)
+    assert motion is not None
+    run = np.rint(motion.time / SIMULATION.control_step).astype(int) // 30
+    assert (run[:, 0] == run[:, -1]).all()
     late = SIMULATION.with_effects(ObservationDelay(0.02, (2, 3)))
-    assert propose_effects(late, runs, CATALOGUE)
+    assert propose_effects(late, runs, CATALOGUE).entries
 
 
 def test_nothing_is_proposed_if_a_coordinate_is_not_observed_or_actuators_have_a_state():
     slow = recorded(SIMULATION.with_effects(JointDamping(1.0, "*")), 3000, noise=0.002)
-    assert propose_effects(SIMULATION, slow, CATALOGUE)
+    assert propose_effects(SIMULATION, slow, CATALOGUE).entries
     without_shoulder = StateMap.of_coordinates(("e", "v", "w"), ("rad", "rad/s", "rad/s"), (1, 2, 3), num_states=4)
     blind = replace(SIMULATION, state_map=without_shoulder)
     columns = {name: getattr(slow, name)[:, 1:] for name in ("observation", "following")}
-    assert propose_effects(blind, replace(slow, **columns), CATALOGUE) == ()
+    assert propose_effects(blind, replace(slow, **columns), CATALOGUE).entries == ()
     filtered = DOUBLE.replace("<motor ", '<general dyntype="filter" dynprm="0.01" ')
     slow_motors = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(filtered))
-    assert propose_effects(slow_motors, slow, slow_motors.catalogue()) == ()
+    assert propose_effects(slow_motors, slow, slow_motors.catalogue()).entries == ()

@@ -65,7 +65,8 @@ def _repeated(log: Log, settings: AuditSettings) -> list[Finding]:
             "severe" if share > settings.many_repeated else "warning",
             f"{share:.1%} of the rows in motion repeat the row before in every sensor, as after a lost packet",
             Rows.of(repeated, settings.examples),
-            "remove the repeated rows and split the log there, or log at the rate of the sensors",
+            "remove the repeated rows and split the log there, or write resample with a step in s, which interpolates "
+            "over them, or log at the rate of the sensors",
         )
     ]
 

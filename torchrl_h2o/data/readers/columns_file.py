@@ -134,6 +134,7 @@ def _build_column(kind: type, entries: dict[str, Any], source: str | Path) -> An
 def _build(kind: type, entries: dict[str, Any], source: str | Path, column: str | None = None) -> Any:
     convert = {
         "dt": lambda name, value: None if value is None else _number(name, value),
+        "resample": lambda name, value: None if value is None else _number(name, value),
         "scale": _number,
         "time_tolerance": _number,
         "bounds": _pair,

@@ -101,6 +101,9 @@ class LogColumns:
         drop_trailing_zero_rows: whether to drop rows at the end of the file that are all zero.
         free_motion: whether the log has no actions; those of the transitions then have the shape (T, 0).
         topic: for a bag with several topics of joint states, the one whose messages are the rows.
+        resample: step in s of a regular clock for a log whose time stamps are irregular; see
+            :func:`~torchrl_h2o.data.readers.resample.resample`. Steps in time longer than it, or than the median step
+            if that is longer, by more than ``time_tolerance`` are jumps.
 
     Raises:
         ValueError: for contradicting or invalid entries; the message lists what is allowed.
@@ -128,6 +131,7 @@ class LogColumns:
     drop_trailing_zero_rows: bool = False
     free_motion: bool = False
     topic: str | None = None
+    resample: float | None = None
 
     def __post_init__(self):
         for name, count in Counter(column.name for column in self.columns).items():
@@ -152,6 +156,8 @@ class LogColumns:
             raise ValueError("dt is missing, and there is no time column to derive it from")
         if self.dt is not None and not 0 < self.dt < math.inf:
             raise ValueError(f"dt {self.dt} must be a positive number of seconds")
+        if self.resample is not None:
+            self._check_resample(self.resample)
         if not isinstance(self.separator, str) or (self.separator != "whitespace" and len(self.separator) != 1):
             raise ValueError(f"separator {self.separator!r} must be 'whitespace' or one character")
         if self.separator in ('"', "\n", "\r"):
@@ -180,6 +186,14 @@ class LogColumns:
         ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} {getattr(self, name)!r} must be one of {allowed}")
+
+    def _check_resample(self, step: float) -> None:
+        if not 0 < step < math.inf:
+            raise ValueError(f"resample {step} must be a positive number of seconds")
+        if self.dt is not None or not self._names("time"):
+            raise ValueError("resample needs a time column and replaces dt; give one of resample and dt")
+        if self._names("reward"):
+            raise ValueError("rewards belong to the steps of the file; with resample, set their role to ignore")
 
     def _check_places(self) -> None:
         indices = [column.index for column in self.in_file]

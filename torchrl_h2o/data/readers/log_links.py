@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from torchrl_h2o.data.readers.error import DataError
-from torchrl_h2o.data.readers.log_columns import LogColumns
+from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 from torchrl_h2o.data.readers.log_table import LogTable
 from torchrl_h2o.data.readers.settings import ReaderSettings
 
@@ -70,11 +70,8 @@ def link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> 
         DataError: for time that does not increase, a time step or a restart that the layout does not allow, a done
             other than 0 and 1, or a log without any transition.
     """
-    done = _done(table, layout)
-    linked = ~done[:-1]
-    _require_declared_restart(table, layout, done)
-    if layout.after_done == "drop" and done.any():
-        linked[np.argmax(done) :] = False
+    done = done_rows(table, layout)
+    linked = same_episode(table, layout, done)
     jumps, dt = _jumps(table, layout, linked, settings)
     linked &= ~jumps
     if not linked.any():
@@ -86,7 +83,12 @@ def link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> 
     return Links.of(linked, done, dt)
 
 
-def _done(table: LogTable, layout: LogColumns) -> np.ndarray:
+def done_rows(table: LogTable, layout: LogColumns) -> np.ndarray:
+    """Return whether done is 1, for each row, (rows,); false without a column of done.
+
+    Raises:
+        DataError: for a done other than 0 and 1.
+    """
     column = layout.named("done")
     if column is None:
         return np.zeros(len(table.rows), bool)
@@ -101,6 +103,19 @@ def _done(table: LogTable, layout: LogColumns) -> np.ndarray:
             row=int(table.rows[wrong[0]]),
         )
     return values.astype(bool)
+
+
+def same_episode(table: LogTable, layout: LogColumns, done: np.ndarray) -> np.ndarray:
+    """Return whether a row and the next one are of the same episode, (rows - 1,); false for rows that are dropped.
+
+    Raises:
+        DataError: for a restart that the layout does not allow.
+    """
+    _require_declared_restart(table, layout, done)
+    linked = ~done[:-1]
+    if layout.after_done == "drop" and done.any():
+        linked[np.argmax(done) :] = False
+    return linked
 
 
 def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndarray) -> None:
@@ -126,19 +141,8 @@ def _jumps(
     column = layout.named("time")
     if column is None:
         return np.zeros(len(linked), bool), cast("float", layout.dt)  # a layout has dt or a time column
-    time = table.columns([column.name])[:, 0]
-    steps = np.diff(time)
+    steps = require_increasing(table, layout, linked)
     place: dict[str, Any] = {"source": table.source, "column": column.name}
-    backwards = np.flatnonzero(linked & (steps <= 0))
-    if len(backwards):
-        index = backwards[0]
-        raise DataError(
-            f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
-            "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
-            "end of the file with zeros",
-            row=int(table.rows[index + 1]),
-            **place,
-        )
     dt = _dt(steps[linked], layout, place, settings)
     jumps = linked & (np.abs(steps - dt) > layout.time_tolerance * dt)
     if jumps.any() and layout.on_time_jump == "error":
@@ -150,6 +154,34 @@ def _jumps(
             **place,
         )
     return jumps, dt
+
+
+def require_increasing(table: LogTable, layout: LogColumns, linked: np.ndarray) -> np.ndarray:
+    """Return the time steps between rows in s, (rows - 1,), of a layout with a column of time.
+
+    Args:
+        table: the numbers of the log.
+        layout: the column of time.
+        linked: whether a row and the next one belong to the same run, (rows - 1,).
+
+    Raises:
+        DataError: for time that does not increase between linked rows.
+    """
+    name = cast("Column", layout.named("time")).name
+    time = table.columns([name])[:, 0]
+    steps = np.diff(time)
+    backwards = np.flatnonzero(linked & (steps <= 0))
+    if len(backwards):
+        index = backwards[0]
+        raise DataError(
+            f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
+            "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
+            "end of the file with zeros",
+            source=table.source,
+            column=name,
+            row=int(table.rows[index + 1]),
+        )
+    return steps
 
 
 def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any], settings: ReaderSettings) -> float:

@@ -6,6 +6,7 @@ Rows t and t + 1 form a transition, so the last row of a run is used only as a n
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
@@ -19,6 +20,7 @@ from torchrl_h2o.data.readers.log_columns import LogColumns
 from torchrl_h2o.data.readers.log_links import link_rows
 from torchrl_h2o.data.readers.log_table import LogTable, read_table
 from torchrl_h2o.data.readers.observed import observe
+from torchrl_h2o.data.readers.resample import resample
 from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.ted import to_ted
 
@@ -43,7 +45,7 @@ def read_robot_log(
         reward: ``reward(observation (T, n), action (T, m), next_observation (T, n)) -> (T,)`` on float64 arrays in
             SI. Without it and without a reward column, the result has no ("next", "reward"), which system
             identification does not need.
-        settings: the tolerance of the clock.
+        settings: tolerances of the clock.
 
     Returns:
         TensorDict of batch size [T] in TED, with a float64 ``time`` in s of shape [T, 1]. If the layout has velocities
@@ -66,6 +68,9 @@ def read_robot_log(
     """
     layout = columns if isinstance(columns, LogColumns) else LogColumns.load(columns)
     table = read_table(path, layout)
+    if layout.resample is not None:
+        table = resample(table, layout, settings)
+        layout = replace(layout, dt=layout.resample, resample=None)
     links = link_rows(table, layout, settings)
     observation, stds, links = observe(table, layout, links)
     action = table.columns(layout.action)

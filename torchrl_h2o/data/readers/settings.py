@@ -13,6 +13,8 @@ class ReaderSettings:
         clock_tolerance: share of dt by which the typical time step of a log may differ from the declared dt. Clock
             drift is smaller; the difference is larger in logs from which every n-th row was removed.
         longest_regular_step: multiple of the median time step; longer steps are gaps and are excluded from the mean.
+        stale_rows: resampling takes up to this many rows in sequence with the readings of the row before for the
+            effect of lost packets; in longer stretches, the robot rests.
         bound_rounding: share of an action bound by which an action may exceed it. A recording in float64 that is
             rounded to float32 exceeds it by about 1e-7.
         largest_compression: ratio of the bytes that an array states to those that its file stores, above which the
@@ -26,6 +28,7 @@ class ReaderSettings:
 
     clock_tolerance: float = 0.02
     longest_regular_step: float = 2.0
+    stale_rows: int = 3
     bound_rounding: float = 1e-6
     largest_compression: float = 1100.0
     largest_expansion: float = 200.0

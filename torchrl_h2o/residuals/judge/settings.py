@@ -86,6 +86,10 @@ class VerdictSettings:
     """Median error, in spreads, below which a rise does not count."""
     better_than_guess: float = 0.8
     """Median error ahead up to which effects explain the motion, in errors of the guess of constant velocities."""
+    more_force: float = 1.5
+    """Factor by which effects may raise the force that a joint's measured motion needs beyond the simulator's."""
+    less_force: float = 0.5
+    """Factor on the product of the missing forces below which effects explain them, whatever the motion shows."""
     auc_near_one: float = 0.95
     """AUC with the effects above which an explanation is not recommended, unless it lowers the error much."""
     raised: float = 1.1

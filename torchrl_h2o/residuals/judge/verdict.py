@@ -10,13 +10,15 @@ from scipy.stats import mannwhitneyu
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
 from torchrl_h2o.residuals.judge.made_worse import made_worse
+from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.judge.short_delays import short_delays
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
+from torchrl_h2o.residuals.measured.missing_force import missing_forces
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED,
     EXPLAINED_IN_PART,
@@ -166,7 +168,11 @@ def reasons_against(
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
     if acting:
-        reasons += no_better_than_constant_velocity(mended, measured, acting, settings)
+        forces = missing_forces(simulation, mended, measured, Split.REPORT, settings.inverse_dynamics)
+        if forces is None or not forces.fall_by(rules.less_force):
+            reasons += no_better_than_constant_velocity(mended, measured, acting, settings)
+        if forces is not None:
+            reasons += needs_more_force(simulation, forces, settings)
     elif two_sample.auc_before is not None and auc is not None and auc > max(rules.auc, two_sample.auc_before):
         before, after = (number(value, 2) for value in (two_sample.auc_before, auc))
         reasons.append(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.measured.residual import residuals, start_states, undelayed_following
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -84,6 +85,43 @@ def explains_motion(errors: Sequence[ErrorsAhead], most: float) -> bool:
         The answer; True if the data hold enough windows for none of the times.
     """
     return not errors or min(float(np.nanmedian(error.relative)) for error in errors) <= most
+
+
+def effects_on_unpredicted_joints(
+    mended: Simulation, errors: Sequence[ErrorsAhead], effects: Sequence[Effect], most: float
+) -> list[Effect]:
+    """The effects on joints all of whose quantities are predicted no better than by the guess, at any time ahead.
+
+    Args:
+        mended: the simulator with the effects.
+        errors: of :func:`errors_ahead`.
+        effects: the effects; those that do not act on joints are left out.
+        most: relative error up to which a prediction counts as better.
+    """
+    found = []
+    for effect in effects:
+        own = quantities_of_joints(mended, effect)
+        known = [error for error in errors if is_known(error, own)]
+        if known and min(float(np.nanmin(error.relative[own])) for error in known) > most:
+            found.append(effect)
+    return found
+
+
+def is_known(error: ErrorsAhead, quantities: Sequence[int]) -> bool:
+    """Whether the error of the guess is known for one of some quantities."""
+    return bool(len(quantities)) and bool(np.isfinite(error.guessed[list(quantities)]).any())
+
+
+def quantities_of_joints(simulation: Simulation, effect: Effect) -> list[int]:
+    """Indices of the quantities that observe the joints of an effect; empty if it does not act on joints."""
+    if (chosen := getattr(effect, "joints", None)) is None:
+        return []
+    model, observe = simulation.model, simulation.state_map.observe
+    dofs = selection.joint_dofs(model, chosen)
+    ends = np.append(model.jnt_qposadr, model.nq)
+    positions = [at for joint in {model.dof_jntid[dof] for dof in dofs} for at in range(ends[joint], ends[joint + 1])]
+    coordinates = [*positions, *(model.nq + dof for dof in dofs)]
+    return [int(i) for i in np.flatnonzero((observe[:, coordinates] != 0.0).any(1))]
 
 
 def _median(error: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import takewhile
 
+from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects.effect import EntryNames
 from torchrl_h2o.residuals.progress import FORCES, NOISE
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED_IN_PART,
@@ -15,7 +17,15 @@ from torchrl_h2o.residuals.report.contents import (
     Verdict,
 )
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
-from torchrl_h2o.residuals.report.words import change, duration, effect_name, in_readable_unit, number, quantity
+from torchrl_h2o.residuals.report.words import (
+    change,
+    duration,
+    effect_name,
+    effect_words,
+    in_readable_unit,
+    number,
+    quantity,
+)
 
 NAMED = 4  # undetectable effects that the sentence names
 MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together
@@ -47,11 +57,11 @@ def _verdict_words(report: ReportContents) -> list[str]:
         return [f"No conclusion: {report.conclusion.rstrip('. ')}."]
     if report.unfinished is not None:
         so_far = (
-            f"so far the simulator lacks {_listed(_found_words(report))}" if report.found else "nothing was found yet"
+            f"so far the simulator lacks {listed(_found_words(report))}" if report.found else "nothing was found yet"
         )
         return [f"Unfinished, when {report.unfinished}: {so_far}."]
     error = _error_words(report.error) if report.error else ""
-    words = _listed(_found_words(report)) if report.found else ""
+    words = listed(_found_words(report)) if report.found else ""
     kind, unknown = (None, "") if report.verdict is None else (report.verdict.kind, _unknown_words(report.verdict))
     by_what, ended = (
         (NOT_IN_CATALOGUE, []) if report.ended_in is None else (NOT_SO_FAR, [_ended_words(report.ended_in)])
@@ -86,7 +96,7 @@ def _undetectable_words(verdict: Verdict | None) -> list[str]:
     effects = () if verdict is None else verdict.undetectable
     if not effects:
         return []
-    named = _listed(effects[:NAMED])
+    named = listed(effects[:NAMED])
     if len(effects) <= NAMED:
         return [f"Noise or a lack of motion would hide in these data: {named}."]
     return [f"Noise or a lack of motion would hide {len(effects)} effects in these data, such as {named}."]
@@ -105,9 +115,18 @@ def _joined(*parts: str) -> str:
 
 def _found_words(report: ReportContents) -> list[str]:
     """The effects found; those of one kind are named together."""
+    return _by_kind((found.effect, found.words) for found in report.found)
+
+
+def effects_in_words(effects: Sequence[Effect], names: EntryNames) -> str:
+    """A list of effects with their values; those of one kind are named together."""
+    return listed(_by_kind((effect, effect_words(effect, names)) for effect in effects))
+
+
+def _by_kind(pairs: Iterable[tuple[Effect, str]]) -> list[str]:
     kinds: dict[type, list[str]] = {}
-    for found in report.found:
-        kinds.setdefault(type(found.effect), []).append(found.words)
+    for effect, words in pairs:
+        kinds.setdefault(type(effect), []).append(words)
     return [words for alike in kinds.values() for words in together(alike)]
 
 
@@ -124,7 +143,7 @@ def together(words: Sequence[str]) -> list[str]:
     if len(words) < 2 or first < MIN_WORDS_ALIKE:
         return list(words)
     middle = [" ".join(phrase[first : len(phrase) - last]) for phrase in split]
-    return [" ".join([*split[0][:first], _listed(middle), *split[0][len(split[0]) - last :]])]
+    return [" ".join([*split[0][:first], listed(middle), *split[0][len(split[0]) - last :]])]
 
 
 def _num_alike(phrases: Sequence[Sequence[str]]) -> int:
@@ -140,7 +159,7 @@ def _alternatives_words(report: ReportContents) -> list[str]:
     ]
     words = [f"These data cannot tell {', nor '.join(pairs)}."] if pairs else []
     if report.others:
-        first, more = _listed(report.others[0].words), len(report.others) > 1
+        first, more = listed(report.others[0].words), len(report.others) > 1
         sets = f"{len(report.others)} other sets of effects explain" if more else "Another set of effects explains"
         words.append(f"{sets} these data as well{', such as' if more else ':'} {first}.")
     return words
@@ -150,7 +169,7 @@ def _one_or_count(others: Sequence[str]) -> str:
     return others[0] if len(others) == 1 else f"{len(others)} other effects"
 
 
-def _listed(words: Sequence[str]) -> str:
+def listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
 
 

@@ -7,7 +7,7 @@ more effect explains most of what was taken for noise; or it has longer windows 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -15,11 +15,17 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.effects.catalogue.entry import entry_of
-from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
+from torchrl_h2o.residuals.measured.constant_velocity import (
+    effects_on_unpredicted_joints,
+    errors_ahead,
+    explains_motion,
+)
+from torchrl_h2o.residuals.measured.missing_force import MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
+from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -78,29 +84,106 @@ def begin_anew(
         The state with the proposed effects; None if the effects found explain motion, or the proposed
         ones do not.
     """
-    simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
     if not state.entries or _explains_motion(state):
         return None
-    pairs = propose_effects(
+    kept_still = {type(entry.effect) for entry in state.entries}.intersection(PROPOSED)
+    proposed = _with_proposed(state, catalogue, rng, progress, kept_still)
+    if proposed is None or not _explains_motion(proposed):
+        return None
+    tried = len(proposed.entries) * len(proposed.catalogue)
+    return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / tried))
+
+
+def begin_with_forces(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
+) -> SearchState | None:
+    """The effects that a regression of the missing forces proposes, where those found do not stand a test.
+
+    Measured torques that are noisy move a light link in the simulator far more than they moved it in reality. A search
+    that compares motion then finds rotors so heavy that the noise does not move them, even where windows are long.
+
+    Args:
+        state: what a search has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+        progress: bar that shows how far the search is.
+
+    Returns:
+        The state with the proposed effects at the values of the regression, because noisy torques would distort a fit
+        to the motion as well. None if the effects found predict the motion of their
+        joints and do not raise the missing forces; or if the proposed ones do not lower the error of the motion, or do
+        not leave far smaller forces missing than those found.
+    """
+    found = _missing_forces(state)
+    if not state.entries or found is None or _stands(state, found):
+        return None
+    proposed = _with_proposed(state, catalogue, rng, progress, refitted=False)
+    if proposed is None or (forces := _missing_forces(proposed)) is None:
+        return None
+    without, with_them = (proposed.first.selection_losses(which) for which in ((), proposed.fit.effects))
+    rules, level = state.settings.verdict, state.settings.significance.level
+    explains = forces.fall_by(rules.less_force) and proposed.p_value(without, with_them) < level
+    return proposed if explains and MissingForces(forces.after, found.after).rise_by(rules.more_force) else None
+
+
+def _stands(state: SearchState, forces: MissingForces) -> bool:
+    """Whether the effects found predict the motion of their joints, and do not raise the missing forces."""
+    effects, rules = state.fit.effects, state.settings.verdict
+    mended = state.first.simulation.with_effects(*effects)
+    errors = errors_ahead(mended, state.first.measured, Split.SELECTION, state.settings)
+    moves = explains_motion(errors, rules.better_than_guess)
+    unpredicted = effects_on_unpredicted_joints(mended, errors, effects, rules.better_than_guess)
+    return moves and not unpredicted and not forces.rise_by(rules.more_force)
+
+
+def _missing_forces(state: SearchState) -> MissingForces | None:
+    """The missing forces of the selection part without and with the effects found."""
+    simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
+    mended = simulation.with_effects(*state.fit.effects)
+    return missing_forces(simulation, mended, measured, Split.SELECTION, settings.inverse_dynamics)
+
+
+def _with_proposed(
+    state: SearchState,
+    catalogue: Sequence[CatalogueEntry],
+    rng: np.random.Generator,
+    progress: LoopBar,
+    left_out: Collection[type[Effect]] = (),
+    refitted: bool = True,
+) -> SearchState | None:
+    """Another search, in longer windows, with the effects that a regression of the missing forces proposes.
+
+    Args:
+        state: what the first search has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+        progress: bar that shows how far the search is.
+        left_out: kinds of effects that the other search does not try, unless they are proposed.
+        refitted: whether the effects are fitted to the motion; else they keep the values of the regression.
+
+    Returns:
+        The state; None if nothing is proposed, or the model rejects it.
+    """
+    simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
+    found = propose_effects(
         simulation, measured, catalogue, lambda: progress.closer(PROPOSAL / len(catalogue)), settings.inverse_dynamics
     )
-    if not pairs:
+    if not found.entries:
         return None
     lengths = possible_horizons(simulation, measured, settings.horizon)
     long_enough = [steps for steps in lengths if steps * simulation.control_step >= settings.inverse_dynamics.window]
     horizon = min(long_enough, default=lengths[-1])
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
-    kept_still = {type(entry.effect) for entry in state.entries}.intersection(PROPOSED)
-    entries, effects = zip(*pairs, strict=True)
-    searched = [entry for entry in catalogue if entry in entries or type(entry.effect) not in kept_still]
-    if not is_possible(problem, effects):
+    if not is_possible(problem, found.effects):
         return None
+    searched = [entry for entry in catalogue if entry in found.entries or type(entry.effect) not in left_out]
     other = SearchState.begin(problem, searched, rng, settings)
-    proposed = other.with_found(entries, other.refitted(entries, effects))
     progress.closer(PROPOSAL)
-    if not _explains_motion(proposed):
-        return None
-    return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / (len(entries) * len(searched))))
+    if refitted:
+        return other.with_found(found.entries, other.refitted(found.entries, found.effects))
+    moved = tuple(tuple(widths) for widths in found.half_widths)
+    fit = Fit(found.effects, moved, other.screened_loss(found.effects), found.half_widths)
+    return replace(other, entries=found.entries, fit=fit, by_forces=True)
 
 
 def begin_noise_free(

@@ -17,6 +17,7 @@ from types import MappingProxyType
 import mujoco
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.stats import t as student_t
 
 from torchrl_h2o.effects import (
     Armature,
@@ -30,8 +31,8 @@ from torchrl_h2o.effects import (
     Payload,
     selection,
 )
-from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
-from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
+from torchrl_h2o.residuals.measured.missing_force import Motion, measured_motion, missing_force
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.families import elements
@@ -50,15 +51,20 @@ OWN_VALUES: Mapping[type[Effect], str] = MappingProxyType(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """Measured motion and executed actions about some rows: qpos (W, nq), qvel and qacc (W, nv), ctrl (W, nu)."""
+@dataclass(frozen=True)
+class Proposal:
+    """Effects at the values of a regression.
 
-    position: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    control: np.ndarray
-    time: np.ndarray
+    Args:
+        entries: entries of the catalogue.
+        effects: each entry's effect.
+        half_widths: half-width of the 95 % interval of each parameter that the regression moves, by effect and name, in
+            its unit; from a jackknife over blocks of the data.
+    """
+
+    entries: tuple[CatalogueEntry, ...] = ()
+    effects: tuple[Effect, ...] = ()
+    half_widths: tuple[dict[str, float], ...] = ()
 
 
 def propose_effects(
@@ -67,12 +73,11 @@ def propose_effects(
     catalogue: Sequence[CatalogueEntry],
     advance: Callable[[], object] = lambda: None,
     settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
-) -> tuple[tuple[CatalogueEntry, Effect], ...]:
+) -> Proposal:
     """The properties of single links and joints that together explain the missing force.
 
-    All are fitted together, and then left out one by one, the one that is needed least first. Velocities and
-    accelerations come from differences over ``half_width``, so the motion must be slow, as it is where a joint that
-    keeps its velocity is a good guess.
+    All are fitted together, and then left out one by one, the one that is needed least first. Accelerations are means
+    over windows of twice ``half_width``.
 
     Args:
         simulation: the simulator.
@@ -82,15 +87,12 @@ def propose_effects(
         settings: rows, smoothing and the size of the set.
 
     Returns:
-        The entries, each with its effect at the value of the regression; empty if coordinates are unobserved, if
-        actuators have a state of their own, which is not measured, or if the rows are too few.
+        The effects; none if coordinates are unobserved, if actuators have a state of their own, which is not measured,
+        or if the rows are too few.
     """
-    if simulation.model.na or not simulation.state_map.observe.any(0).all():
-        return ()
-    half = max(1, round(settings.half_width / simulation.control_step))
-    motion = _motion(simulation, measured, _rows(measured, half, settings), half)
-    if len(motion.time) < settings.least_rows:
-        return ()
+    motion = measured_motion(simulation, measured, Split.FIT, settings)
+    if motion is None:
+        return Proposal()
     missing = missing_force(simulation, motion)
     entries, columns = [], []
     for entry in catalogue:
@@ -101,52 +103,35 @@ def propose_effects(
                 columns.append(change)
         advance()
     if not entries:
-        return ()
-    bounds = np.array([_bounds(entry, simulation.model) for entry in entries]).T
-    shares = _needed(missing, np.stack(columns, axis=-1), bounds, settings)
-    return tuple((entry, _at(entry, share)) for entry, share in zip(entries, shares, strict=True) if share != 0.0)
-
-
-def missing_force(simulation: Simulation, motion: _Motion) -> np.ndarray:
-    """Generalised force, (W, nv) in N or N·m, that the measured motion needs beyond what the simulator has."""
-    model = simulation.model
-    data, needed = mujoco.MjData(model), np.empty_like(motion.acceleration)
-    for row in range(len(needed)):
-        data.qpos[:], data.qvel[:] = motion.position[row], motion.velocity[row]
-        data.qacc[:], data.ctrl[:] = motion.acceleration[row], motion.control[row]
-        mujoco.mj_inverse(model, data)
-        mujoco.mj_fwdActuation(model, data)
-        needed[row] = data.qfrc_inverse - data.qfrc_actuator
-    for force in simulation.pipeline.batched_forces(model):
-        needed -= force(motion.position, motion.velocity, motion.control, motion.time)
-    return needed
-
-
-def _rows(measured: Measured, half: int, settings: InverseDynamicsSettings) -> np.ndarray:
-    """Rows for fits, evenly spread, with ``half`` rows of their run on both sides."""
-    return thinned(measured.windows(2 * half + 1, split=Split.FIT), settings.rows) + half
-
-
-def _motion(simulation: Simulation, measured: Measured, rows: np.ndarray, half: int) -> _Motion:
-    """The motion from differences over ``half`` rows on both sides, which average the sensors' noise.
-
-    Rows next to unknown states, as those at the ends of a run with late sensors, are left out.
-    """
-    states, model = start_states(simulation, measured), simulation.model
-    known = np.flatnonzero(np.isfinite(states).all(1))
-    rows = rows[np.all([np.isin(rows + offset, known) for offset in (-half, 0, half)], axis=0)]
-    seconds, before, after = 2.0 * half * simulation.control_step, states[rows - half], states[rows + half]
-    velocity = np.empty((len(rows), model.nv))
-    for found, one, other in zip(velocity, before, after, strict=True):
-        mujoco.mj_differentiatePos(model, found, seconds, one[: model.nq], other[: model.nq])
-    actions = executed_actions(simulation, measured)
-    return _Motion(
-        states[rows, : model.nq],
-        velocity,
-        (after - before)[:, model.nq :] / seconds,
-        actions[rows[:, None] + np.arange(-half, half)].mean(1),
-        measured.time[rows],
+        return Proposal()
+    bounds, changes = np.array([_bounds(entry, simulation.model) for entry in entries]).T, np.stack(columns, axis=-1)
+    shares = _needed(missing, changes, bounds, settings)
+    kept = np.flatnonzero(shares)
+    if not len(kept):
+        return Proposal()
+    half = _half_widths(missing, changes[..., kept], bounds[:, kept], settings.blocks)
+    chosen = [entries[index] for index in kept]
+    return Proposal(
+        tuple(chosen),
+        tuple(_at(entry, share) for entry, share in zip(chosen, shares[kept], strict=True)),
+        tuple(
+            {name: float(width * abs(_step(entry, name))) for name in _scaled(entry)}
+            for entry, width in zip(chosen, half, strict=True)
+        ),
     )
+
+
+def _half_widths(missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, blocks: int) -> np.ndarray:
+    """Half-widths of the shares' 95 % intervals, (P), by leaving out one block of neighbouring windows after another."""
+    parts = np.array_split(np.arange(len(missing)), blocks)
+    left_out = np.array(
+        [
+            _Regression.fit(np.delete(missing, part, 0), np.delete(changes, part, 0), bounds).shares
+            for part in parts
+            if len(part)
+        ]
+    )
+    return student_t.ppf(0.975, len(left_out) - 1) * np.sqrt((len(left_out) - 1) * left_out.var(0))
 
 
 def _acts_on_one(effect: Effect, simulation: Simulation) -> bool:
@@ -156,7 +141,7 @@ def _acts_on_one(effect: Effect, simulation: Simulation) -> bool:
     return len(elements(effect, simulation)) == 1
 
 
-def _change(simulation: Simulation, motion: _Motion, missing: np.ndarray, entry: CatalogueEntry) -> np.ndarray | None:
+def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: CatalogueEntry) -> np.ndarray | None:
     """Change of the missing force, (W, nv), by an entry's first trial; None if there is none."""
     try:
         change = missing_force(simulation.with_effects(entry.starts[0]), motion) - missing
@@ -263,11 +248,15 @@ def _own_value(effect: Effect, model: mujoco.MjModel) -> float:
     return float(np.ravel(getattr(model, field)[place])[0])
 
 
+def _step(entry: CatalogueEntry, name: str) -> float:
+    """Distance of a parameter's first trial from the value without effect."""
+    return entry.trials[0][name] - entry.effect.parameters[name].neutral
+
+
 def _at(entry: CatalogueEntry, share: float) -> Effect:
     """An entry's effect at a share of its first trial."""
     values = dict(entry.trials[0])
     for name in _scaled(entry):
         parameter = entry.effect.parameters[name]
-        moved = parameter.neutral + share * (values[name] - parameter.neutral)
-        values[name] = float(np.clip(moved, *parameter.bounds))
+        values[name] = float(np.clip(parameter.neutral + share * _step(entry, name), *parameter.bounds))
     return entry.effect.with_parameters(values)

@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.trace.begin import (
     begin_in_longer_windows,
     begin_noise_free,
     begin_with,
+    begin_with_forces,
     in_longer_windows,
 )
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
@@ -77,13 +78,17 @@ def trace_effects(
 
     others, ended_in = (), None
     try:
-        best, others = with_most_usual_set(
-            _searched(best, catalogue, rng, progress, keep), lambda: progress.closer(SET_FITTED)
-        )
+        searched = _searched(best, catalogue, rng, progress, keep)
+        by_forces = begin_with_forces(searched, catalogue, rng, progress)
+        if by_forces is not None:
+            keep(by_forces)
+        else:
+            best, others = with_most_usual_set(searched, lambda: progress.closer(SET_FITTED))
     except OutOfTimeError as end:
         ended_in = str(end)
-    divided = _divided_in_longer_windows(best, catalogue, rng)
-    return replace(_outcome(_fitted_to_all(divided)), others=others, ended_in=ended_in)
+    if not best.by_forces:
+        best = _fitted_to_all(_divided_in_longer_windows(best, catalogue, rng))
+    return replace(_outcome(best), others=others, ended_in=ended_in)
 
 
 def _searched(

@@ -165,6 +165,10 @@ class InverseDynamicsSettings:
     """Time before and after a row, in s, over which its velocity and acceleration are averaged."""
     rows: int = 1500
     """Largest number of rows in the regression."""
+    rows_in_window: int = 7
+    """Rows, evenly spread over a window, over which the simulator's forces are averaged."""
+    blocks: int = 20
+    """Blocks of neighbouring windows by which intervals are computed."""
     least_rows: int = 200
     """Smallest number of rows."""
     more_left: float = 1.2

@@ -12,6 +12,9 @@ from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
 from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force
 from torchrl_h2o.data.readers.units import to_si
 
+JUMP = 0.5  # share of the median step by which a step must differ for the run to end there
+UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the steps differ from the median by this share
+
 
 @dataclass(frozen=True)
 class Coordinates:
@@ -219,12 +222,7 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
         lines.append("dt: 0.01  # no column of time was found: give the time between two rows in s")
     if "action" not in kinds:
         lines.append("free_motion: true  # no column of actions was found: remove this line if there is one")
-    steps = np.diff(time) if (time := _time(contents)) is not None else np.zeros(0)
-    jumps = int((np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)).sum()) if len(steps) else 0
-    if jumps:
-        lines.append(
-            f"on_time_jump: split  # {jumps} of {len(steps)} time steps differ by more than half: runs end there"
-        )
+    lines += _clock(_time(contents))
     lines.append("columns:")
     for column in columns:
         role = {"position": "observation", "velocity": "observation"}.get(column.kind, column.kind)
@@ -241,3 +239,19 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
             entry = f'name: "{_estimated(column.name)}", role: observation, derivative_of: "{column.name}"'
             lines.append(f"  - {{{entry}}}  # no such column was found: it is estimated")
     return "\n".join(lines) + "\n"
+
+
+def _clock(time: np.ndarray | None) -> list[str]:
+    """What to do about irregular time steps: split at few late rows, resample if many steps differ."""
+    if time is None or len(time) < 2:
+        return []
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    uneven = float((np.abs(steps - usual) > UNEVEN * usual).mean())
+    if uneven > MANY and usual > 0.0:
+        why = f"{uneven:.0%} of the time steps differ by more than {UNEVEN:.0%}, and the simulator takes equal ones"
+        split = "on_time_jump: split  # runs end at gaps longer than 1.5 steps; time_tolerance: 3 allows 4 steps"
+        return [f"resample: {usual:.1g}  # s; {why}", split]
+    jumps = int((np.abs(steps - usual) > JUMP * usual).sum())
+    words = f"{jumps} of {len(steps)} time steps differ by more than half: runs end there"
+    return [f"on_time_jump: split  # {words}"] if jumps else []

@@ -1,0 +1,166 @@
+"""Resample a log with irregular time stamps to a regular clock, because a simulator takes equal steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from torchrl import torchrl_logger
+
+from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.log_columns import Column, LogColumns
+from torchrl_h2o.data.readers.log_links import done_rows, require_increasing, same_episode
+from torchrl_h2o.data.readers.log_table import LogTable
+from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
+from torchrl_h2o.data.readers.units import to_si
+
+_ROUNDING = 1e-6  # share of a step by which the last row may be too early for it
+
+
+def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = READER_SETTINGS) -> LogTable:
+    """Resample the rows of a log to the clock of ``layout.resample``.
+
+    Observations are interpolated linearly between rows, angles across their jumps by 2π. An action is the mean, over
+    its step, of the actions of the file, each of which holds until the next row. An observation that repeats that of
+    the row before, as after a lost packet, is not used, unless the robot seems to rest. A run ends with the last step
+    before its ``done`` is 1, or at a gap longer than ``time_tolerance`` allows.
+
+    Args:
+        table: the numbers of the log.
+        layout: its columns, with ``resample``.
+        settings: how many repeated rows count as lost packets.
+
+    Returns:
+        The table with the new clock as its time; ``rows`` are those at or before each step.
+
+    Raises:
+        DataError: for time that does not increase, a gap where the layout does not split, or no two steps.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from torchrl_h2o.data import Column, LogColumns, read_robot_log
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+        >>> _ = path.write_text("t,q,u\\n0,0,1\\n0.009,0.9,1\\n0.021,2.1,1\\n0.03,3,1\\n")
+        >>> columns = Column("t", "time", "s"), Column("q", "observation"), Column("u", "action")
+        >>> td = read_robot_log(path, LogColumns(columns, separator=",", header=True, resample=0.01))
+        >>> td["next", "observation"].flatten().tolist()
+        [1.0, 2.0, 3.0]
+    """
+    time = table.columns([cast("Column", layout.named("time")).name])[:, 0]  # a layout with resample has one
+    done = done_rows(table, layout)
+    linked = same_episode(table, layout, done)
+    steps = require_increasing(table, layout, linked)
+    stale = _stale(table.columns(layout.observation), settings.stale_rows)
+    step = cast("float", layout.resample)
+    parts = [
+        _resampled(table, layout, _Run(time[run], step, stale[run], run, bool(done[run.stop - 1])))
+        for run in _runs(steps, linked, table, layout)
+        if time[run.stop - 1] - time[run.start] >= step * (1.0 - _ROUNDING)
+    ]
+    if not parts:
+        raise DataError(
+            f"no run is as long as a step of {step:g} s", "correct resample or time_tolerance", source=table.source
+        )
+    values, rows = (np.concatenate(each) for each in zip(*parts, strict=True))
+    torchrl_logger.info(
+        f"{table.source}: resampled to {step:g} s, {len(rows)} rows from {len(time)}; readings of {stale.sum()} rows "
+        "repeat the row before in every sensor and were not used"
+    )
+    return LogTable(table.source, table.names, values, rows, table.zero_rows)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """An unbroken run and its new clock.
+
+    Args:
+        time: stamps of the run's rows in s, increasing.
+        step: step of the new clock in s.
+        stale: whether the readings of a row are those of the row before.
+        rows: the run's rows in the table.
+        ends: whether done is 1 in its last row.
+    """
+
+    time: np.ndarray
+    step: float
+    stale: np.ndarray
+    rows: slice
+    ends: bool
+
+    @property
+    def clock(self) -> np.ndarray:
+        """The new stamps, the first of which is that of the run's first row."""
+        count = int((self.time[-1] - self.time[0]) / self.step + _ROUNDING) + 1
+        return self.time[0] + self.step * np.arange(count)
+
+    @property
+    def before(self) -> np.ndarray:
+        """The last row at or before each new stamp, counted from the run's first."""
+        return np.searchsorted(self.time, self.clock + _ROUNDING * self.step, side="right") - 1
+
+
+def _runs(steps: np.ndarray, linked: np.ndarray, table: LogTable, layout: LogColumns) -> list[slice]:
+    """Rows of each run, which ends with its episode or at a gap.
+
+    Raises:
+        DataError: for a gap, unless the layout splits there.
+    """
+    usual = float(np.median(steps[linked])) if linked.any() else 0.0
+    longest = (1.0 + layout.time_tolerance) * max(usual, cast("float", layout.resample))
+    gaps = linked & (steps > longest)
+    if gaps.any() and layout.on_time_jump == "error":
+        index = int(np.argmax(gaps))
+        raise DataError(
+            f"the time step is {steps[index]:.9g} s; time_tolerance allows interpolation over {longest:.4g} s",
+            "set on_time_jump: split, or widen time_tolerance",
+            source=table.source,
+            column=cast("Column", layout.named("time")).name,
+            row=int(table.rows[index + 1]),
+        )
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], linked & ~gaps, [False]]).astype(int)))
+    return [slice(int(first), int(last) + 1) for first, last in edges.reshape(-1, 2)]
+
+
+def _stale(observation: np.ndarray, longest: int) -> np.ndarray:
+    """Rows that repeat the row before in every sensor, in stretches of at most ``longest`` rows; longer ones rest."""
+    same = np.concatenate([[False], (observation[1:] == observation[:-1]).all(1), [False]])
+    stale = np.zeros(len(observation), bool)
+    for first, last in np.flatnonzero(np.diff(same.astype(int))).reshape(-1, 2) + 1:
+        stale[first:last] = last - first <= longest
+    return stale
+
+
+def _resampled(table: LogTable, layout: LogColumns, run: _Run) -> tuple[np.ndarray, np.ndarray]:
+    """Values (steps, columns) and row numbers (steps,) of a run on its new clock."""
+    by_name = {column.name: column for column in layout.in_file}
+    columns = [_column(by_name[name], table.columns([name])[run.rows, 0], run) for name in table.names]
+    return np.stack(columns, axis=1), table.rows[run.rows][run.before]
+
+
+def _column(column: Column, values: np.ndarray, run: _Run) -> np.ndarray:
+    if column.role == "time":
+        return run.clock
+    if column.role == "action":
+        return _mean_action(values, run)
+    if column.role == "done":
+        return np.append(np.zeros(len(run.clock) - 1), float(run.ends))
+    return _interpolated(values, run, angle=to_si(column.unit)[0] == "rad")
+
+
+def _interpolated(values: np.ndarray, run: _Run, *, angle: bool) -> np.ndarray:
+    fresh = ~run.stale
+    fresh[[0, -1]] = True
+    time, known = run.time[fresh], values[fresh]
+    found = np.interp(run.clock, time, np.unwrap(known) if angle else known)
+    if angle:
+        nearest = values[run.before]
+        found -= 2.0 * np.pi * np.round((found - nearest) / (2.0 * np.pi))
+    return found
+
+
+def _mean_action(values: np.ndarray, run: _Run) -> np.ndarray:
+    """Mean of the held action over each step; that of the last step has no next row and is the last one held."""
+    integral = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(run.time))])
+    mean = np.diff(np.interp(run.clock, run.time, integral)) / run.step
+    return np.append(mean, values[run.before[-1]])

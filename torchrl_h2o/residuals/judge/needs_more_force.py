@@ -1,0 +1,37 @@
+"""Whether the measured motion needs larger forces with the effects found than the simulator lacks without them."""
+
+from __future__ import annotations
+
+from torchrl_h2o.residuals.measured.missing_force import MissingForces
+from torchrl_h2o.residuals.report.words import quantity
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.simulation.state_map import coordinate_names
+
+
+def needs_more_force(
+    simulation: Simulation, forces: MissingForces, settings: LoopSettings = DEFAULTS
+) -> tuple[str, ...]:
+    """Says so if effects contradict the measured forces: the motion then needs forces that no motor gave.
+
+    A rotor that is too heavy predicts that a joint keeps its velocity, which is a good guess over some steps. But the
+    accelerations in the data would then need far larger torques than those that were measured.
+
+    Args:
+        simulation: the simulator, for the names of its joints.
+        forces: the missing forces without and with the effects, on the part of the data for the report.
+        settings: the largest factor by which effects may raise a missing force.
+
+    Returns:
+        One clause, about the joint whose missing force rises most, or nothing.
+    """
+    if not forces.rise_by(settings.verdict.more_force):
+        return ()
+    dof, model = int(forces.factors.argmax()), simulation.model
+    names, units = (each[model.nq + dof] for each in coordinate_names(model))
+    unit = "N" if units == "m/s" else "N·m"
+    after, before = (quantity(float(which[dof]), unit, 2) for which in (forces.after, forces.before))
+    return (
+        f"with them, the measured motion of {names.removesuffix('_velocity')} needs {after} more than was measured, "
+        f"and {before} without them",
+    )

@@ -1,0 +1,144 @@
+"""The force that a simulator lacks along the measured motion, by inverse dynamics.
+
+A simulation over several steps says little where a torque moves a light link: noise of the torque, or a small error of
+the friction, is enough to make it run away. The force that the motion needs shows the same error in N or N·m, whatever
+the inertia is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
+from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Measured motion over short windows.
+
+    Args:
+        position: (W, K, nq), at K rows of each window.
+        velocity: (W, K, nv), at these rows.
+        acceleration: (W, nv), mean over the window.
+        control: (W, nu), executed actions, mean over the window.
+        time: (W, K), in s.
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    control: np.ndarray
+    time: np.ndarray
+
+
+def measured_motion(
+    simulation: Simulation,
+    measured: Measured,
+    split: Split,
+    settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
+) -> Motion | None:
+    """The motion in windows that reach ``half_width`` to both sides of a row, long enough to average out noise.
+
+    Windows with unknown states, as those at the ends of a run with late sensors, are left out.
+
+    Args:
+        simulation: the simulator, whose effects on sensors and actions are applied.
+        measured: the data.
+        split: part of the data.
+        settings: rows and smoothing.
+
+    Returns:
+        The motion in evenly spread windows; None if coordinates are unobserved, if actuators have a state of their own,
+        which is not measured, or if the windows are too few.
+    """
+    if simulation.model.na or not simulation.state_map.observe.any(0).all():
+        return None
+    half = max(1, round(settings.half_width / simulation.control_step))
+    starts = thinned(measured.windows(2 * half + 1, split=split), settings.rows)
+    states, model = start_states(simulation, measured), simulation.model
+    rows = starts[:, None] + np.linspace(0, 2 * half, min(2 * half + 1, settings.rows_in_window)).round().astype(int)
+    rows = rows[np.isfinite(states[rows]).all((1, 2))]
+    if len(rows) < settings.least_rows:
+        return None
+    actions = executed_actions(simulation, measured)
+    return Motion(
+        states[rows, : model.nq],
+        states[rows, model.nq :],
+        (states[rows[:, -1]] - states[rows[:, 0]])[:, model.nq :] / (2.0 * half * simulation.control_step),
+        actions[rows[:, :1] + np.arange(2 * half)].mean(1),
+        measured.time[rows],
+    )
+
+
+def missing_force(simulation: Simulation, motion: Motion) -> np.ndarray:
+    """Generalised force, (W, nv) in N or N·m, that the measured motion needs beyond what the simulator has.
+
+    Forces of the simulator are averaged over the rows of a window, because dry friction may change its sign within it.
+    """
+    model = simulation.model
+    data, (windows, rows) = mujoco.MjData(model), motion.time.shape
+    needed = np.empty((windows, rows, model.nv))
+    for window in range(windows):
+        data.qacc[:], data.ctrl[:] = motion.acceleration[window], motion.control[window]
+        for row in range(rows):
+            data.qpos[:], data.qvel[:] = motion.position[window, row], motion.velocity[window, row]
+            mujoco.mj_inverse(model, data)
+            mujoco.mj_fwdActuation(model, data)
+            needed[window, row] = data.qfrc_inverse - data.qfrc_actuator
+    position, velocity = (each.reshape(windows * rows, -1) for each in (motion.position, motion.velocity))
+    control = np.repeat(motion.control, rows, axis=0)
+    for force in simulation.pipeline.batched_forces(model):
+        needed -= force(position, velocity, control, motion.time.ravel()).reshape(needed.shape)
+    weights = np.ones(rows)
+    weights[[0, -1]] = 0.5  # trapezoidal rule
+    return np.average(needed, axis=1, weights=weights)
+
+
+@dataclass(frozen=True, eq=False)
+class MissingForces:
+    """Usual sizes of the forces that the measured motion needs, in N or N·m.
+
+    Args:
+        before: (nv), beyond those of a simulator.
+        after: (nv), beyond those of the simulator with effects.
+    """
+
+    before: np.ndarray
+    after: np.ndarray
+
+    @property
+    def factors(self) -> np.ndarray:
+        """(nv), by which the effects multiply what is missing; forces far below the largest one do not count."""
+        floor = 1e-3 * max(self.before.max(), self.after.max(), 1e-12)
+        return (self.after + floor) / (self.before + floor)
+
+    def rise_by(self, factor: float) -> bool:
+        """Whether the effects raise one force by more than a factor, and do not lower the others as much."""
+        return bool(self.factors.max() > factor and np.log(self.factors).sum() > 0.0)
+
+    def fall_by(self, factor: float) -> bool:
+        """Whether the effects multiply the product of all forces by less than a factor below one."""
+        return bool(np.log(self.factors).sum() < np.log(factor))
+
+
+def missing_forces(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    split: Split,
+    settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
+) -> MissingForces | None:
+    """The forces that a simulator lacks without and with effects; None if :func:`measured_motion` gives no motion."""
+    sizes = []
+    for which in (simulation, mended):
+        motion = measured_motion(which, measured, split, settings)
+        if motion is None:
+            return None
+        sizes.append(np.median(np.abs(missing_force(which, motion)), axis=0))
+    return MissingForces(*sizes)
