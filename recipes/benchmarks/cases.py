@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from systems import SYSTEMS
+from systems import SYSTEMS, with_torque_noise
 from tensordict import TensorDict
 
 from torchrl_h2o.effects import Effect
@@ -27,6 +27,8 @@ class Case:
         in_simulator: effects of the simulator.
         in_reality: effects of the measured system.
         noise: standard deviation of the sensor noise, as a fraction of each signal's standard deviation.
+        torque_noise: standard deviation of the noise of the logged actions, as a fraction of each action's own; the
+            system does not feel it.
         seed: random seed of the recording.
         transitions: number of recorded transitions.
         episode: steps until a reset.
@@ -40,6 +42,7 @@ class Case:
     in_simulator: tuple[Effect, ...] = ()
     in_reality: tuple[Effect, ...] = ()
     noise: float = 0.0
+    torque_noise: float = 0.0
     seed: int = 0
     transitions: int = TRANSITIONS
     episode: int = 500
@@ -52,7 +55,8 @@ class Case:
     def measure(self) -> TensorDict:
         """Record the data, TED ``(transitions,)``."""
         system = SYSTEMS[self.system]
-        return system.record(self.in_reality, self.transitions, self.seed, noise=self.noise, episode=self.episode)
+        data = system.record(self.in_reality, self.transitions, self.seed, noise=self.noise, episode=self.episode)
+        return with_torque_noise(data, self.torque_noise, self.seed) if self.torque_noise else data
 
     @property
     def truth_in_words(self) -> str:

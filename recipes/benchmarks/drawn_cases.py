@@ -46,6 +46,8 @@ EXPLAINABLE_UNDECLARED = 0.8
 DAMPING_RATIO = (0.007, 0.015)  # of slow viscous friction: about 1 % of critical
 FRICTION, ARMATURE = (0.2, 0.9), (0.004, 0.012)  # N·m and kg·m², of each joint of the leg
 WITHIN = 0.15  # relative error of the leg's values
+ROUGHLY = 0.4  # the same, where the torques are noisy
+ENCODER_NOISE, TORQUE_NOISE = 0.003, (0.05, 0.3)  # shares of the signals' standard deviations
 DRIFT = (0.05, 0.15)  # N·m, torque that a drifting motor reaches at the end of the data
 
 
@@ -300,6 +302,37 @@ def judge_joints(report: Report, case: Case) -> dict:
     return {"ok": bool(errors.max() <= WITHIN) and not others, "parameter_error": float(errors.max())}
 
 
+def torques(number: int, rng: np.random.Generator) -> Case:
+    """Dry friction of the leg's joints, logged with the torques of noisy sensors; every fourth draw has no friction."""
+    friction = [JointFrictionLoss(float(rng.uniform(*FRICTION)), joint) for joint in JOINTS]
+    truth: tuple[Effect, ...] = () if number % 4 == 3 else tuple(friction)
+    return Case(
+        name=f"leg {number}",
+        system="leg",
+        judge=judge_torques,
+        truth=truth,
+        in_reality=truth,
+        noise=ENCODER_NOISE,
+        torque_noise=float(rng.uniform(*TORQUE_NOISE)),
+        seed=int(rng.integers(2**31)),
+        episode=10**6,
+    )
+
+
+def judge_torques(report: Report, case: Case) -> dict:
+    """Passed if the friction of each joint is right within 40 %, and nothing else is named but noise; or if refused."""
+    simulation = case.simulation()
+    true, found = (simulation.with_effects(*effects).model for effects in (case.truth, report.effects))
+    errors = np.abs(found.dof_frictionloss - true.dof_frictionloss) / np.maximum(true.dof_frictionloss, FRICTION[0])
+    others = [effect for effect in report.effects if not (effect.random or isinstance(effect, JointFrictionLoss))]
+    refused = bool(report.effects) and not report.recommended
+    return {
+        "ok": refused or (bool(errors.max() <= ROUGHLY) and not others),
+        "parameter_error": float(errors.max()),
+        "refused": refused,
+    }
+
+
 SEVERAL = Family(
     several, 20, 18, "the exact set, its group or a listed other set, 95 % of the explainable error gone", stream=4
 )
@@ -308,3 +341,6 @@ NOTHING = Family(nothing, 20, 20, "'nothing missing'", stream=1)
 DECOY = Family(decoy, 4, 4, "reported as a group", stream=0)
 SLOW = Family(slow, 10, 8, "viscous friction or a torque that depends on time", stream=6)
 JOINT_BY_JOINT = Family(joints, 6, 5, "friction and rotor inertia of each joint within 15 %", stream=7)
+NOISY_TORQUES = Family(
+    torques, 8, 8, "friction of each joint within 40 % and nothing else, or not recommended", stream=8
+)

@@ -5,7 +5,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from cases import Family
-from drawn_cases import DECOY, JOINT_BY_JOINT, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
+from drawn_cases import DECOY, JOINT_BY_JOINT, NOISY_TORQUES, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
 from log_cases import log_families
 from machine_cases import MACHINE
 from paper_cases import PAPER, PAPER_WITH_NOISE
@@ -21,6 +21,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "decoy": DECOY,
         "slow": SLOW,
         "joints": JOINT_BY_JOINT,
+        "torques": NOISY_TORQUES,
         "robot": ROBOT,
         "machines": MACHINE,
     }

@@ -110,6 +110,23 @@ def with_sensor_noise(data: TensorDict, share: float, seed: int, limit: float = 
     return noisy
 
 
+def with_torque_noise(data: TensorDict, share: float, seed: int) -> TensorDict:
+    """Add noise to the logged actions, as torque sensors do.
+
+    Args:
+        data: TED, ``(T,)``.
+        share: the noise's standard deviation as a share of each action's own.
+        seed: of the noise.
+
+    Returns:
+        A noisy copy.
+    """
+    generator, action = torch.Generator().manual_seed(seed), data["action"]
+    noisy = data.clone()
+    noisy["action"] = action + share * action.std(0) * torch.randn(action.shape, generator=generator)
+    return noisy
+
+
 def _measured(true: torch.Tensor, std: torch.Tensor, limit: float, generator: torch.Generator) -> torch.Tensor:
     noisy = true + std * torch.randn(true.shape, generator=generator)
     # saturated sensors stay saturated: they do not show how far the signal exceeds the limit

@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from tests.residuals.pendulum import UnknownForce, pendulum, recorded
+from tests.residuals.pendulum import UnknownForce, double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     ActionGain,
     ActionNoise,
@@ -165,3 +166,21 @@ def test_action_noise_that_was_found_is_not_missing():
     noise = ActionNoise(0.2)
     explained = verdict((noise,), (noise,), noise=0.003)
     assert explained.kind == EXPLAINED
+
+
+def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques_spoil_the_motion():
+    """The noise is on the logged torques alone. A rotor that hides it is not recommended."""
+    simulation, friction = double_pendulum(), (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"))
+    data = recorded(simulation.with_effects(*friction), 3000, noise=0.002)
+    noise = 0.3 * np.random.default_rng(0).normal(size=data.action.shape)
+    noisy = replace(data, action=data.action + noise)
+
+    def of(*found):
+        mended = simulation.with_effects(*found)
+        error, auc = error_summary(simulation, mended, noisy), two_sample_auc(mended, noisy, sensor_std=None)
+        return reach_verdict(simulation, mended, noisy, found, error, TwoSample(None, auc))
+
+    assert of(*friction).recommended
+    rotor = of(Armature(0.1, "elbow"))
+    assert not rotor.recommended
+    assert any("the measured motion of elbow needs" in reason for reason in rotor.reasons)

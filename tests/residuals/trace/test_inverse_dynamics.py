@@ -23,7 +23,8 @@ from torchrl_h2o.residuals import Split, StateMap, trace_effects
 from torchrl_h2o.residuals.measured.missing_force import measured_motion
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS
-from torchrl_h2o.residuals.trace.begin import begin_anew
+from torchrl_h2o.residuals.trace.begin import begin_anew, begin_with_forces
+from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible
@@ -138,3 +139,51 @@ def test_nothing_is_proposed_if_a_coordinate_is_not_observed_or_actuators_have_a
     filtered = DOUBLE.replace("<motor ", '<general dyntype="filter" dynprm="0.01" ')
     slow_motors = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(filtered))
     assert propose_effects(slow_motors, slow, slow_motors.catalogue()).entries == ()
+
+
+def with_noisy_torques(measured, std=0.15, seed=0):
+    """The data with noise on the measured torques, N·m, which did not move the joints."""
+    return replace(
+        measured, action=measured.action + std * np.random.default_rng(seed).normal(size=measured.action.shape)
+    )
+
+
+def by_forces(measured, found):
+    """What the forces say after a search that has found some effects; None if these stand."""
+    rng = np.random.default_rng(0)
+    state = SearchState.begin(Problem.pose(SIMULATION, measured), CATALOGUE, rng)
+    entries = [entry_of(effect, CATALOGUE) for effect in found]
+    none = tuple({} for _ in found)
+    state = state.with_found(entries, Fit(tuple(found), tuple(() for _ in found), 0.0, none))
+    with LoopBar(disable=True) as bar:
+        return begin_with_forces(state, CATALOGUE, rng, bar)
+
+
+def test_effects_that_contradict_noisy_torques_give_way_to_the_friction():
+    noisy = with_noisy_torques(MEASURED)
+    other = by_forces(noisy, (Armature(0.5, "*"),))
+    assert other is not None
+    assert other.by_forces
+    model = SIMULATION.with_effects(*other.fit.effects).model
+    assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.25)
+    assert (model.dof_armature < 0.1 * SIMULATION.model.dof_M0).all()
+    assert [set(widths) for widths in other.fit.half_widths] == [set(free) for free in other.fit.free]
+    assert all(0.0 < width < 0.1 for widths in other.fit.half_widths for width in widths.values())
+
+
+def test_effects_that_stand_the_test_are_kept():
+    assert by_forces(MEASURED, FRICTION) is None
+    assert by_forces(with_noisy_torques(MEASURED, 0.02), FRICTION) is None
+    assert by_forces(MEASURED, ()) is None
+
+
+def test_nothing_replaces_a_wrong_effect_if_no_force_is_missing():
+    """Noisy torques alone must not make an effect."""
+    assert by_forces(with_noisy_torques(recorded(SIMULATION, 3000, noise=0.002)), (Armature(0.5, "*"),)) is None
+
+
+def test_intervals_cover_the_true_friction():
+    found = propose_effects(SIMULATION, with_noisy_torques(MEASURED), CATALOGUE)
+    index = next(i for i, effect in enumerate(found.effects) if getattr(effect, "joints", "") == "elbow")
+    assert isinstance(found.effects[index], JointFrictionLoss)
+    assert abs(found.effects[index].torque - 0.08) < 2.0 * found.half_widths[index]["torque"]

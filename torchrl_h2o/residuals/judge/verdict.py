@@ -67,6 +67,8 @@ def reach_verdict(
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
+    of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects, settings)
+    against, signs = (*against, *of_forces), (*signs, *of_motion)
     raised = False
     if (head := error.headline) is not None:
         steps = max(1, round(head.seconds / simulation.control_step))
@@ -92,8 +94,7 @@ def _raises(
 ) -> bool:
     """Whether effects other than noise raise the error of the sentence, beyond what is negligible."""
     spread = float(measured.observation[:, simulation.state_map.names.index(head.name)].std())
-    acting = any(not effect.random for effect in effects)
-    return acting and head.after > max(rules.raised * head.before, rules.worse_negligible * spread)
+    return bool(_acting(effects)) and head.after > max(rules.raised * head.before, rules.worse_negligible * spread)
 
 
 def _leaves_little(error: ErrorSummary, two_sample: TwoSample, rules: VerdictSettings) -> bool:
@@ -163,18 +164,13 @@ def reasons_against(
 ) -> tuple[str, ...]:
     """Reasons against putting effects into a simulator for training; empty if there are none."""
     rules, reasons = settings.verdict, []
-    acting = [effect for effect in effects if not effect.random]
+    acting = _acting(effects)
     if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
-    if acting:
-        forces = missing_forces(simulation, mended, measured, Split.REPORT, settings.inverse_dynamics)
-        if forces is None or not forces.fall_by(rules.less_force):
-            reasons += no_better_than_constant_velocity(mended, measured, acting, settings)
-        if forces is not None:
-            reasons += needs_more_force(simulation, forces, settings)
-    elif two_sample.auc_before is not None and auc is not None and auc > max(rules.auc, two_sample.auc_before):
-        before, after = (number(value, 2) for value in (two_sample.auc_before, auc))
+    auc_before = two_sample.auc_before
+    if not acting and auc_before is not None and auc is not None and auc > max(rules.auc, auc_before):
+        before, after = (number(value, 2) for value in (auc_before, auc))
         reasons.append(
             f"the noise found makes simulated transitions no more like the measured ones (AUC {before} → {after})"
         )
@@ -186,6 +182,34 @@ def reasons_against(
         f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect, rules))
     ]
     return tuple(reasons)
+
+
+def _acting(effects: Sequence[Effect]) -> list[Effect]:
+    """The effects that change the motion; noise does not."""
+    return [effect for effect in effects if not effect.random]
+
+
+def _by_motion_and_forces(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    effects: Sequence[Effect],
+    settings: LoopSettings,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Signs of something missing, and reasons against effects, by the motion and by the forces that it needs.
+
+    Effects that predict the motion no better than the guess of constant velocities are not used, unless they explain
+    the missing forces: where torques are noisy, right effects may not predict the motion of light links.
+    """
+    if not (acting := _acting(effects)):
+        return (), ()
+    hardly = no_better_than_constant_velocity(mended, measured, acting, settings)
+    forces = missing_forces(simulation, mended, measured, Split.REPORT, settings.inverse_dynamics)
+    if forces is None:
+        return (), hardly
+    if forces.fall_by(settings.verdict.less_force):
+        return hardly, ()
+    return (), (*hardly, *needs_more_force(simulation, forces, settings))
 
 
 def _lowers_the_error(

@@ -122,7 +122,7 @@ def propose_effects(
 
 
 def _half_widths(missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, blocks: int) -> np.ndarray:
-    """Half-widths of the shares' 95 % intervals, (P), by leaving out one block of neighbouring windows after another."""
+    """Half-widths of the shares' 95 % intervals, (P), by a jackknife over blocks of neighbouring windows."""
     parts = np.array_split(np.arange(len(missing)), blocks)
     left_out = np.array(
         [
