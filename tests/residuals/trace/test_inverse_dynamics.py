@@ -23,7 +23,7 @@ from torchrl_h2o.residuals import Split, StateMap, trace_effects
 from torchrl_h2o.residuals.measured.missing_force import measured_motion
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.settings import DEFAULTS
-from torchrl_h2o.residuals.trace.begin import begin_anew, begin_with_forces
+from torchrl_h2o.residuals.trace.begin import begin_anew, replaced_by_forces
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -156,14 +156,13 @@ def by_forces(measured, found):
     none = tuple({} for _ in found)
     state = state.with_found(entries, Fit(tuple(found), tuple(() for _ in found), 0.0, none))
     with LoopBar(disable=True) as bar:
-        return begin_with_forces(state, CATALOGUE, rng, bar)
+        return replaced_by_forces(state, CATALOGUE, rng, bar)
 
 
 def test_effects_that_contradict_noisy_torques_give_way_to_the_friction():
     noisy = with_noisy_torques(MEASURED)
     other = by_forces(noisy, (Armature(0.5, "*"),))
     assert other is not None
-    assert other.by_forces
     model = SIMULATION.with_effects(*other.fit.effects).model
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.25)
     assert (model.dof_armature < 0.1 * SIMULATION.model.dof_M0).all()

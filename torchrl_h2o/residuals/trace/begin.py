@@ -94,7 +94,7 @@ def begin_anew(
     return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / tried))
 
 
-def begin_with_forces(
+def replaced_by_forces(
     state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
 ) -> SearchState | None:
     """The effects that a regression of the missing forces proposes, where those found do not stand a test.
@@ -183,7 +183,7 @@ def _with_proposed(
         return other.with_found(found.entries, other.refitted(found.entries, found.effects))
     moved = tuple(tuple(widths) for widths in found.half_widths)
     fit = Fit(found.effects, moved, other.screened_loss(found.effects), found.half_widths)
-    return replace(other, entries=found.entries, fit=fit, by_forces=True)
+    return other.with_found(found.entries, fit)
 
 
 def begin_noise_free(

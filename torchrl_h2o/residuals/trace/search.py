@@ -17,8 +17,8 @@ from torchrl_h2o.residuals.trace.begin import (
     begin_in_longer_windows,
     begin_noise_free,
     begin_with,
-    begin_with_forces,
     in_longer_windows,
+    replaced_by_forces,
 )
 from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
 from torchrl_h2o.residuals.trace.eliminate import eliminate
@@ -78,16 +78,14 @@ def trace_effects(
 
     others, ended_in = (), None
     try:
-        searched = _searched(best, catalogue, rng, progress, keep)
-        by_forces = begin_with_forces(searched, catalogue, rng, progress)
-        if by_forces is not None:
-            keep(by_forces)
-        else:
-            best, others = with_most_usual_set(searched, lambda: progress.closer(SET_FITTED))
+        best, others = with_most_usual_set(
+            _searched(best, catalogue, rng, progress, keep), lambda: progress.closer(SET_FITTED)
+        )
     except OutOfTimeError as end:
         ended_in = str(end)
-    if not best.by_forces:
-        best = _fitted_to_all(_divided_in_longer_windows(best, catalogue, rng))
+    best = _fitted_to_all(_divided_in_longer_windows(best, catalogue, rng))
+    if ended_in is None and (by_forces := replaced_by_forces(best, catalogue, rng, progress)) is not None:
+        best, others = by_forces, ()
     return replace(_outcome(best), others=others, ended_in=ended_in)
 
 

@@ -71,7 +71,6 @@ class SearchState:
         noise_free: whether the search takes the sensors for free of noise, whatever the residual looks like.
         chosen_horizon: control steps per window that were chosen for the data, by which forces are looked for; None for
             those of the problem. A search in longer windows has others.
-        by_forces: whether the values are those of a regression of the missing forces, which no fit changes.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -89,7 +88,6 @@ class SearchState:
     exact: bool = False
     noise_free: bool = False
     chosen_horizon: int | None = None
-    by_forces: bool = False
 
     @classmethod
     def begin(
