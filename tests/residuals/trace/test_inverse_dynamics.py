@@ -186,3 +186,14 @@ def test_intervals_cover_the_true_friction():
     index = next(i for i, effect in enumerate(found.effects) if getattr(effect, "joints", "") == "elbow")
     assert isinstance(found.effects[index], JointFrictionLoss)
     assert abs(found.effects[index].torque - 0.08) < 2.0 * found.half_widths[index]["torque"]
+
+
+def test_what_the_model_has_too_much_is_taken_away_to_the_last_digit():
+    """A sum that is negative by rounding would be refused by the model."""
+    heavy = SIMULATION.with_effects(Armature(0.1, "*"), JointDamping(0.3, "*"))
+    found = propose_effects(heavy, MEASURED, CATALOGUE)
+    assert Armature in map(type, found.effects)
+    assert is_possible(Problem.pose(heavy, MEASURED), found.effects)
+    model = heavy.with_effects(*found.effects).model
+    assert (model.dof_armature < 0.05 * SIMULATION.model.dof_M0).all()
+    assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.2)

@@ -120,9 +120,9 @@ def replaced_by_forces(
     proposed = _with_proposed(state, catalogue, rng, progress, refitted=False)
     if proposed is None or (forces := _missing_forces(proposed)) is None:
         return None
-    without, with_them = (proposed.first.selection_losses(which) for which in ((), proposed.fit.effects))
-    rules, level = state.settings.verdict, state.settings.significance.level
-    explains = forces.fall_by(rules.less_force) and proposed.p_value(without, with_them) < level
+    without, with_them = (proposed.first.selection_loss(which) for which in ((), proposed.fit.effects))
+    rules = state.settings.verdict
+    explains = forces.fall_by(rules.less_force) and with_them < without
     return proposed if explains and MissingForces(forces.after, found.after).rise_by(rules.more_force) else None
 
 

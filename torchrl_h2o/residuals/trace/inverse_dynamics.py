@@ -113,7 +113,7 @@ def propose_effects(
     chosen = [entries[index] for index in kept]
     return Proposal(
         tuple(chosen),
-        tuple(_at(entry, share) for entry, share in zip(chosen, shares[kept], strict=True)),
+        tuple(_at(entry, share, simulation.model) for entry, share in zip(chosen, shares[kept], strict=True)),
         tuple(
             {name: float(width * abs(_step(entry, name))) for name in _scaled(entry)}
             for entry, width in zip(chosen, half, strict=True)
@@ -253,10 +253,11 @@ def _step(entry: CatalogueEntry, name: str) -> float:
     return entry.trials[0][name] - entry.effect.parameters[name].neutral
 
 
-def _at(entry: CatalogueEntry, share: float) -> Effect:
-    """An entry's effect at a share of its first trial."""
-    values = dict(entry.trials[0])
+def _at(entry: CatalogueEntry, share: float, model: mujoco.MjModel) -> Effect:
+    """An entry's effect at a share of its first trial, within what its bounds and the model allow."""
+    values, least = dict(entry.trials[0]), -_own_value(entry.effect, model)
     for name in _scaled(entry):
         parameter = entry.effect.parameters[name]
-        values[name] = float(np.clip(parameter.neutral + share * _step(entry, name), *parameter.bounds))
+        low, high = parameter.bounds
+        values[name] = float(np.clip(parameter.neutral + share * _step(entry, name), max(low, least), high))
     return entry.effect.with_parameters(values)
