@@ -189,8 +189,8 @@ def test_intervals_cover_the_true_friction():
 
 
 def test_what_the_model_has_too_much_is_taken_away_to_the_last_digit():
-    """A sum that is negative by rounding would be refused by the model."""
-    heavy = SIMULATION.with_effects(Armature(0.1, "*"), JointDamping(0.3, "*"))
+    """A sum that is negative by rounding, as it is with 0.013, would be refused by the model."""
+    heavy = SIMULATION.with_effects(Armature(0.013, "*"), JointDamping(0.3, "*"))
     found = propose_effects(heavy, MEASURED, CATALOGUE)
     assert Armature in map(type, found.effects)
     assert is_possible(Problem.pose(heavy, MEASURED), found.effects)
