@@ -28,6 +28,8 @@ class Motion:
         acceleration: (W, nv), mean over the window.
         control: (W, nu), executed actions, mean over the window.
         time: (W, K), in s.
+        moving: (W, nv), whether a degree of freedom moves in one direction throughout the window, and faster than a
+            share of its usual speed.
     """
 
     position: np.ndarray
@@ -35,6 +37,7 @@ class Motion:
     acceleration: np.ndarray
     control: np.ndarray
     time: np.ndarray
+    moving: np.ndarray
 
 
 def measured_motion(
@@ -66,20 +69,24 @@ def measured_motion(
     rows = rows[np.isfinite(states[rows]).all((1, 2))]
     if len(rows) < settings.least_rows:
         return None
-    actions = executed_actions(simulation, measured)
+    actions, velocity = executed_actions(simulation, measured), states[rows, model.nq :]
+    slowest = settings.resting * velocity.std((0, 1))
     return Motion(
         states[rows, : model.nq],
-        states[rows, model.nq :],
+        velocity,
         (states[rows[:, -1]] - states[rows[:, 0]])[:, model.nq :] / (2.0 * half * simulation.control_step),
         actions[rows[:, :1] + np.arange(2 * half)].mean(1),
         measured.time[rows],
+        (velocity > slowest).all(1) | (velocity < -slowest).all(1),
     )
 
 
 def missing_force(simulation: Simulation, motion: Motion) -> np.ndarray:
-    """Generalised force, (W, nv) in N or N·m, that the measured motion needs beyond what the simulator has.
+    """Generalised force that the measured motion needs beyond what the simulator has, mean over each window.
 
-    Forces of the simulator are averaged over the rows of a window, because dry friction may change its sign within it.
+    Returns:
+        (W, nv) in N or N·m; NaN for joints that rest or turn around in the window, where dry friction may have any size
+        up to its largest one.
     """
     model = simulation.model
     data, (windows, rows) = mujoco.MjData(model), motion.time.shape
@@ -97,7 +104,7 @@ def missing_force(simulation: Simulation, motion: Motion) -> np.ndarray:
         needed -= force(position, velocity, control, motion.time.ravel()).reshape(needed.shape)
     weights = np.ones(rows)
     weights[[0, -1]] = 0.5  # trapezoidal rule
-    return np.average(needed, axis=1, weights=weights)
+    return np.where(motion.moving, np.average(needed, axis=1, weights=weights), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,5 +147,7 @@ def missing_forces(
         motion = measured_motion(which, measured, split, settings)
         if motion is None:
             return None
-        sizes.append(np.median(np.abs(missing_force(which, motion)), axis=0))
+        force = np.abs(missing_force(which, motion))
+        enough = motion.moving.sum(0) >= settings.least_moving
+        sizes.append(np.where(enough, np.nanmedian(np.where(enough, force, 0.0), axis=0), 0.0))
     return MissingForces(*sizes)

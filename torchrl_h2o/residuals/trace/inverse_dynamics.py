@@ -142,12 +142,13 @@ def _acts_on_one(effect: Effect, simulation: Simulation) -> bool:
 
 
 def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: CatalogueEntry) -> np.ndarray | None:
-    """Change of the missing force, (W, nv), by an entry's first trial; None if there is none."""
+    """Change of the missing force, (W, nv), by an entry's first trial, NaN as the force; None if there is none."""
     try:
         change = missing_force(simulation.with_effects(entry.starts[0]), motion) - missing
     except ValueError:  # a value that the model rejects
         return None
-    return change if np.isfinite(change).all() and np.abs(change).max() > 0.0 else None
+    known = change[motion.moving]
+    return change if np.isfinite(known).all() and np.abs(known).max(initial=0.0) > 0.0 else None
 
 
 def _needed(
@@ -156,7 +157,7 @@ def _needed(
     """Share of each trial, (P), in the smallest set that explains the force nearly as well as all of them; else 0.
 
     Args:
-        missing: (W, nv).
+        missing: (W, nv), NaN where unknown.
         changes: (W, nv, P), of the trials.
         bounds: (2, P), smallest and largest share of each trial.
         settings: how much more than the whole set a smaller one may leave.
@@ -198,18 +199,22 @@ class _Regression:
         for _ in range(rounds if changes.shape[-1] else 0):
             scale = _usual(left)
             root = 1.0 / (scale * np.sqrt(np.maximum(1.0, np.abs(left / scale) / 2.0)))
-            shares, cost = _least_squares((missing * root).ravel(), changes * root[..., None], bounds)
+            known = np.isfinite(missing)
+            shares, cost = _least_squares((missing * root)[known], (changes * root[..., None])[known], bounds)
             left = missing + changes @ shares
         return cls(shares, left, _usual(left), int(cost.argmin()))
 
     def loss(self, scale: np.ndarray) -> float:
         """Mean robust loss of what is left, in units of ``scale``."""
-        return float(np.log1p((self.left / scale) ** 2).mean())
+        return float(np.nanmean(np.log1p((self.left / scale) ** 2)))
 
 
 def _least_squares(y: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounded shares, (P), that minimise the square of ``y`` plus the changes, and its rise without each of them."""
-    x = changes.reshape(len(y), -1)
+    """Bounded shares, (P), that minimise the square of ``y``, (N), plus the changes, (N, P).
+
+    Also returns the rise of the square without each of them, (P).
+    """
+    x = changes
     size = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
     inner = (x / size).T @ (x / size) + 1e-9 * np.eye(len(size))
     factor = np.linalg.cholesky(inner)
@@ -219,7 +224,9 @@ def _least_squares(y: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> tu
 
 
 def _usual(force: np.ndarray) -> np.ndarray:
-    return 1.4826 * np.median(np.abs(force), axis=0) + 1e-12
+    """Usual size, (nv), of forces (W, nv); of a joint that never moves, the smallest one."""
+    never = np.isnan(force).all(0)
+    return 1.4826 * np.nanmedian(np.where(never, 0.0, np.abs(force)), axis=0) + 1e-12
 
 
 def _scaled(entry: CatalogueEntry) -> tuple[str, ...]:

@@ -81,6 +81,8 @@ class Trace:
         others: other sets of effects with an equivalent loss, the most usual ones first.
         horizon: control steps per window that were chosen for the data.
         ended_in: stage in which the time for the search was up; None if it came to its end.
+        by_forces: whether the effects are those of a regression of the missing forces, because torques are so noisy
+            that the motion does not show them.
     """
 
     entries: tuple[CatalogueEntry, ...]
@@ -91,3 +93,4 @@ class Trace:
     others: tuple[RivalSet, ...] = ()
     horizon: int = 1
     ended_in: str | None = None
+    by_forces: bool = False

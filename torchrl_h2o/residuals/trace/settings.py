@@ -167,6 +167,10 @@ class InverseDynamicsSettings:
     """Largest number of rows in the regression."""
     rows_in_window: int = 7
     """Rows, evenly spread over a window, over which the simulator's forces are averaged."""
+    resting: float = 0.1
+    """Share of a joint's usual speed below which it counts as resting."""
+    least_moving: int = 50
+    """Smallest number of windows in which a joint must move for its missing force to count."""
     blocks: int = 20
     """Blocks of neighbouring windows by which intervals are computed."""
     least_rows: int = 200

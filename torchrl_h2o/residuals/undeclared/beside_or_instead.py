@@ -63,9 +63,10 @@ def add_undeclared_force(
         settings: thresholds and budgets.
 
     Returns:
-        The explanation, unchanged if no force passes the tests or nothing is left to explain.
+        The explanation, unchanged if no force passes the tests, if nothing is left to explain, or if the torques are so
+        noisy that the effects come from the missing forces: a force that is fitted to the motion would fit the noise.
     """
-    if explanation.trace.exact:
+    if explanation.trace.exact or explanation.trace.by_forces:
         return explanation
     parts, horizon = explanation.parts, _horizon(explanation, settings)
     first = Problem.pose(simulation, measured, horizon, settings=settings.residual)
