@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchrl_h2o.data import LogColumns, load
+from torchrl_h2o.data import LogColumns, load, read_robot_log
 from torchrl_h2o.data.readers.guess import guess_layout
 from torchrl_h2o.data.readers.guess.layout_text import Coordinates
 from torchrl_h2o.data.readers.guess.roles import guess_columns
@@ -96,3 +96,17 @@ def test_the_command_of_a_servo_has_the_unit_of_its_position(tmp_path):
     text = guess_layout(tmp_path / "log.csv", model).text
     assert '{name: "command", role: action, unit: "deg"}  # the model\'s actuators are servos' in text
     assert '{name: "effort", role: ignore}' in text
+
+
+def test_irregular_stamps_are_resampled(tmp_path):
+    """The written file can be read, also with a velocity that is estimated."""
+    path = tmp_path / "log.csv"
+    time = np.cumsum(0.01 + 0.004 * np.random.default_rng(0).uniform(-1, 1, 300))
+    rows = "".join(f"{t:.9f},{np.sin(t):.9f},{np.cos(t):.9f}\n" for t in time)
+    path.write_text("t,hip,tau\n" + rows)
+    text = guess_layout(path).text
+    assert "resample: 0.0" in text
+    (tmp_path / "log.yaml").write_text(text)
+    td = read_robot_log(path, tmp_path / "log.yaml")
+    assert td["observation"].shape[1] == 2
+    assert np.diff(td["time"].flatten().numpy()) == pytest.approx(0.01, rel=0.05)

@@ -13,15 +13,13 @@ from torchrl_h2o.residuals.measured.missing_force import MissingForces
 def test_the_joint_with_the_largest_rise_is_named_with_its_torques():
     forces = MissingForces(np.array([0.2, 0.1]), np.array([0.3, 1.25]))
     (clause,) = needs_more_force(double_pendulum(), forces)
-    assert clause == (
-        "with them, the measured motion of elbow needs 1.2 N·m more than was measured, and 0.1 N·m without them"
-    )
+    assert clause == ("with them, 1.2 N·m is missing in the measured motion of elbow, and 0.1 N·m without them")
 
 
 def test_a_sliding_joint_has_forces():
     sliding = replace(pendulum(), spec=lambda: mujoco.MjSpec.from_string(XML.replace('"hinge"', '"slide"')))
     (clause,) = needs_more_force(sliding, MissingForces(np.array([0.2]), np.array([2.0])))
-    assert "of elbow needs 2 N more than was measured, and 0.2 N without them" in clause
+    assert "2 N is missing in the measured motion of elbow, and 0.2 N without them" in clause
 
 
 def test_nothing_is_said_of_effects_that_lower_the_forces():

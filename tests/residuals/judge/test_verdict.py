@@ -183,4 +183,4 @@ def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques
     assert of(*friction).recommended
     rotor = of(Armature(0.1, "elbow"))
     assert not rotor.recommended
-    assert any("the measured motion of elbow needs" in reason for reason in rotor.reasons)
+    assert any("is missing in the measured motion of elbow" in reason for reason in rotor.reasons)

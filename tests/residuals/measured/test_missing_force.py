@@ -2,12 +2,13 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import ActionDelay, Armature, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals import Split, StateMap
+from torchrl_h2o.residuals import Simulation, Split, StateMap
 from torchrl_h2o.residuals.measured.missing_force import MissingForces, measured_motion, missing_forces
 
 SIMULATION = double_pendulum()
@@ -59,3 +60,14 @@ def test_there_are_none_without_all_coordinates():
     columns = {name: getattr(MEASURED, name)[:, 1:] for name in ("observation", "following")}
     assert measured_motion(blind, replace(MEASURED, **columns), Split.FIT) is None
     assert missing_forces(SIMULATION, SIMULATION, MEASURED.part(slice(0, 100)), Split.FIT) is None
+
+
+def test_windows_with_contacts_are_left_out():
+    """A foot on the ground: contact forces hang on the acceleration within a step, which the log does not show."""
+    ball = """<mujoco><option timestep="0.005"/><worldbody><geom type="plane" size="5 5 1"/>
+      <body pos="0 0 0.3"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+      <geom size="0.1" mass="1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-2 2"/></actuator></mujoco>"""
+    names, units = ("x", "z", "vx", "vz"), ("m", "m", "m/s", "m/s")
+    state_map = StateMap.of_coordinates(names, units, (0, 1, 2, 3), num_states=4)
+    rolling = Simulation(lambda: mujoco.MjSpec.from_string(ball), 1, state_map)
+    assert measured_motion(rolling, recorded(rolling, 3000), Split.FIT) is None

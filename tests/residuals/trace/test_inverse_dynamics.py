@@ -8,6 +8,8 @@ import pytest
 
 from tests.residuals.pendulum import DOUBLE, double_pendulum, recorded
 from torchrl_h2o.effects import (
+    ActionDelay,
+    ActionGain,
     Armature,
     BodyMass,
     CatalogueEntry,
@@ -21,8 +23,9 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import Split, StateMap, trace_effects
 from torchrl_h2o.residuals.measured.missing_force import measured_motion
-from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.settings import DEFAULTS
+from torchrl_h2o.residuals.trace import search
 from torchrl_h2o.residuals.trace.begin import begin_anew, replaced_by_forces
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
@@ -197,3 +200,37 @@ def test_what_the_model_has_too_much_is_taken_away_to_the_last_digit():
     model = heavy.with_effects(*found.effects).model
     assert (model.dof_armature < 0.05 * SIMULATION.model.dof_M0).all()
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.2)
+
+
+@pytest.mark.parametrize("other", [ActionDelay(0.02), ActionGain(0.7), Gravity(0.7)])
+def test_effects_that_no_regression_proposes_stay_beside_the_friction(other):
+    """Without the gain, masses × 1.4 would explain the forces as well."""
+    noisy = with_noisy_torques(recorded(SIMULATION.with_effects(*FRICTION, other), 3000, noise=0.002))
+    found = by_forces(noisy, (Armature(0.5, "*"), other))
+    assert found is not None
+    assert found.fit.effects[0] == other
+    model = SIMULATION.with_effects(*found.fit.effects).model
+    assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.25)
+
+
+def test_a_search_ends_with_the_forces_where_its_effects_contradict_them(monkeypatch):
+    """And with what it has found if its time is up while the forces are asked."""
+    few = [entry_of(Armature(0.0, "*"), CATALOGUE)]
+    asked = []
+
+    def of_forces(state, catalogue, rng, progress):
+        asked.append(state.fit.effects)
+        if len(asked) > 1:
+            raise OutOfTimeError("looking for effects")
+        return state.with_found((), Fit((), (), 0.0, ()))
+
+    monkeypatch.setattr(search, "replaced_by_forces", of_forces)
+    noisy = with_noisy_torques(recorded(SIMULATION.with_effects(*FRICTION), 800, noise=0.002))
+    with LoopBar(disable=True) as bar:
+        replaced, in_time = (
+            trace_effects(SIMULATION, noisy, few, rng=np.random.default_rng(0), progress=bar) for _ in range(2)
+        )
+    assert replaced.by_forces
+    assert replaced.entries == ()
+    assert in_time.ended_in == "looking for effects"
+    assert in_time.fit.effects == asked[1]

@@ -85,7 +85,7 @@ def _stamps(log: Log, settings: AuditSettings) -> list[Finding]:
                 f"takes equal steps",
                 Rows.of(late, settings.examples),
                 "split the log at late rows (on_time_jump: split with a smaller time_tolerance)"
-                + (f", or write resample: {usual:.1g} for a regular clock" if severity != "note" else ""),
+                + (f", or write resample: {log.dt:.3g} for a regular clock" if severity != "note" else ""),
             )
         )
     return found
@@ -99,7 +99,7 @@ def _splits(log: Log, settings: AuditSettings) -> list[Finding]:
         return []
     severity = "severe" if rows < settings.very_short_runs else "warning"
     words = f"the log breaks into {runs} runs of {rows:.0f} rows on average: its time steps are irregular"
-    return [Finding(CHECK, severity, words, None, f"log with a regular clock, or write resample: {log.dt:.1g}")]
+    return [Finding(CHECK, severity, words, None, f"log with a regular clock, or write resample: {log.dt:.3g}")]
 
 
 def _wrong_step(usual: float, dt: float, settings: AuditSettings) -> Finding:

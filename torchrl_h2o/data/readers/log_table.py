@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import cast
@@ -26,6 +26,8 @@ class LogTable:
         values: values in SI, float64, (rows, columns).
         rows: number of each row, counted from 1; the line number in text files, (rows,).
         zero_rows: number of rows of zeros that were dropped at the end of the file.
+        noise: standard deviation of the noise of columns whose noise the values do not show, because they were
+            interpolated, in SI.
     """
 
     source: str
@@ -33,6 +35,7 @@ class LogTable:
     values: np.ndarray
     rows: np.ndarray
     zero_rows: int
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
         """Return the named columns in the given order, (rows, len(names))."""

@@ -43,7 +43,8 @@ def observe(table: LogTable, layout: LogColumns, links: Links) -> tuple[np.ndarr
             continue
         values = table.columns([position])[:, 0]
         try:
-            found = estimate_velocity(values, links.runs, links.dt, angle=units[position] == "rad")
+            noise = table.noise.get(position, 0.0)
+            found = estimate_velocity(values, links.runs, links.dt, angle=units[position] == "rad", least_noise=noise)
         except ValueError as error:
             raise DataError(str(error), "record longer runs", source=table.source, column=name) from error
         torchrl_logger.info(

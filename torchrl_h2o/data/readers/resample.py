@@ -14,17 +14,20 @@ from torchrl_h2o.data.readers.log_links import done_rows, require_increasing, sa
 from torchrl_h2o.data.readers.log_table import LogTable
 from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.units import to_si
+from torchrl_h2o.data.readers.velocity import estimate_velocity
 
+TURN = 2.01 * np.pi  # rad, range of an angle that wraps, with some tolerance
 _ROUNDING = 1e-6  # share of a step by which the last row may be too early for it
 
 
 def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = READER_SETTINGS) -> LogTable:
     """Resample the rows of a log to the clock of ``layout.resample``.
 
-    Observations are interpolated linearly between rows, angles across their jumps by 2π. An action is the mean, over
-    its step, of the actions of the file, each of which holds until the next row. An observation that repeats that of
-    the row before, as after a lost packet, is not used, unless the robot seems to rest. A run ends with the last step
-    before its ``done`` is 1, or at a gap longer than ``time_tolerance`` allows.
+    Observations are interpolated linearly between rows, angles that stay within one turn across their jumps by 2π. An
+    action is the mean, over its step, of the actions of the file, each of which holds until the next row. Readings that
+    repeat those of the row before in every sensor, as after a lost packet, are not used, unless so many rows are alike
+    that the robot rests. A run ends with the last step before its ``done`` is 1, or at a gap that is longer than
+    ``time_tolerance`` allows.
 
     Args:
         table: the numbers of the log.
@@ -51,11 +54,13 @@ def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = REA
     done = done_rows(table, layout)
     linked = same_episode(table, layout, done)
     steps = require_increasing(table, layout, linked)
-    stale = _stale(table.columns(layout.observation), settings.stale_rows)
+    measured = [name for name in layout.observation if name in table.names]  # estimated velocities are not in the file
+    stale = _stale(table.columns(measured), settings.stale_rows)
     step = cast("float", layout.resample)
+    runs = _up_to_fresh(_runs(steps, linked, table, layout), stale)
     parts = [
         _resampled(table, layout, _Run(time[run], step, stale[run], run, bool(done[run.stop - 1])))
-        for run in _runs(steps, linked, table, layout)
+        for run in runs
         if time[run.stop - 1] - time[run.start] >= step * (1.0 - _ROUNDING)
     ]
     if not parts:
@@ -67,7 +72,25 @@ def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = REA
         f"{table.source}: resampled to {step:g} s, {len(rows)} rows from {len(time)}; readings of {stale.sum()} rows "
         "repeat the row before in every sensor and were not used"
     )
-    return LogTable(table.source, table.names, values, rows, table.zero_rows)
+    return LogTable(table.source, table.names, values, rows, table.zero_rows, _noise(table, layout, runs, steps))
+
+
+def _noise(table: LogTable, layout: LogColumns, runs: list[slice], steps: np.ndarray) -> dict[str, float]:
+    """Standard deviation of the noise of positions whose velocities are estimated, as white noise on the new clock.
+
+    It is that of the file's rows, as if they were evenly spaced; between these, interpolation adds rows without
+    information.
+    """
+    usual = float(np.median(np.concatenate([steps[run.start : run.stop - 1] for run in runs])))
+    more_rows = max(1.0, usual / cast("float", layout.resample))
+    units, found = {column.name: to_si(column.unit)[0] for column in layout.columns}, {}
+    for name in set(layout.derivatives.values()):
+        try:
+            estimate = estimate_velocity(table.columns([name])[:, 0], runs, usual, angle=units[name] == "rad")
+        except ValueError:  # the runs are too short, as the velocity's estimate will say
+            continue
+        found[name] = float(np.sqrt(more_rows)) * estimate.position_std
+    return found
 
 
 @dataclass(frozen=True)
@@ -122,6 +145,11 @@ def _runs(steps: np.ndarray, linked: np.ndarray, table: LogTable, layout: LogCol
     return [slice(int(first), int(last) + 1) for first, last in edges.reshape(-1, 2)]
 
 
+def _up_to_fresh(runs: list[slice], stale: np.ndarray) -> list[slice]:
+    """The runs without stale rows at their ends, whose readings are unknown."""
+    return [slice(run.start, int(np.flatnonzero(~stale[run])[-1]) + 1 + run.start) for run in runs]
+
+
 def _stale(observation: np.ndarray, longest: int) -> np.ndarray:
     """Rows that repeat the row before in every sensor, in stretches of at most ``longest`` rows; longer ones rest."""
     same = np.concatenate([[False], (observation[1:] == observation[:-1]).all(1), [False]])
@@ -150,10 +178,11 @@ def _column(column: Column, values: np.ndarray, run: _Run) -> np.ndarray:
 
 def _interpolated(values: np.ndarray, run: _Run, *, angle: bool) -> np.ndarray:
     fresh = ~run.stale
-    fresh[[0, -1]] = True
+    fresh[0] = True  # a run may begin with a repeated reading
     time, known = run.time[fresh], values[fresh]
-    found = np.interp(run.clock, time, np.unwrap(known) if angle else known)
-    if angle:
+    wraps = angle and np.ptp(known) <= TURN  # an angle that counts its turns does not jump
+    found = np.interp(run.clock, time, np.unwrap(known) if wraps else known)
+    if wraps:
         nearest = values[run.before]
         found -= 2.0 * np.pi * np.round((found - nearest) / (2.0 * np.pi))
     return found

@@ -28,7 +28,7 @@ class ReaderSettings:
 
     clock_tolerance: float = 0.02
     longest_regular_step: float = 2.0
-    stale_rows: int = 3
+    stale_rows: int = 10
     bound_rounding: float = 1e-6
     largest_compression: float = 1100.0
     largest_expansion: float = 200.0

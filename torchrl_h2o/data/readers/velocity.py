@@ -38,7 +38,7 @@ class VelocityEstimate:
 
 
 def estimate_velocity(
-    position: np.ndarray, runs: Sequence[slice], dt: float, *, angle: bool = False
+    position: np.ndarray, runs: Sequence[slice], dt: float, *, angle: bool = False, least_noise: float = 0.0
 ) -> VelocityEstimate:
     """Estimate the derivative of a position at each row, and the error of the estimate.
 
@@ -47,6 +47,7 @@ def estimate_velocity(
         runs: the rows of each unbroken run; windows do not reach across their ends.
         dt: time between two rows in s.
         angle: whether the positions are in rad and may jump by 2π.
+        least_noise: standard deviation that the positions' noise has at least, in their unit.
 
     Returns:
         The estimate. Rows within half a window of the ends of their run have none.
@@ -70,7 +71,7 @@ def estimate_velocity(
         raise ValueError(f"the longest run has {longest} rows, but a velocity is estimated from {_SHORTEST_RUN}")
     # windows of at most a quarter of the longest run, because half of one is lost at each end
     widths = [width for width in _HALF_WIDTHS if 8 * width <= longest] or [_HALF_WIDTHS[0]]
-    noise = _noise(parts, widths)
+    noise = max(least_noise, _noise(parts, widths))
     std, width = min((_error(parts, width, noise, dt), width) for width in widths)
     velocity = np.full(len(position), np.nan)
     kernel = _kernels(width, 3)[1] / dt

@@ -12,7 +12,7 @@ from torchrl_h2o.residuals.simulation.state_map import coordinate_names
 def needs_more_force(
     simulation: Simulation, forces: MissingForces, settings: LoopSettings = DEFAULTS
 ) -> tuple[str, ...]:
-    """Says so if effects contradict the measured forces: the motion then needs forces that no motor gave.
+    """Says so if effects contradict the measured forces: with them, far larger forces are missing than without them.
 
     A rotor that is too heavy predicts that a joint keeps its velocity, which is a good guess over some steps. But the
     accelerations in the data would then need far larger torques than those that were measured.
@@ -32,6 +32,6 @@ def needs_more_force(
     unit = "N" if units == "m/s" else "N·m"
     after, before = (quantity(float(which[dof]), unit, 2) for which in (forces.after, forces.before))
     return (
-        f"with them, the measured motion of {names.removesuffix('_velocity')} needs {after} more than was measured, "
-        f"and {before} without them",
+        f"with them, {after} is missing in the measured motion of {names.removesuffix('_velocity')}, and {before} "
+        "without them",
     )

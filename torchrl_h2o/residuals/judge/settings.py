@@ -88,6 +88,8 @@ class VerdictSettings:
     """Median error ahead up to which effects explain the motion, in errors of the guess of constant velocities."""
     more_force: float = 1.5
     """Factor by which effects may raise the force that a joint's measured motion needs beyond the simulator's."""
+    own_force: float = 1.2
+    """Factor by which effects on a joint may raise its missing force and still count as explaining the forces."""
     less_force: float = 0.5
     """Factor on the product of the missing forces below which effects explain them, whatever the motion shows."""
     auc_near_one: float = 0.95

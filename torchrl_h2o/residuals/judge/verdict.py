@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import mannwhitneyu
 
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
 from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
@@ -15,7 +15,7 @@ from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.judge.short_delays import short_delays
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
-from torchrl_h2o.residuals.measured.missing_force import missing_forces
+from torchrl_h2o.residuals.measured.missing_force import MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
@@ -207,9 +207,18 @@ def _by_motion_and_forces(
     forces = missing_forces(simulation, mended, measured, Split.REPORT, settings.inverse_dynamics)
     if forces is None:
         return (), hardly
-    if forces.fall_by(settings.verdict.less_force):
+    more = needs_more_force(simulation, forces, settings)
+    explained = forces.fall_by(settings.verdict.less_force) and not more
+    if explained and not any(_raises_its_forces(effect, mended, forces, settings.verdict) for effect in acting):
         return hardly, ()
-    return (), (*hardly, *needs_more_force(simulation, forces, settings))
+    return (), (*hardly, *more)
+
+
+def _raises_its_forces(effect: Effect, mended: Simulation, forces: MissingForces, rules: VerdictSettings) -> bool:
+    """Whether more force is missing at one of an effect's joints than without the effects."""
+    if (joints := getattr(effect, "joints", None)) is None:
+        return False
+    return bool(forces.factors[selection.joint_dofs(mended.model, joints)].max(initial=0.0) > rules.own_force)
 
 
 def _lowers_the_error(

@@ -13,9 +13,13 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
+from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+_MEDIAN_OF_NORMAL = 0.6745  # median size of a normal number, in its standard deviation
+_WITHOUT_CONTACTS = (mujoco.mjtConstraint.mjCNSTR_EQUALITY, mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,7 @@ class Motion:
         control: (W, nu), executed actions, mean over the window.
         time: (W, K), in s.
         moving: (W, nv), whether a degree of freedom moves in one direction throughout the window, and faster than a
-            share of its usual speed.
+            share of its usual speed; all windows of one that hardly ever does.
     """
 
     position: np.ndarray
@@ -48,7 +52,8 @@ def measured_motion(
 ) -> Motion | None:
     """The motion in windows that reach ``half_width`` to both sides of a row, long enough to average out noise.
 
-    Windows with unknown states, as those at the ends of a run with late sensors, are left out.
+    Windows with unknown states, as those at the ends of a run with late sensors, are left out. So are windows with
+    contacts or joints at their stops, whose forces depend on the acceleration within the physics step.
 
     Args:
         simulation: the simulator, whose effects on sensors and actions are applied.
@@ -67,18 +72,31 @@ def measured_motion(
     states, model = start_states(simulation, measured), simulation.model
     rows = starts[:, None] + np.linspace(0, 2 * half, min(2 * half + 1, settings.rows_in_window)).round().astype(int)
     rows = rows[np.isfinite(states[rows]).all((1, 2))]
+    rows = rows[_free_of_contacts(simulation, states[rows, : model.nq])]
     if len(rows) < settings.least_rows:
         return None
     actions, velocity = executed_actions(simulation, measured), states[rows, model.nq :]
     slowest = settings.resting * velocity.std((0, 1))
+    moving = (velocity > slowest).all(1) | (velocity < -slowest).all(1)
     return Motion(
         states[rows, : model.nq],
         velocity,
         (states[rows[:, -1]] - states[rows[:, 0]])[:, model.nq :] / (2.0 * half * simulation.control_step),
         actions[rows[:, :1] + np.arange(2 * half)].mean(1),
         measured.time[rows],
-        (velocity > slowest).all(1) | (velocity < -slowest).all(1),
+        moving | (moving.sum(0) < settings.least_moving),
     )
+
+
+def _free_of_contacts(simulation: Simulation, position: np.ndarray) -> np.ndarray:
+    """Mask (W) of windows in which nothing touches and no joint is at its stops, from positions (W, K, nq)."""
+    model = simulation.model
+    data, free = mujoco.MjData(model), []
+    for qpos in position.reshape(-1, model.nq):
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        free.append(bool(np.isin(data.efc_type, _WITHOUT_CONTACTS).all()))
+    return np.all(np.reshape(free, position.shape[:2]), axis=1)
 
 
 def missing_force(simulation: Simulation, motion: Motion) -> np.ndarray:
@@ -114,20 +132,30 @@ class MissingForces:
     Args:
         before: (nv), beyond those of a simulator.
         after: (nv), beyond those of the simulator with effects.
+        by_noise: (nv), what the sensors' noise alone makes missing with the effects.
     """
 
     before: np.ndarray
     after: np.ndarray
+    by_noise: np.ndarray | float = 0.0
 
     @property
     def factors(self) -> np.ndarray:
-        """(nv), by which the effects multiply what is missing; forces far below the largest one do not count."""
+        """(nv), by which the effects multiply what is missing.
+
+        Forces far below the largest one do not count, nor a rise up to twice what noise explains.
+        """
         floor = 1e-3 * max(self.before.max(), self.after.max(), 1e-12)
-        return (self.after + floor) / (self.before + floor)
+        before = np.maximum(self.before, np.minimum(2.0 * self.by_noise, self.after))
+        return (self.after + floor) / (before + floor)
 
     def rise_by(self, factor: float) -> bool:
-        """Whether the effects raise one force by more than a factor, and do not lower the others as much."""
-        return bool(self.factors.max() > factor and np.log(self.factors).sum() > 0.0)
+        """Whether the effects raise one force by more than a factor, and do not lower the others as much.
+
+        A rise by more than twice the factor counts whatever becomes of the others.
+        """
+        highest, together = self.factors.max(), np.log(self.factors).sum()
+        return bool(highest > 2.0 * factor or (highest > factor and together > 0.0))
 
     def fall_by(self, factor: float) -> bool:
         """Whether the effects multiply the product of all forces by less than a factor below one."""
@@ -142,12 +170,33 @@ def missing_forces(
     settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
 ) -> MissingForces | None:
     """The forces that a simulator lacks without and with effects; None if :func:`measured_motion` gives no motion."""
+    motion, same = (measured_motion(which, measured, split, settings) for which in (simulation, mended))
+    if motion is None or same is None:
+        return None
+    before, after = _usual_size(simulation, motion), _usual_size(mended, same)
+    return MissingForces(before, after, _by_noise(mended, measured, same, settings))
+
+
+def _usual_size(simulation: Simulation, motion: Motion) -> np.ndarray:
+    """Median sizes of the missing forces, (nv)."""
+    return np.nanmedian(np.abs(missing_force(simulation, motion)), axis=0)
+
+
+def _by_noise(
+    simulation: Simulation, measured: Measured, motion: Motion, settings: InverseDynamicsSettings
+) -> np.ndarray | float:
+    """Usual size of the force, (nv), that noise of the measured velocities makes missing."""
+    if (std := sensor_noise(simulation, measured)) is None:
+        return 0.0
+    model, observe = simulation.model, simulation.state_map.observe
+    of_velocity = np.abs(observe[:, model.nq :].T) @ std  # each velocity has one sensor
+    half = max(1, round(settings.half_width / simulation.control_step))
+    acceleration = np.sqrt(2.0) * of_velocity / (2.0 * half * simulation.control_step)
+    data, inertia = mujoco.MjData(model), np.empty((model.nv, model.nv))
     sizes = []
-    for which in (simulation, mended):
-        motion = measured_motion(which, measured, split, settings)
-        if motion is None:
-            return None
-        force = np.abs(missing_force(which, motion))
-        enough = motion.moving.sum(0) >= settings.least_moving
-        sizes.append(np.where(enough, np.nanmedian(np.where(enough, force, 0.0), axis=0), 0.0))
-    return MissingForces(*sizes)
+    for position in motion.position[:: max(1, len(motion.position) // 20), 0]:
+        data.qpos[:] = position
+        mujoco.mj_fwdPosition(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        sizes.append(np.sqrt(inertia**2 @ acceleration**2))
+    return _MEDIAN_OF_NORMAL * np.median(sizes, axis=0)

@@ -109,21 +109,28 @@ def replaced_by_forces(
         progress: bar that shows how far the search is.
 
     Returns:
-        The state with the proposed effects at the values of the regression, because noisy torques would distort a fit
-        to the motion as well. None if the effects found predict the motion of their
-        joints and do not raise the missing forces; or if the proposed ones do not lower the error of the motion, or do
-        not leave far smaller forces missing than those found.
+        The state with the proposed effects, at the values of the regression because noisy torques would distort a fit
+        to the motion as well. Effects found that no regression proposes, such as a delay, stay beside them unless far
+        less force is missing without them. None if the effects found predict the motion of their joints and do not
+        raise the missing forces; or if the proposed ones raise the error of the motion, or do not leave smaller forces
+        missing.
     """
     found = _missing_forces(state)
     if not state.entries or found is None or _stands(state, found):
         return None
-    proposed = _with_proposed(state, catalogue, rng, progress, refitted=False)
-    if proposed is None or (forces := _missing_forces(proposed)) is None:
+    others = [index for index, effect in enumerate(state.fit.effects) if not isinstance(effect, PROPOSED)]
+    proposed = [
+        _with_proposed(state, catalogue, rng, progress, kept=kept) for kept in ([others, []] if others else [[]])
+    ]
+    possible = [(one, forces) for one in proposed if one is not None and (forces := _missing_forces(one)) is not None]
+    if not possible:
         return None
-    without, with_them = (proposed.first.selection_loss(which) for which in ((), proposed.fit.effects))
-    rules = state.settings.verdict
+    rules, (best, forces) = state.settings.verdict, possible[0]
+    if MissingForces(possible[-1][1].after, forces.after).rise_by(rules.more_force):
+        best, forces = possible[-1]
+    without, with_them = (best.first.selection_loss(which) for which in ((), best.fit.effects))
     explains = forces.fall_by(rules.less_force) and with_them < without
-    return proposed if explains and MissingForces(forces.after, found.after).rise_by(rules.more_force) else None
+    return best if explains and MissingForces(forces.after, found.after).rise_by(rules.more_force) else None
 
 
 def _stands(state: SearchState, forces: MissingForces) -> bool:
@@ -149,7 +156,7 @@ def _with_proposed(
     rng: np.random.Generator,
     progress: LoopBar,
     left_out: Collection[type[Effect]] = (),
-    refitted: bool = True,
+    kept: Sequence[int] | None = None,
 ) -> SearchState | None:
     """Another search, in longer windows, with the effects that a regression of the missing forces proposes.
 
@@ -159,14 +166,20 @@ def _with_proposed(
         rng: generator for screened windows.
         progress: bar that shows how far the search is.
         left_out: kinds of effects that the other search does not try, unless they are proposed.
-        refitted: whether the effects are fitted to the motion; else they keep the values of the regression.
+        kept: indices of the effects found that stay beside the proposed ones. All keep their values then; by default
+            none stays, and the proposed ones are fitted to the motion.
 
     Returns:
         The state; None if nothing is proposed, or the model rejects it.
     """
     simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
+    before = state.fit.only(kept or ())
     found = propose_effects(
-        simulation, measured, catalogue, lambda: progress.closer(PROPOSAL / len(catalogue)), settings.inverse_dynamics
+        simulation.with_effects(*before.effects),
+        measured,
+        catalogue,
+        lambda: progress.closer(PROPOSAL / len(catalogue)),
+        settings.inverse_dynamics,
     )
     if not found.entries:
         return None
@@ -174,16 +187,17 @@ def _with_proposed(
     long_enough = [steps for steps in lengths if steps * simulation.control_step >= settings.inverse_dynamics.window]
     horizon = min(long_enough, default=lengths[-1])
     problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
-    if not is_possible(problem, found.effects):
+    if not is_possible(problem, [*before.effects, *found.effects]):
         return None
     searched = [entry for entry in catalogue if entry in found.entries or type(entry.effect) not in left_out]
     other = SearchState.begin(problem, searched, rng, settings)
     progress.closer(PROPOSAL)
-    if refitted:
+    if kept is None:
         return other.with_found(found.entries, other.refitted(found.entries, found.effects))
-    moved = tuple(tuple(widths) for widths in found.half_widths)
-    fit = Fit(found.effects, moved, other.screened_loss(found.effects), found.half_widths)
-    return other.with_found(found.entries, fit)
+    effects = (*before.effects, *found.effects)
+    moved = (*before.free, *(tuple(widths) for widths in found.half_widths))
+    fit = Fit(effects, moved, other.screened_loss(effects), (*before.half_widths, *found.half_widths))
+    return other.with_found([*(state.entries[index] for index in kept), *found.entries], fit)
 
 
 def begin_noise_free(

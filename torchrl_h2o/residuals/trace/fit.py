@@ -40,8 +40,12 @@ class Fit:
 
     def without(self, index: int) -> Fit:
         """The fit without one effect; the other values and the loss are those of the joint fit."""
+        return self.only([i for i in range(len(self.effects)) if i != index])
+
+    def only(self, indices: Sequence[int]) -> Fit:
+        """The fit with some of the effects; their values and the loss are those of the joint fit."""
         effects, free, half_widths = (
-            tuple(one for i, one in enumerate(all_of_them) if i != index)
+            tuple(all_of_them[index] for index in indices)
             for all_of_them in (self.effects, self.free, self.half_widths)
         )
         return replace(self, effects=effects, free=free, half_widths=half_widths)

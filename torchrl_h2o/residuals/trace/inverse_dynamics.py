@@ -148,7 +148,7 @@ def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: 
     except ValueError:  # a value that the model rejects
         return None
     known = change[motion.moving]
-    return change if np.isfinite(known).all() and np.abs(known).max(initial=0.0) > 0.0 else None
+    return change if np.isfinite(known).all() and np.abs(known).max() > 0.0 else None
 
 
 def _needed(
@@ -224,9 +224,7 @@ def _least_squares(y: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> tu
 
 
 def _usual(force: np.ndarray) -> np.ndarray:
-    """Usual size, (nv), of forces (W, nv); of a joint that never moves, the smallest one."""
-    never = np.isnan(force).all(0)
-    return 1.4826 * np.nanmedian(np.where(never, 0.0, np.abs(force)), axis=0) + 1e-12
+    return 1.4826 * np.nanmedian(np.abs(force), axis=0) + 1e-12
 
 
 def _scaled(entry: CatalogueEntry) -> tuple[str, ...]:

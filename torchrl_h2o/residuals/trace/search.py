@@ -84,7 +84,11 @@ def trace_effects(
     except OutOfTimeError as end:
         ended_in = str(end)
     best = _fitted_to_all(_divided_in_longer_windows(best, catalogue, rng))
-    if ended_in is None and (other := replaced_by_forces(best, catalogue, rng, progress)) is not None:
+    try:
+        other = None if ended_in else replaced_by_forces(best, catalogue, rng, progress)
+    except OutOfTimeError as end:
+        other, ended_in = None, str(end)
+    if other is not None:
         return replace(_outcome(other), by_forces=True)
     return replace(_outcome(best), others=others, ended_in=ended_in)
 

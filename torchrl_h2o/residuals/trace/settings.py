@@ -159,10 +159,10 @@ class LongerWindowsSettings:
 
 @dataclass(frozen=True)
 class InverseDynamicsSettings:
-    """The regression of missing forces, for a search whose effects predict no better than constant velocities do."""
+    """The forces that a simulator lacks along the measured motion, and a regression of them."""
 
     half_width: float = 0.025
-    """Time before and after a row, in s, over which its velocity and acceleration are averaged."""
+    """Half the length, in s, of the windows over which accelerations and forces are averaged."""
     rows: int = 1500
     """Largest number of rows in the regression."""
     rows_in_window: int = 7
@@ -170,7 +170,7 @@ class InverseDynamicsSettings:
     resting: float = 0.1
     """Share of a joint's usual speed below which it counts as resting."""
     least_moving: int = 50
-    """Smallest number of windows in which a joint must move for its missing force to count."""
+    """Smallest number of windows in which a joint moves in one direction for the others to be left out."""
     blocks: int = 20
     """Blocks of neighbouring windows by which intervals are computed."""
     least_rows: int = 200
