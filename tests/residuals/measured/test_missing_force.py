@@ -45,7 +45,20 @@ def test_the_missing_force_has_the_size_of_the_friction():
 def test_a_rise_that_others_make_up_for_does_not_count():
     assert MissingForces(np.array([1.0, 1.0]), np.array([2.0, 0.9])).rise_by(1.5)
     assert not MissingForces(np.array([1.0, 1.0]), np.array([2.0, 0.4])).rise_by(1.5)
-    assert not MissingForces(np.array([1.0, 1.0]), np.array([1.4, 1.4])).rise_by(1.5)
+    assert not MissingForces(np.array([1.0, 1.0]), np.array([1.4, 0.9])).rise_by(1.5)
+    assert MissingForces(np.array([1.0, 1.0]), np.array([3.1, 0.1])).rise_by(1.5)
+
+
+def test_a_small_rise_counts_if_no_force_falls():
+    """A right effect lowers one. A force that makes up for noisy torques lowers none."""
+    assert MissingForces(np.array([1.0, 1.0]), np.array([1.3, 1.0])).rise_by(1.5)
+    assert not MissingForces(np.array([1.0, 1.0]), np.array([1.1, 1.0])).rise_by(1.5)
+
+
+def test_a_rise_by_the_noise_of_the_sensors_does_not_count():
+    heavy = np.array([1.0]), np.array([1.9])
+    assert MissingForces(*heavy).rise_by(1.5)
+    assert not MissingForces(*heavy, by_noise=np.array([0.9])).rise_by(1.5)
 
 
 def test_forces_far_below_the_largest_one_do_not_count():

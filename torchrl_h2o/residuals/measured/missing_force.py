@@ -18,6 +18,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+LOWER = 0.95  # factor on a missing force below which it falls; chance alone changes it less
 _MEDIAN_OF_NORMAL = 0.6745  # median size of a normal number, in its standard deviation
 _WITHOUT_CONTACTS = (mujoco.mjtConstraint.mjCNSTR_EQUALITY, mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
 
@@ -152,10 +153,15 @@ class MissingForces:
     def rise_by(self, factor: float) -> bool:
         """Whether the effects raise one force by more than a factor, and do not lower the others as much.
 
-        A rise by more than twice the factor counts whatever becomes of the others.
+        A rise by more than twice the factor counts whatever becomes of the others; one by more than its root counts if
+        no other force falls, because a right effect lowers one.
         """
-        highest, together = self.factors.max(), np.log(self.factors).sum()
-        return bool(highest > 2.0 * factor or (highest > factor and together > 0.0))
+        factors = self.factors
+        highest, falls = factors.max(), factors.min() < LOWER
+        together = float(np.log(factors).sum())
+        return bool(
+            highest > 2.0 * factor or (highest > factor and together > 0.0) or (highest > factor**0.5 and not falls)
+        )
 
     def fall_by(self, factor: float) -> bool:
         """Whether the effects multiply the product of all forces by less than a factor below one."""
