@@ -342,5 +342,5 @@ DECOY = Family(decoy, 4, 4, "reported as a group", stream=0)
 SLOW = Family(slow, 10, 8, "viscous friction or a torque that depends on time", stream=6)
 JOINT_BY_JOINT = Family(joints, 6, 5, "friction and rotor inertia of each joint within 15 %", stream=7)
 NOISY_TORQUES = Family(
-    torques, 8, 8, "friction of each joint within 40 % and nothing else, or not recommended", stream=10
+    torques, 8, 8, "friction of each joint within 40 % and nothing else, or refused (counted apart)", stream=10
 )

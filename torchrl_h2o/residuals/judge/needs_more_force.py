@@ -32,6 +32,6 @@ def needs_more_force(
     unit = "N" if units == "m/s" else "N·m"
     after, before = (quantity(float(which[dof]), unit, 2) for which in (forces.after, forces.before))
     return (
-        f"with them, {after} is missing in the measured motion of {names.removesuffix('_velocity')}, and {before} "
+        f"with the effects found, {after} is missing in the measured motion of {names.removesuffix('_velocity')}, and {before} "
         "without them",
     )
