@@ -13,7 +13,9 @@ from torchrl_h2o.residuals.measured.missing_force import MissingForces
 def test_the_joint_with_the_largest_rise_is_named_with_its_torques():
     forces = MissingForces(np.array([0.2, 0.1]), np.array([0.3, 1.25]))
     (clause,) = needs_more_force(double_pendulum(), forces)
-    assert clause == ("with the effects found, 1.2 N·m is missing in the measured motion of elbow, and 0.1 N·m without them")
+    assert clause == (
+        "with the effects found, 1.2 N·m is missing in the measured motion of elbow, and 0.1 N·m without them"
+    )
 
 
 def test_a_sliding_joint_has_forces():

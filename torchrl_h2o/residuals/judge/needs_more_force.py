@@ -31,7 +31,5 @@ def needs_more_force(
     names, units = (each[model.nq + dof] for each in coordinate_names(model))
     unit = "N" if units == "m/s" else "N·m"
     after, before = (quantity(float(which[dof]), unit, 2) for which in (forces.after, forces.before))
-    return (
-        f"with the effects found, {after} is missing in the measured motion of {names.removesuffix('_velocity')}, and {before} "
-        "without them",
-    )
+    joint = names.removesuffix("_velocity")
+    return (f"with the effects found, {after} is missing in the measured motion of {joint}, and {before} without them",)
