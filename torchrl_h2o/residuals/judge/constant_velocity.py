@@ -44,7 +44,7 @@ def no_better_than_constant_velocity(
     errors, most = errors_ahead(mended, measured, Split.REPORT, settings), settings.verdict.better_than_guess
     if not explains_motion(errors, most):
         everything = range(len(mended.state_map.names))
-        return (f"they predict the motion {_hardly_better(mended, errors[0], everything)}",)
+        return (f"the effects found predict the motion {_hardly_better(mended, errors[0], everything)}",)
     unpredicted = effects_on_unpredicted_joints(mended, errors, effects, most)
     if not unpredicted:
         return ()
