@@ -23,16 +23,16 @@ _ROUNDING = 1e-6  # share of a step by which the last row may be too early for i
 def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = READER_SETTINGS) -> LogTable:
     """Resample the rows of a log to the clock of ``layout.resample``.
 
-    Observations are interpolated linearly between rows, angles that stay within one turn across their jumps by 2π. An
-    action is the mean, over its step, of the actions of the file, each of which holds until the next row. Readings that
-    repeat those of the row before in every sensor, as after a lost packet, are not used, unless so many rows are alike
-    that the robot rests. A run ends with the last step before its ``done`` is 1, or at a gap that is longer than
-    ``time_tolerance`` allows.
+    Observations are interpolated linearly between two rows. An angle that stays within one turn may jump by 2π between
+    them. Each action of the file holds until the next row; a resampled action is the mean of what was held during its
+    step. After a lost packet, all sensors show the readings of the row before; such rows are not used for observations.
+    If more than ``settings.stale_rows`` successive rows are equal, the robot rests, and they are used. A run ends with
+    the last step before its ``done`` is 1, or at a gap that is longer than ``time_tolerance`` allows.
 
     Args:
         table: the numbers of the log.
         layout: its columns, with ``resample``.
-        settings: how many repeated rows count as lost packets.
+        settings: the largest number of successive equal rows that counts as lost packets.
 
     Returns:
         The table with the new clock as its time; ``rows`` are those at or before each step.

@@ -247,9 +247,9 @@ def _clock(time: np.ndarray | None) -> list[str]:
         return []
     steps = np.diff(time)
     usual = float(np.median(steps))
-    mean = float(np.mean(steps[steps <= 2.0 * usual]))  # a clock of 300 Hz with stamps in ms has steps of 3 and 4 ms
     uneven = float((np.abs(steps - usual) > UNEVEN * usual).mean())
     if uneven > MANY and usual > 0.0:
+        mean = float(np.mean(steps[steps <= 2.0 * usual]))  # 300 Hz with stamps in ms: steps of 3 and 4 ms
         why = f"{uneven:.0%} of the time steps differ by more than {UNEVEN:.0%}, and the simulator takes equal ones"
         split = "on_time_jump: split  # runs end at gaps longer than 1.5 steps; time_tolerance: 3 allows 4 steps"
         return [f"resample: {mean:.3g}  # s; {why}", split]
