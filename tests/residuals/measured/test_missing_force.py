@@ -9,7 +9,7 @@ import pytest
 from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import ActionDelay, Armature, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import Simulation, Split, StateMap
-from torchrl_h2o.residuals.measured.missing_force import MissingForces, measured_motion, missing_forces
+from torchrl_h2o.residuals.measured.missing_force import MissingForces, measured_motion, missing_force, missing_forces
 
 SIMULATION = double_pendulum()
 FRICTION = (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"))
@@ -84,3 +84,12 @@ def test_windows_with_contacts_are_left_out():
     state_map = StateMap.of_coordinates(names, units, (0, 1, 2, 3), num_states=4)
     rolling = Simulation(lambda: mujoco.MjSpec.from_string(ball), 1, state_map)
     assert measured_motion(rolling, recorded(rolling, 3000), Split.FIT) is None
+
+
+def test_the_force_is_unknown_where_a_joint_rests_or_turns_around():
+    motion = measured_motion(SIMULATION, MEASURED, Split.FIT)
+    assert motion is not None
+    one_way = np.abs(np.sign(motion.velocity).sum(1)) == motion.velocity.shape[1]
+    known = np.isfinite(missing_force(SIMULATION, motion))
+    assert (known <= one_way).all()
+    assert 0.3 < known.mean() < one_way.mean() < 1.0

@@ -41,12 +41,13 @@ CATALOGUE = tuple(entry for entry in SIMULATION.catalogue() if isinstance(entry.
 
 
 def test_friction_of_each_joint_is_proposed():
+    """With windows in which joints rest or turn around, friction would come out 4 % too low."""
     found = propose_effects(SIMULATION, MEASURED, CATALOGUE)
     proposed = {(type(effect), effect.joints): effect for effect in found.effects}
     assert proposed.keys() == {(type(effect), effect.joints) for effect in FRICTION}
     for true in FRICTION:
         (name,) = true.parameters
-        assert getattr(proposed[type(true), true.joints], name) == pytest.approx(getattr(true, name), rel=0.25)
+        assert getattr(proposed[type(true), true.joints], name) == pytest.approx(getattr(true, name), rel=0.02)
 
 
 def test_a_payload_is_proposed_with_its_mass():
