@@ -19,13 +19,18 @@ FRICTION = CatalogueEntry(JointFrictionLoss(joints="elbow"), ({"torque": 0.01}, 
 RIPPLE = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
 
 
-@pytest.mark.parametrize(("gravity", "looked_for"), [(0.501, False), (0.7, True)])
-def test_a_force_is_not_looked_for_where_the_effects_leave_less_than_it_must_explain(monkeypatch, gravity, looked_for):
+@pytest.mark.parametrize(
+    ("gravity", "by_forces", "looked_for"), [(0.501, False, False), (0.7, False, True), (0.7, True, False)]
+)
+def test_a_force_is_looked_for_where_effects_leave_enough_and_the_motion_shows_it(
+    monkeypatch, gravity, by_forces, looked_for
+):
+    """Effects that come from the missing forces mean that noisy torques hide the motion, which a force would fit."""
     simulation, asked = pendulum(), []
     measured = recorded(simulation.with_effects(Gravity(0.5)), 400)
     state = SearchState.begin(Problem.pose(simulation, measured), [GRAVITY], np.random.default_rng(0))
     fitted = replace(state.refitted([GRAVITY], [Gravity(0.5)]), effects=(Gravity(gravity),))
-    explanation = Explanation.of(Trace((GRAVITY,), fitted, (), ((),), exact=False))
+    explanation = Explanation.of(Trace((GRAVITY,), fitted, (), ((),), exact=False, by_forces=by_forces))
     monkeypatch.setattr(beside_or_instead, "find_undeclared", lambda *args, **kwargs: asked.append(1))
     found = add_undeclared_force(simulation, measured, explanation, rng=np.random.default_rng(0))
     assert bool(asked) is looked_for
