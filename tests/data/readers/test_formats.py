@@ -334,8 +334,13 @@ def test_contradicting_columns_are_refused(columns, message):
         ({"index": -1}, "index -1 must be"),
         ({"index": True}, "index True must be"),
         ({"index": "1"}, "index '1' must be"),
-        ({"derivative_of": "q", "unit": "rad/s"}, "is not in the file: omit index, unit and scale"),
+        ({"derivative_of": "q", "unit": "rad/s"}, "is not in the file: omit index, unit, scale, offset, unwrap"),
         ({"derivative_of": "q", "role": "action"}, "derivative_of is for observations only"),
+        ({"derivative_of": "q", "offset": 1.0}, "is not in the file"),
+        ({"offset": float("nan")}, "offset nan must be finite"),
+        ({"unwrap": True, "unit": "m"}, "unwrap is for observed or commanded angles"),
+        ({"unwrap": True, "unit": "rad", "role": "ignore"}, "unwrap is for observed or commanded angles"),
+        ({"unwrap": 1, "unit": "rad"}, "unwrap 1 must be true or false"),
     ],
 )
 def test_invalid_columns_are_refused(entries, message):
@@ -350,3 +355,16 @@ def test_free_motion_has_no_actions(tmp_path):
     assert td["action"].shape == (ROWS - 1, 0)
     with pytest.raises(ValueError, match="free_motion: true, but u has the role action"):
         LogColumns((*columns, Column("u", "action")), free_motion=True)
+
+
+def test_an_angle_is_unwrapped_behind_its_gear_and_shifted_in_si(tmp_path):
+    (tmp_path / "log.yaml").write_text(
+        "dt: 0.01\ncolumns:\n"
+        "  - {name: q, role: observation, unit: deg, scale: 0.5, offset: 1.0, unwrap: true}\n"
+        "  - {name: u, role: action, unit: deg, unwrap: true}\n"
+    )
+    (tmp_path / "log.txt").write_text("350 170\n10 -170\n30 -150\n")
+    td = load(tmp_path / "log.txt", columns=tmp_path / "log.yaml")
+    angle = torch.cat([td["observation"], td["next", "observation"][-1:]])
+    assert angle.flatten().tolist() == pytest.approx([1.0 + np.radians(a) for a in (175.0, 185.0, 195.0)])
+    assert td["action"].flatten().tolist() == pytest.approx([np.radians(a) for a in (170.0, 190.0)])

@@ -26,6 +26,9 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
         ("theta", "position", "rad"),
         ("theta_dot", "velocity", "rad/s"),
         ("hipVel", "velocity", "rad/s"),
+        ("alphadot", "velocity", "rad/s"),
+        ("dtheta", "velocity", "rad/s"),
+        ("Vin", "action", "V"),
         ("x", "position", "m"),
         ("dq1", "velocity", "rad/s"),
         ("motor1_vel_rpm", "velocity", "rpm"),
@@ -110,3 +113,48 @@ def test_irregular_stamps_are_resampled(tmp_path):
     td = read_robot_log(path, tmp_path / "log.yaml")
     assert td["observation"].shape[1] == 2
     assert np.diff(td["time"].flatten().numpy()) == pytest.approx(0.01, rel=0.05)
+
+
+TIME = 0.01 * np.arange(400)
+ANGLE = 4.0 * np.sin(TIME)
+
+
+def guessed(tmp_path, names: str, columns, model=None) -> str:
+    np.savetxt(tmp_path / "log.csv", np.stack(columns, 1), delimiter=",", header=names, comments="")
+    return guess_layout(tmp_path / "log.csv", model).text
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("rad", 1.0), ("deg", 180.0 / np.pi)])
+def test_an_angle_that_jumps_by_a_turn_is_unwrapped(tmp_path, unit, factor):
+    wrapped = np.angle(np.exp(1j * ANGLE)) * factor
+    text = guessed(tmp_path, f"time,q_{unit},tau", [TIME, wrapped, TIME])
+    assert "unwrap: true" in text
+    (tmp_path / "log.yaml").write_text(text)
+    read = read_robot_log(tmp_path / "log.csv", tmp_path / "log.yaml")["observation"][:, 0].numpy()
+    assert read == pytest.approx(4.0 * np.sin(TIME[3 : 3 + len(read)]), abs=1e-3)
+
+
+def test_an_angle_that_is_read_wrongly_now_and_then_is_not_unwrapped(tmp_path):
+    broken = ANGLE + 3.0 * (np.arange(400) % 50 == 0)
+    assert "unwrap" not in guessed(tmp_path, "time,q,tau", [TIME, broken, TIME])
+
+
+def test_a_velocity_that_does_not_follow_its_position_is_estimated_instead(tmp_path):
+    wrong = guessed(tmp_path, "time,q,qdot,tau", [TIME, ANGLE, ANGLE, TIME])
+    assert '"qdot", role: ignore}  # not the slope of q (correlation' in wrong
+    assert 'derivative_of: "q"' in wrong
+    right = guessed(tmp_path, "time,q,qdot,tau", [TIME, ANGLE, 4.0 * np.cos(TIME), TIME])
+    assert '"qdot", role: observation' in right
+    assert "derivative_of" not in right
+
+
+@pytest.mark.parametrize(("names", "role"), [("time,q,drive", "action"), ("time,q,tau", "action")])
+def test_the_only_column_left_is_the_action_of_the_only_actuator(tmp_path, names, role):
+    model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
+    assert f"role: {role}" in guessed(tmp_path, names, [TIME, ANGLE, TIME], model)
+
+
+def test_of_several_columns_left_none_is_taken_for_the_action(tmp_path):
+    model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
+    text = guessed(tmp_path, "time,q,drive,mode", [TIME, ANGLE, TIME, TIME], model)
+    assert "role: action" not in text

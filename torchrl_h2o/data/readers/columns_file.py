@@ -136,6 +136,7 @@ def _build(kind: type, entries: dict[str, Any], source: str | Path, column: str 
         "dt": lambda name, value: None if value is None else _number(name, value),
         "resample": lambda name, value: None if value is None else _number(name, value),
         "scale": _number,
+        "offset": _number,
         "time_tolerance": _number,
         "bounds": _pair,
         "observation": _names,

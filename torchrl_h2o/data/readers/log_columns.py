@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from torchrl_h2o.data.readers.units import to_si
 
 ROLES = ("observation", "action", "reward", "done", "time", "ignore")
@@ -23,6 +25,9 @@ class Column:
             ended. The ``reward`` of a row is the reward of that row's action.
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
         scale: a factor in addition to the unit's, such as a gear ratio or a sign.
+        offset: a constant in SI that is added after unit and scale, such as the zero of an angle.
+        unwrap: whether the column is an angle that jumps by a turn at the end of its range; its turns are then counted
+            from the first row on.
         bounds: lowest and highest value in SI, for actions only.
         index: position in the file, counted from 0, for files without names; all columns have it, or none.
         derivative_of: the observed position whose velocity this column is, for a velocity that is not in the file. It
@@ -32,12 +37,17 @@ class Column:
         >>> from torchrl_h2o.data import Column
         >>> Column("pitch", "observation", unit="deg").factor
         0.017453292519943295
+        >>> pole = Column("pole", "observation", unit="deg", offset=3.1416, unwrap=True)  # hangs at 0 in the model
+        >>> pole.in_si(np.array([170.0, -170.0])).round(2).tolist()
+        [6.11, 6.46]
     """
 
     name: str
     role: Literal["observation", "action", "reward", "done", "time", "ignore"]
     unit: str = "1"
     scale: float = 1.0
+    offset: float = 0.0
+    unwrap: bool = False
     bounds: tuple[float, float] | None = None
     index: int | None = None
     derivative_of: str | None = None
@@ -55,6 +65,12 @@ class Column:
             raise ValueError(f"the unit {self.unit!r} is not a unit of time; use s, ms or us")
         if not math.isfinite(self.scale) or self.scale == 0:
             raise ValueError(f"scale {self.scale} must be finite and not zero")
+        if not math.isfinite(self.offset):
+            raise ValueError(f"offset {self.offset} must be finite")
+        if not isinstance(self.unwrap, bool):
+            raise ValueError(f"unwrap {self.unwrap!r} must be true or false")
+        if self.unwrap and (si_unit != "rad" or self.role not in ("observation", "action")):
+            raise ValueError("unwrap is for observed or commanded angles: give the unit, rad or deg")
         if self.bounds is not None:
             if self.role != "action":
                 raise ValueError("bounds are for actions only")
@@ -67,13 +83,22 @@ class Column:
         if self.derivative_of is not None:
             if self.role != "observation":
                 raise ValueError("derivative_of is for observations only")
-            if self.index is not None or self.unit != "1" or self.scale != 1.0:
-                raise ValueError("a column with derivative_of is not in the file: omit index, unit and scale")
+            if self.index is not None or self.unwrap or (self.unit, self.scale, self.offset) != ("1", 1.0, 0.0):
+                raise ValueError(
+                    "a column with derivative_of is not in the file: omit index, unit, scale, offset, unwrap"
+                )
 
     @property
     def factor(self) -> float:
         """The factor from the file's value to SI."""
         return to_si(self.unit)[1] * self.scale
+
+    def in_si(self, values: np.ndarray) -> np.ndarray:
+        """Values of the file (rows,) in SI, with ``offset``; for ``unwrap``, without jumps by a turn."""
+        values = values * self.factor
+        if self.unwrap:
+            values = np.unwrap(values, period=2.0 * math.pi * abs(self.scale))
+        return values + self.offset
 
 
 @dataclass(frozen=True)

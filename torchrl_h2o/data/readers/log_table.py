@@ -79,7 +79,7 @@ def read_table(path: str | Path, layout: LogColumns) -> LogTable:
         values, numbers = values[: len(values) - zero_rows], numbers[: len(values) - zero_rows]
     if len(values) < 2:
         raise DataError("only rows of zeros remain", "record the log again", source=raw.source)
-    values = values * np.array([column.factor for _, column in chosen])
+    values = np.stack([column.in_si(values[:, index]) for index, (_, column) in enumerate(chosen)], axis=1)
     require_finite(values, names, source=raw.source, row_of=lambda index: int(numbers[index]))
     return LogTable(str(raw.source), tuple(names), values, numbers, int(zero_rows))
 

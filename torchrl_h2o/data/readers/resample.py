@@ -173,7 +173,7 @@ def _column(column: Column, values: np.ndarray, run: _Run) -> np.ndarray:
         return _mean_action(values, run)
     if column.role == "done":
         return np.append(np.zeros(len(run.clock) - 1), float(run.ends))
-    return _interpolated(values, run, angle=to_si(column.unit)[0] == "rad")
+    return _interpolated(values, run, angle=to_si(column.unit)[0] == "rad" and not column.unwrap)
 
 
 def _interpolated(values: np.ndarray, run: _Run, *, angle: bool) -> np.ndarray:

@@ -15,6 +15,9 @@ from torchrl_h2o.data.readers.units import to_si
 JUMP = 0.5  # share of the median step by which a step must differ for the run to end there
 UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the steps differ from the median by this share
 
+_SPAN = 25  # rows over which displacements are compared with a velocity; single steps are often smaller than a sensor's
+_RELATED = 0.5  # correlation of both below which the column is not that velocity
+
 
 @dataclass(frozen=True)
 class Coordinates:
@@ -80,7 +83,9 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     columns = _one_set(_servo_commands(columns) if model is not None and model.servos else columns)
     if model is not None and not contents.named:
         columns = _by_order(columns, model)
-    pairs = _pairs(columns)
+    elif model is not None:
+        columns = _actions_left(columns, len(model.actuators))
+    columns, pairs = _without_strangers(columns, contents, _pairs(columns))
     found = {} if model is None else _coordinates(columns, pairs, model)
     units = {column.name: column.unit for column in columns}
     columns = [_checked(column, contents, pairs, found, model, units) for column in columns]
@@ -139,6 +144,15 @@ def _by_order(columns: Sequence[Guess], model: Coordinates) -> list[Guess]:
     return [Guess(*parts, note=note) for parts in zip(names, kinds, units, names, strict=True)]
 
 
+def _actions_left(columns: Sequence[Guess], number: int) -> list[Guess]:
+    """The columns that nothing recognised as actions, if there are as many as actuators and no other actions."""
+    left = [column for column in columns if column.kind == "unknown" and not column.note]
+    if len(left) != number or any(column.kind == "action" for column in columns):
+        return list(columns)
+    note = "not recognised, but as many columns as the model has actuators are left: check role and unit"
+    return [replace(column, kind="action", note=note) if column in left else column for column in columns]
+
+
 def _pairs(columns: Sequence[Guess]) -> dict[str, str]:
     """Return the position of each velocity: by the rest of their names, or by order if as many are left."""
     positions = [column for column in columns if column.kind == "position"]
@@ -188,14 +202,43 @@ def _checked(
         if to_si(unit)[0] != to_si(model.units[coordinate])[0]:
             unit = model.units[coordinate]
         note = f"{coordinate} of the model; {note}".rstrip("; ")
-    position, time = contents.values.get(pairs.get(column.name, "")), _time(contents)
-    values = contents.values.get(column.name)
-    if position is not None and values is not None and time is not None and values.any():
-        slope = np.gradient(position) / np.where(np.gradient(time) == 0, np.nan, np.gradient(time))
-        good = np.isfinite(slope)
-        factor = float(slope[good] @ values[good] / (values[good] @ values[good]))
-        note = f"slope of {pairs[column.name]}: {factor:.3g} times this; {note}"
+    relation = _relation(column, contents, pairs, units)
+    if relation is not None:
+        note = f"slope of {pairs[column.name]}: {relation[1]:.3g} times this; {note}"
     return replace(column, unit=unit, note=note)
+
+
+def _without_strangers(
+    columns: Sequence[Guess], contents: Contents, pairs: Mapping[str, str]
+) -> tuple[list[Guess], dict[str, str]]:
+    """Velocities that do not follow their positions as columns to ignore, and the pairs without them."""
+    units = {column.name: column.unit for column in columns}
+    found, kept = [], dict(pairs)
+    for column in columns:
+        relation = _relation(column, contents, pairs, units)
+        if relation is not None and abs(relation[0]) < _RELATED:
+            del kept[column.name]
+            note = f"not the slope of {pairs[column.name]} (correlation {relation[0]:.2f}), which is estimated instead"
+            column = replace(column, kind="unknown", note=note)
+        found.append(column)
+    return found, kept
+
+
+def _relation(
+    velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
+) -> tuple[float, float] | None:
+    """Correlation of displacements over some rows with the integral of a velocity, and their ratio; None if at rest."""
+    name = pairs.get(velocity.name, "")
+    position, values, time = contents.values.get(name), contents.values.get(velocity.name), _time(contents)
+    if position is None or values is None or time is None:
+        return None
+    if _is_wrapped(position, units[name]):
+        position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
+    rows = min(_SPAN, len(time) - 1)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
+    moved, expected = position[rows:] - position[:-rows], integral[rows:] - integral[:-rows]
+    size = np.sqrt((moved @ moved) * (expected @ expected))
+    return (float(moved @ expected / size), float(moved @ expected / (expected @ expected))) if size > 0.0 else None
 
 
 def _time(contents: Contents) -> np.ndarray | None:
@@ -232,6 +275,9 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
         elif role == "unknown":
             role, note = "ignore", note or "not recognised: observation, action or ignore?"
         unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""
+        if column.kind == "position" and _is_wrapped(contents.values.get(column.name), column.unit):
+            unit += ", unwrap: true"
+            note = f"jumps by a turn; {note}"
         comment = f"  # {note}" if note else ""
         lines.append(f'  - {{name: "{column.name}", role: {role}{unit}}}{comment}')
     for column in columns:
@@ -239,6 +285,16 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
             entry = f'name: "{_estimated(column.name)}", role: observation, derivative_of: "{column.name}"'
             lines.append(f"  - {{{entry}}}  # no such column was found: it is estimated")
     return "\n".join(lines) + "\n"
+
+
+def _is_wrapped(values: np.ndarray | None, unit: str) -> bool:
+    """Whether an angle jumps at the end of its range: its large steps all are turns."""
+    si, factor = to_si(unit)
+    if values is None or si != "rad":
+        return False
+    steps = np.abs(np.diff(values)) * factor
+    large = steps[steps > 0.5 * np.pi]
+    return bool(len(large) and (np.abs(large - 2.0 * np.pi) < 0.2 * np.pi).all())
 
 
 def _clock(time: np.ndarray | None) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from torchrl_h2o.data.readers.units import UNITS, to_si
 
 _FORCES = ("tau", "torque", "torques", "effort", "force", "current", "moment")  # a commanded one is no desired position
-_VOLTS = ("volt", "volts", "voltage")
+_VOLTS = ("volt", "volts", "voltage", "vin", "vm")
 _DUTY = ("pwm", "duty")
 _WORDS = {
     "time": ("t", "time", "timestamp", "stamp", "secs", "seconds", "millis", "clock"),
@@ -139,7 +139,17 @@ def _is_supply(guess: Guess, values: Mapping[str, np.ndarray | None]) -> bool:
 
 def _words(name: str) -> list[str]:
     """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2."""
-    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+    words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+    return [part for word in words for part in _derivative(word)]
+
+
+def _derivative(word: str) -> list[str]:
+    """Split a time derivative that is written as one word, ``thetadot`` or ``dtheta``, into theta, dot."""
+    known = any(word in words for words in _WORDS.values())
+    for position in () if known else (word.removesuffix("dot"), word.removeprefix("d")):
+        if position != word and position in _WORDS["position"]:
+            return [position, "dot"]
+    return [word]
 
 
 def _letters(name: str) -> str:
