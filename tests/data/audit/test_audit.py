@@ -62,6 +62,7 @@ def test_good_log_has_neither_severe_findings_nor_warnings(good, simulation):
         JointFrictionLoss(0.15),
         ActionGain(0.7),
         Armature(0.02),
+        Armature(0.05),
         BodyMass(1.5),
         Gravity(2.0),
         ActionDelay(0.015),
@@ -128,6 +129,22 @@ def test_exchanged_columns(good, simulation):
 def test_zero_of_an_angle(good, simulation):
     words = warned(changed(good, lambda rows: rows + np.array([0.4, 0, 0, 0])), simulation, "model")
     assert "the zero of shoulder is shifted by 0.4" in words
+
+
+def test_zero_on_the_other_side_of_the_turn(good, simulation):
+    words = severe(changed(good, lambda rows: rows - np.array([np.pi, 0, 0, 0])), simulation, "model")
+    assert "if the zero of shoulder is shifted by -3.1" in words
+    assert "half a turn" in words
+
+
+@pytest.mark.parametrize(("from_row", "size"), [(800, 1.2), (1500, -0.9)])
+def test_an_encoder_that_slips_is_found_with_its_rows(good, simulation, from_row, size):
+    slipped = changed(good, lambda rows: rows + size * np.outer(np.arange(len(rows)) >= from_row, [1, 0, 0, 0]))
+    (found,) = audit(slipped, simulation).severe
+    if found.check == "rows":  # the slip itself is one wrong reading
+        pytest.skip(found.words)
+    assert f"the zero of shoulder changes (shifted by {size:.1f}"[:-1] in found.words
+    assert found.rows.ranges[0][0] == pytest.approx(from_row, abs=60)
 
 
 def test_wrapped_angle(good, simulation):

@@ -17,6 +17,7 @@ from torchrl_h2o.data.audit.kinematics import check_kinematics
 from torchrl_h2o.data.audit.log import AuditedSimulation, AuditedTransitions, Log
 from torchrl_h2o.data.audit.model import check_belonging, check_model
 from torchrl_h2o.data.audit.response import Response
+from torchrl_h2o.data.audit.rotors import with_rotors
 from torchrl_h2o.data.audit.rows import check_rows
 from torchrl_h2o.data.audit.settings import AUDIT_SETTINGS, AuditSettings
 from torchrl_h2o.data.audit.time import check_step, check_time
@@ -106,10 +107,13 @@ def audit(
         found += (check_step(step, settings) if severe else []) or kinematics
     if any(finding.severity == "severe" for finding in found):
         return ordered(found)
+    if log.estimated_std is not None:  # the errors of estimated velocities are smooth, so rows do not show them
+        noise = np.maximum(noise, log.estimated_std)
     response = Response.of(log, simulation, noise, settings)
     if response is None:
         words = "the data hold too few unbroken rows of positions and velocities to compare them with the simulator"
         return ordered([*found, Finding("model", "note", words), *check_actions(log, None, settings)])
+    response = with_rotors(response, settings)
     found += check_model(response, settings)
     if not any(finding.severity == "severe" for finding in found):
         found += check_actions(log, response, settings, lateness=lateness(derivatives))

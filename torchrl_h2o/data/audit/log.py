@@ -58,6 +58,8 @@ class AuditedTransitions(Protocol):
     def run(self) -> np.ndarray: ...
     @property
     def time(self) -> np.ndarray: ...
+    @property
+    def estimated_std(self) -> np.ndarray | None: ...
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class Log:
         actuators: names of the actions, (nu,).
         pairs: positions with an observed velocity.
         clipped: (T,), transitions with a value at the end of the range that the simulator's own sensors have.
+        estimated_std: (n,), errors of columns that were estimated from others, 0 for measured ones; None if none was.
     """
 
     observation: np.ndarray
@@ -118,6 +121,7 @@ class Log:
     actuators: tuple[str, ...]
     pairs: tuple[Pair, ...]
     clipped: np.ndarray
+    estimated_std: np.ndarray | None = None
 
     @classmethod
     def of(cls, measured: TensorDictBase | AuditedTransitions, simulation: AuditedSimulation) -> Log:
@@ -126,7 +130,7 @@ class Log:
         Raises:
             DataError: if they are no valid TED, or observations or actions do not have the simulator's width.
         """
-        state_map, ended, time = simulation.state_map, None, None
+        state_map, ended, time, estimated_std = simulation.state_map, None, None, None
         if isinstance(measured, TensorDictBase):
             require_ted(measured)
             observation, action = _float64(measured["observation"]), _float64(measured["action"])
@@ -136,9 +140,11 @@ class Log:
             run = np.concatenate([[0], np.cumsum(breaks)])
             if "time" in measured.keys():
                 time = _float64(measured["time"]).flatten()
+            if "observation_std" in measured.keys():
+                estimated_std = np.sqrt((_float64(measured["observation_std"]) ** 2).mean(0))
         else:
             observation, action, following = measured.observation, measured.action, measured.following
-            run, time = measured.run, measured.time
+            run, time, estimated_std = measured.run, measured.time, measured.estimated_std
         _require_width(observation, state_map.names, "observation")
         _require_width(action, simulation.actuators, "action")
         clipped = state_map.clipped(observation) | state_map.clipped(following)
@@ -155,6 +161,7 @@ class Log:
             simulation.actuators,
             find_pairs(state_map, simulation.model),
             clipped,
+            estimated_std,
         )
 
     def __len__(self) -> int:

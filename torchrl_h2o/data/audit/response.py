@@ -160,7 +160,11 @@ class Response:
     @cached_property
     def simulated(self) -> np.ndarray:
         """Simulated change of the velocities under the actions of :attr:`anchor`, (W, m)."""
-        return self._velocities(self.anchor) - self.before
+        return self.simulated_with(self.anchor)
+
+    def simulated_with(self, actions: np.ndarray) -> np.ndarray:
+        """Simulated change of the velocities under actions (W, H, nu), (W, m)."""
+        return self._velocities(actions) - self.before
 
     @cached_property
     def target(self) -> np.ndarray:

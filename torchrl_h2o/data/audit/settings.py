@@ -127,6 +127,11 @@ class AuditSettings:
     """Step of derivatives by the zero of a position, in rad or m."""
     robust: float = 3.0
     """Usual deviations beyond which a window loses weight in fits."""
+    rotors: tuple[float, ...] = (1.0, 3.0, 10.0)
+    """Inertias of rotors that are tried, in inertias of their joint in the model."""
+    rotors_leave: float = 0.65
+    """Share of the accelerations that may stay unexplained with rotors, any gains and friction; above it, these are not
+    what is missing."""
     misfit: float = 0.3
     """Share of the change of the velocities that the simulator leaves unexplained, above which causes are sought."""
     better: float = 0.6
@@ -158,6 +163,15 @@ class AuditSettings:
     """Gains outside these are a warning."""
     zero_warning: float = 0.1
     """Error of an angle's zero, in rad, from which a warning is given."""
+    zero_severe: float = 0.5
+    """Error of an angle's zero, in rad, from which it is severe, and sought in parts of the log as well."""
+    zero_change: float = 5.0
+    """Sum over windows of the unexplained shares by which a change of a zero within a run must lower them."""
+    zero_gain: float = 0.03
+    """Unexplained share of a window that a large shift must explain at least, so that shifts without effect are 0."""
+    zero_explained: float = 0.5
+    """Share of the accelerations that may stay unexplained in the whole log with a large shift, any gains and friction;
+    above it, something else is wrong as well, and no zero is blamed."""
     zero_better: float = 0.8
     """Share of the misfit that a corrected zero must leave at most."""
     foreign: float = 0.85

@@ -1,0 +1,217 @@
+"""Check of the zeros of angles: small shifts, and large ones in all rows or in some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from torchrl_h2o.data.audit.actions import friction_responses
+from torchrl_h2o.data.audit.finding import Finding, Rows
+from torchrl_h2o.data.audit.log import Pair
+from torchrl_h2o.data.audit.regression import robust_fit
+from torchrl_h2o.data.audit.response import Response
+from torchrl_h2o.data.audit.settings import AuditSettings
+
+CHECK = "model"
+_GRIDS = ((30.0, 180.0), (5.0, 30.0), (1.0, 5.0))  # steps and half widths of successive grids of shifts, in degrees
+_FEWEST, _SMALLEST = 12, 0.04  # windows of a part of the log with its own zero, and their share of all
+
+
+def check_large_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
+    """Angles whose zero lies far from the model's, or changes in the log, as that of an encoder that loses counts.
+
+    Each angle is shifted by steps of 30° around the circle, in all windows. If no single shift explains the log, the
+    Viterbi algorithm divides it into parts with a shift each, such that the simulator's error is least; a change
+    within a run must lower it by more than chance, and lasts until the run ends or another change. The best shifts
+    have to explain far more than gains, friction, constant forces and small shifts of all zeros can, so that no gap of
+    the dynamics counts as a wrong zero.
+
+    Args:
+        response: simulated windows.
+        settings: thresholds.
+    """
+    if _errors(response).mean() <= settings.misfit:
+        return []
+    angles = [pair for pair in response.log.pairs if pair.angle]
+    one, runs = np.zeros(len(response.starts), int), response.log.run[response.starts]
+    for groups, change in ((one, np.inf), (runs, settings.zero_change)):
+        found: list[tuple[float, float, Pair, np.ndarray]] = []
+        for pair in angles:
+            shifts = _shifts(response, pair, groups, change, settings)
+            shifts = _confirmed(response, pair, groups, shifts, settings)
+            if shifts.any():
+                both = (response, _shifted(response, pair, shifts))
+                plain, left = (unexplained(each, settings, shifts != 0.0) for each in both)
+                if unexplained(both[1], settings) < settings.zero_explained:
+                    found.append((left, plain, pair, shifts))
+        if found:
+            left, plain, pair, shifts = min(found, key=lambda each: each[0])
+            return [_finding(response, pair, shifts, plain, left, settings)]
+    return []
+
+
+def _confirmed(
+    response: Response, pair: Pair, groups: np.ndarray, shifts: np.ndarray, settings: AuditSettings
+) -> np.ndarray:
+    """The shifts (W,) without those of parts that gains, friction and small shifts explain nearly as well."""
+    shifted, confirmed = _shifted(response, pair, shifts), shifts.copy()
+    for part in _equal(shifts, groups):
+        if shifts[part.start] != 0.0:
+            mask = np.zeros(len(shifts), bool)
+            mask[part] = True
+            plain, left = (unexplained(each, settings, mask) for each in (response, shifted))
+            if left >= settings.better * plain or plain - left <= 0.1:
+                confirmed[part] = 0.0
+    return confirmed
+
+
+def _finding(
+    response: Response, pair: Pair, shifts: np.ndarray, plain: float, left: float, settings: AuditSettings
+) -> Finding:
+    parts = list(_parts(response, shifts))
+    explained = (
+        f"with any gains and friction the simulator leaves {percent(plain)} of the accelerations unexplained, and "
+        f"{percent(left)} "
+    )
+    if len({round(shift, 1) for _, shift in parts}) == 1:
+        shift = parts[0][1]
+        half = ", half a turn" if abs(abs(shift) - np.pi) < 0.1 else ""
+        words = f"{explained}if the zero of {pair.name} is shifted by {-shift:.2f} rad{half}"
+        remedy = f"if the log counts this angle from elsewhere, add offset: {shift:.4g} to its column"
+        return Finding(CHECK, "severe", words, None, remedy)
+    mask = np.zeros(len(response.log), bool)
+    for rows, shift in parts:
+        mask[rows] = shift != 0.0
+    shifted = [(rows, shift) for rows, shift in parts if shift != 0.0]
+    sizes = ", ".join(f"{-shift:.2f} rad in about rows {rows.start} to {rows.stop - 1}" for rows, shift in shifted)
+    words = f"{explained}if the zero of {pair.name} changes (shifted by {sizes}): its sensor slipped, lost counts, or "
+    words += "was set to zero elsewhere"
+    remedy = "leave these rows out, or correct the column"
+    return Finding(CHECK, "severe", words, Rows.of(mask, settings.examples), remedy)
+
+
+def _parts(response: Response, shifts: np.ndarray) -> Iterator[tuple[slice, float]]:
+    """Rows and shift of each part of the log; a part begins with its first window, or with its run."""
+    runs = response.log.run[response.starts]
+    begins = np.flatnonzero(np.append(True, (np.diff(shifts) != 0.0) | (np.diff(runs) != 0)))
+    first = [int(response.starts[i]) if i and runs[i] == runs[i - 1] else None for i in begins]
+    of_run = {int(response.log.run[rows.start]): rows for rows in response.log.runs}
+    for place, begin in enumerate(begins):
+        rows, start = of_run[int(runs[begin])], first[place]
+        following = first[place + 1] if place + 1 < len(begins) else None
+        stop = rows.stop if following is None else following
+        yield slice(rows.start if start is None else start, stop), float(shifts[begin])
+
+
+def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, settings: AuditSettings) -> np.ndarray:
+    """The shift of the angle in each window, in rad, (W,); 0 where none of at least ``zero_severe`` helps.
+
+    Args:
+        response: simulated windows.
+        pair: the angle.
+        groups: group of each window, (W,); the shift may change freely between groups.
+        change: cost of a change within a group.
+        settings: thresholds.
+    """
+    shifts = np.zeros(len(groups))
+    for turn, (step, half_width) in enumerate(_GRIDS):
+        grid = np.radians(np.arange(-half_width + (step if turn == 0 else 0.0), half_width + 0.5 * step, step))
+        errors = np.stack([_errors(_shifted(response, pair, shifts + shift)) for shift in grid])  # (K, W)
+        if turn == 0:
+            shifts = grid[_viterbi(errors + settings.zero_gain * (grid != 0.0)[:, None], groups, change)]
+        else:
+            for part in _equal(shifts, groups):
+                shifts[part] += grid[errors[:, part].mean(1).argmin()]
+        if not shifts.any():
+            return shifts
+    fewest = max(_FEWEST, _SMALLEST * len(shifts))
+    for part in reversed(_equal(shifts, groups)):
+        lasts = part.stop == len(shifts) or groups[part.stop] != groups[part.start] or shifts[part.stop] != 0.0
+        if not lasts or part.stop - part.start < fewest or abs(shifts[part.start]) < settings.zero_severe:
+            shifts[part] = 0.0
+    return shifts
+
+
+def _viterbi(errors: np.ndarray, groups: np.ndarray, change: float) -> np.ndarray:
+    """The cheapest choice of a row of ``errors`` (K, W) for each column, (W,).
+
+    A change of the row within a group costs ``change``.
+    This is the algorithm of Viterbi (1967), IEEE Transactions on Information Theory 13, 260.
+    """
+    cost, before = errors[:, 0], np.zeros(errors.shape, int)
+    for window in range(1, errors.shape[1]):
+        cheapest = int(cost.argmin())
+        limit = cost.min() + (change if groups[window] == groups[window - 1] else 0.0)
+        before[:, window] = np.where(cost <= limit, np.arange(len(cost)), cheapest)
+        cost = np.minimum(cost, limit) + errors[:, window]
+    chosen = [int(cost.argmin())]
+    for window in range(errors.shape[1] - 1, 0, -1):
+        chosen.append(int(before[chosen[-1], window]))
+    return np.array(chosen[::-1])
+
+
+def _equal(shifts: np.ndarray, groups: np.ndarray) -> list[slice]:
+    """Successive windows of one group with one shift."""
+    edges = np.flatnonzero((np.diff(shifts) != 0.0) | (np.diff(groups) != 0)) + 1
+    return [slice(int(a), int(b)) for a, b in zip([0, *edges], [*edges, len(groups)], strict=True)]
+
+
+def _shifted(response: Response, pair: Pair, shifts: np.ndarray) -> Response:
+    """The windows with shifts (W,) of an angle at their beginnings; velocities do not change."""
+    states = response.states.copy()
+    states[:, pair.coordinate] += shifts
+    return replace(response, states=states)
+
+
+def _errors(response: Response) -> np.ndarray:
+    """Unexplained change of the velocities of each window, in usual changes, at most 3, mean over velocities, (W,)."""
+    share = np.abs(response.change - response.simulated_with(response.limited[response.rows])) / response.scale
+    return np.minimum(np.where(np.isfinite(share), share, 3.0), 3.0).mean(1)
+
+
+def unexplained(response: Response, settings: AuditSettings, windows: np.ndarray | None = None) -> float:
+    """Usual share of the accelerations that no gains, friction, constant forces and small shifts of zeros explain.
+
+    Args:
+        response: simulated windows, to all of which these are fitted.
+        settings: thresholds.
+        windows: mask (W,) of those whose usual share is meant; None for all.
+    """
+    gains = response.by_action * response.limited[response.rows].mean(1)[:, None]
+    responses = np.concatenate([gains, friction_responses(response), response.by_zero], -1)
+    found = robust_fit(response.target, responses, response.scale, settings.robust)
+    left = np.abs(response.target - responses @ found.values)
+    return float(np.mean(np.nanmedian(left if windows is None else left[windows], axis=0) / response.scale))
+
+
+def check_small_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
+    """Angles whose zero is shifted a little: fitted beside gains and friction, then confirmed by simulation."""
+    pairs = response.log.pairs
+    angles = [index for index, pair in enumerate(pairs) if pair.angle]
+    if not angles:
+        return []
+    others = friction_responses(response)[..., : 2 * len(pairs)]
+    gains = response.by_action * response.limited[response.rows].mean(1)[:, None]
+    responses = np.concatenate([response.by_zero[..., angles], gains, others], -1)
+    found = robust_fit(response.target, responses, response.scale, settings.robust)
+    findings = []
+    misfit = response.misfit()
+    for place, index in enumerate(angles):
+        shift, error = found.values[place], found.errors[place]
+        if abs(shift) < max(settings.zero_warning, settings.significance * error) or abs(shift) > np.pi:
+            continue
+        pair = pairs[index]
+        left = _shifted(response, pair, np.full(len(response.starts), shift)).misfit()
+        if left < settings.zero_better * misfit:
+            words = f"the simulator leaves {percent(misfit)} of the accelerations unexplained, and {percent(left)} "
+            words += f"if the zero of {pair.name} is shifted by {-shift:.2f} rad: an offset, or a tilted model"
+            remedy = f"measure the angle's zero, for example at rest; offset: {shift:.3g} in its column corrects it"
+            findings.append(Finding(CHECK, "warning", words, None, remedy))
+    return findings
+
+
+def percent(share: float) -> str:
+    """A share in words."""
+    return "all" if share >= 0.995 else f"{share:.0%}"
