@@ -16,7 +16,7 @@ from torchrl_h2o.effects import (
     Gravity,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals import LoopSettings, Report, Simulation, close_the_loop, residuals
+from torchrl_h2o.residuals import LoopSettings, Report, Simulation, Split, close_the_loop, residuals
 from torchrl_h2o.residuals.report.contents import UNDECIDED
 from torchrl_h2o.residuals.settings import JudgeSettings
 
@@ -222,3 +222,19 @@ def test_held_out_rows_are_not_fitted():
     )
     (gravity,) = closed(measured, catalogue=[GRAVITY]).effects
     assert gravity.scale == pytest.approx(1.3, rel=0.02)
+
+
+@pytest.mark.parametrize(("rows", "known"), [(6, False), (300, True)])
+def test_where_rows_are_too_few_to_choose_by_the_catalogue_is_not_said_to_lack_the_cause(rows, known):
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 1500, noise=0.01)
+    split = np.full(1500, Split.FIT)
+    split[700 : 700 + rows], split[700 + rows :] = Split.SELECTION, Split.REPORT
+    report = closed(replace(measured, split=split), catalogue=[GRAVITY])
+    assert bool(report.found) == known
+    if not known:
+        words = report.sentence()
+        assert "these data do not tell what" in words
+        assert "For example, gravity × 1.3" in words
+        assert f"the {rows} rows by which effects are chosen are too few" in words
+        assert "catalogue" not in words
+        assert report.verdict == Report.from_json(report.to_json()).verdict

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.effects import ActionDelay, Gravity, JointDamping, JointFrictionLoss, ObservationGain
+from tests.residuals.pendulum import UnknownForce, double_pendulum, pendulum, recorded
+from torchrl_h2o.effects import ActionDelay, Armature, Gravity, JointDamping, JointFrictionLoss, ObservationGain
 from torchrl_h2o.residuals import Measured
 from torchrl_h2o.residuals.trace.fit import fit
+from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 
 SIMULATION = pendulum()
@@ -131,3 +132,21 @@ def test_a_large_residual_counts_less_than_its_square():
     residual = np.array([0.0, 0.01, 100.0]).reshape(3, 1, 1)
     assert losses(residual) == pytest.approx([0.0, 1e-4, 198.0], rel=0.01)
     assert losses(-residual) == pytest.approx(losses(residual))
+
+
+def test_a_fit_that_takes_all_of_the_models_damping_away_still_moves_the_other_values():
+    """Beyond the model's own damping, every step is rejected; a fit that does not know this stays where it began."""
+    problem = pose(JointDamping(-0.1), Armature(0.02))
+    damping, armature = fitted(problem, JointDamping(-0.1), Armature(0.08)).effects
+    assert damping.damping == pytest.approx(-0.1, abs=2e-3)
+    assert armature.inertia == pytest.approx(0.02, rel=0.05)
+    assert fitted(pose(), JointDamping(-0.05)).effects[0].damping >= -0.1
+
+
+def test_what_may_be_taken_away_depends_on_the_effects_beside_it():
+    model = double_pendulum().with_effects(JointDamping(0.3, "shoulder"), JointDamping(0.1, "elbow")).model
+    assert lowest_value(JointDamping(), model) == pytest.approx(-0.1)
+    assert lowest_value(JointDamping(0.0, "shoulder"), model) == pytest.approx(-0.3)
+    assert lowest_value(JointDamping(0.0, "shoulder"), model, [JointDamping(-0.1)]) == pytest.approx(-0.2)
+    assert lowest_value(JointDamping(0.0, "shoulder"), model, [Armature(-0.1)]) == pytest.approx(-0.3)
+    assert lowest_value(Gravity(), model) == -np.inf

@@ -187,3 +187,9 @@ def test_the_bar_moves_with_the_search():
     with LoopBar(file=io.StringIO()) as progress:
         trace_effects(SIMULATION, measured, ALL, rng=np.random.default_rng(0), progress=progress)
         assert STAGES[EFFECTS] < progress.n < STAGES[EFFECTS] + STAGES[OTHERS]
+
+
+def test_where_nothing_was_found_what_was_tried_is_told_all_the_same():
+    trace = traced(noise=0.01)
+    assert trace.entries == ()
+    assert trace.attempts

@@ -21,13 +21,13 @@ from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
-from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.contents import NOTHING_MISSING, UNDECIDED, TwoSample, Verdict
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
+from torchrl_h2o.residuals.report.contents import NOT_EXPLAINED, NOTHING_MISSING, UNDECIDED, TwoSample, Verdict
 from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.outcome import Attempt, RivalSet
 
@@ -114,6 +114,8 @@ def judge(
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
     verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings)
+    if verdict.kind == NOT_EXPLAINED and not effects:
+        verdict = replace(verdict, too_few=too_few_rows(simulation, measured, rejected, error, settings.verdict))
     if verdict.kind == NOTHING_MISSING and explanation.ended_in is not None:
         verdict = replace(verdict, kind=UNDECIDED)
     if verdict.kind == NOTHING_MISSING and not explanation.failures:
@@ -140,6 +142,30 @@ def judge(
         verdict=verdict,
         failures=(*explanation.failures, *failures),
         others=_others(simulation, mended, measured, explanation, settings),
+    )
+
+
+def too_few_rows(
+    simulation: Simulation,
+    measured: Measured,
+    rejected: Sequence[tuple[Attempt, float]],
+    error: ErrorSummary,
+    rules: VerdictSettings,
+) -> str:
+    """An effect that was not put in although it clearly lowers the error on data that chose nothing, in words.
+
+    The catalogue may then explain what is missing, and only the part of the data by which effects are chosen is too
+    short for the tests.
+    """
+    attempt, after = min(rejected, key=lambda pair: (np.isnan(pair[1]), pair[1]), default=(None, math.nan))
+    if attempt is None or not after < rules.lowers_much * error.before:
+        return ""
+    rows = int((measured.split == Split.SELECTION).sum())
+    words = effect_words(attempt.effect, simulation.names)
+    less = f"{1.0 - after / error.before:.0%}"
+    return (
+        f"For example, {words} lowers the error by {less} on the rows that chose nothing, but the {rows} rows by which "
+        "effects are chosen are too few, or move too little, to exclude chance: record more, or give more logs"
     )
 
 

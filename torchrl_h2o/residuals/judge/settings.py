@@ -98,6 +98,8 @@ class VerdictSettings:
     """Factor by which effects may raise the error in the report's sentence; beyond it they are not recommended."""
     much_lower: float = 0.5
     """Share of the error ahead below which an explanation counts in spite of such an AUC."""
+    lowers_much: float = 0.8
+    """Share of the held-out error that an effect which was not put in must leave at most to be named all the same."""
     extreme_factor: float = 20.0
     """Factor on a property of the model beyond which the value is reported as implausible."""
     blocks: int = 10

@@ -156,6 +156,8 @@ class Verdict:
         caveats: sentences on effects that may have another cause than the one they are named after.
         undetectable: where nothing is missing, effects that the data could not have shown, in words; one of each kind
             comes first.
+        too_few: where nothing was found, an effect that lowers the held-out error, and how many rows there were to
+            choose it by, too few for the tests; empty otherwise.
 
     Raises:
         ValueError: for an unknown kind.
@@ -167,6 +169,7 @@ class Verdict:
     where: str = ""
     caveats: tuple[str, ...] = ()
     undetectable: tuple[str, ...] = ()
+    too_few: str = ""
 
     def __post_init__(self):
         if self.kind not in VERDICTS:

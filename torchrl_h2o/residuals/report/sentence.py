@@ -66,6 +66,9 @@ def _verdict_words(report: ReportContents) -> list[str]:
     by_what, ended = (
         (NOT_IN_CATALOGUE, []) if report.ended_in is None else (NOT_SO_FAR, [_ended_words(report.ended_in)])
     )
+    if kind == NOT_EXPLAINED and report.verdict is not None and report.verdict.too_few:
+        first = f"Something is missing, and these data do not tell what: {_joined(unknown, error)}."
+        return [first, *ended, f"{report.verdict.too_few}."]
     if kind == NOT_EXPLAINED:
         attempt = words and f"the best attempt, {words}, is not recommended"
         return [f"Something is missing that {by_what}: {_joined(unknown, attempt, error)}.", *ended]

@@ -17,6 +17,7 @@ from mujoco import sysid
 
 from torchrl_h2o.effects import Effect, Parameter
 from torchrl_h2o.residuals.settings import DEFAULTS, FitSettings
+from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 
 Free = tuple[str, ...]  # names of the parameters of one effect that a fit may move
@@ -82,10 +83,9 @@ def fit(
     Returns:
         The fit.
     """
+    allowed = [_allowed(problem, effects, index) for index in range(len(effects))]
     variables = [
-        _Variable(index, name, effect.parameters[name], settings)
-        for index, effect in enumerate(effects)
-        for name in free[index]
+        _Variable(index, name, allowed[index][name], settings) for index in range(len(effects)) for name in free[index]
     ]
 
     def residual(z: np.ndarray, _: sysid.ParameterDict) -> tuple:
@@ -105,6 +105,19 @@ def fit(
         widths[variable.effect][variable.name] = half * variable.slope(position)
     at_best = problem.residual(fitted, starts)
     return Fit(tuple(fitted), tuple(free), float(losses(at_best).mean()), tuple(widths))
+
+
+def _allowed(problem: Problem, effects: Sequence[Effect], index: int) -> dict[str, Parameter]:
+    """The parameters of one of the effects, with bounds within what the model and the others leave.
+
+    Without them, a fit that wants to take away more than the model has gets stuck where the model rejects its steps.
+    """
+    effect, others = effects[index], [*effects[:index], *effects[index + 1 :]]
+    least = lowest_value(effect, problem.simulation.model, others)
+    return {
+        name: replace(one, bounds=(min(one.value, max(one.bounds[0], least)), one.bounds[1]))
+        for name, one in effect.parameters.items()
+    }
 
 
 def _with_values(effects: Sequence[Effect], variables: Sequence[_Variable], z: np.ndarray) -> list[Effect]:

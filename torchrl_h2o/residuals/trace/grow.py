@@ -71,7 +71,7 @@ class _Beam:
         self.seen.add(_names(state))
         beam, complete, rounds = [state], [], 0
         while True:
-            grown = [(one, self._with_one_more(one)) for one in beam]
+            grown = [self._with_one_more(one) for one in beam]
             complete += [one for one, more in grown if not more]
             beam, rounds = [each for _, more in grown for each in more], rounds + 1
             if rounds == 2 and self.first is not None and not any(one.exact for one in beam):
@@ -87,15 +87,15 @@ class _Beam:
                 return lists[0]
             beam, complete = ([one for one in lists if one in which] for which in (beam, complete))
 
-    def _with_one_more(self, state: SearchState) -> list[SearchState]:
-        """The states with one set of effects more; empty if the list is complete."""
+    def _with_one_more(self, state: SearchState) -> tuple[SearchState, list[SearchState]]:
+        """The state with the entries that were tried, and those with one set of effects more, if any passes."""
         if state.exact or number_of_effects(state) >= state.settings.trace.max_effects:
-            return []
+            return state, []
         one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
         leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
         added = additions(state, leads, self.rng, self.progress.check)
         self.first = self.first or added
-        return self._put_in(added)
+        return added.state, self._put_in(added)
 
     def _put_in(self, possible: Additions) -> list[SearchState]:
         """The states with the additions that come close to the best one, without what they make redundant.

@@ -10,9 +10,8 @@ Research 5(3), 101-119.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -36,19 +35,11 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.families import elements
+from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 
 #: the properties of links and joints that are identified; the gain of a motor is not among them, because with a gain of
 #: zero and masses of zero no force would be missing
 PROPOSED = (JointFrictionLoss, JointDamping, JointSpring, JointForce, Armature, BodyMass, Payload)
-#: where the model holds a joint's own value, below which an effect cannot reduce it
-OWN_VALUES: Mapping[type[Effect], str] = MappingProxyType(
-    {
-        JointFrictionLoss: "dof_frictionloss",
-        JointDamping: "dof_damping",
-        Armature: "dof_armature",
-        JointSpring: "jnt_stiffness",
-    }
-)
 
 
 @dataclass(frozen=True)
@@ -235,22 +226,13 @@ def _scaled(entry: CatalogueEntry) -> tuple[str, ...]:
 
 def _bounds(entry: CatalogueEntry, model: mujoco.MjModel) -> tuple[float, float]:
     """Smallest and largest share of an entry's first trial that its bounds and the model allow."""
-    lowest, highest, least = -np.inf, np.inf, -_own_value(entry.effect, model)
+    lowest, highest, least = -np.inf, np.inf, lowest_value(entry.effect, model)
     for name in _scaled(entry):
         parameter, trial = entry.effect.parameters[name], entry.trials[0][name]
         allowed = (max(parameter.bounds[0], least), parameter.bounds[1])
         ends = sorted((bound - parameter.neutral) / (trial - parameter.neutral) for bound in allowed)
         lowest, highest = max(lowest, ends[0]), min(highest, ends[1])
     return lowest, highest
-
-
-def _own_value(effect: Effect, model: mujoco.MjModel) -> float:
-    """The model's friction, damping, armature or stiffness of an effect's joint; infinite for other effects."""
-    if (field := OWN_VALUES.get(type(effect))) is None:
-        return np.inf
-    dof = selection.joint_dofs(model, getattr(effect, "joints", "*"))[0]
-    place = model.dof_jntid[dof] if field.startswith("jnt") else dof
-    return float(np.ravel(getattr(model, field)[place])[0])
 
 
 def _step(entry: CatalogueEntry, name: str) -> float:
@@ -260,7 +242,7 @@ def _step(entry: CatalogueEntry, name: str) -> float:
 
 def _at(entry: CatalogueEntry, share: float, model: mujoco.MjModel) -> Effect:
     """An entry's effect at a share of its first trial, within what its bounds and the model allow."""
-    values, least = dict(entry.trials[0]), -_own_value(entry.effect, model)
+    values, least = dict(entry.trials[0]), lowest_value(entry.effect, model)
     for name in _scaled(entry):
         parameter = entry.effect.parameters[name]
         low, high = parameter.bounds
