@@ -143,7 +143,7 @@ def _reversed(response: Response, settings: AuditSettings) -> list[Finding]:
                 f"the simulator leaves {misfit:.0%} of the accelerations unexplained, and {left:.0%} if the action of "
             )
             words += f"{name} has the other sign"
-            remedy = "reverse the sign of the action, or of the joint's position and velocity"
+            remedy = "reverse the sign of the action (scale: -1), or of the joint's position and velocity"
             found.append(Finding(CHECK, "severe", words, None, remedy))
     return found
 
@@ -264,7 +264,7 @@ def _gains(response: Response, found: Fit, settings: AuditSettings) -> list[Find
         low, high = settings.gain_warning
         if gain < 0.0 and abs(gain) > settings.significance * error and abs(gain) > settings.gain_severe[0]:
             words = f"the accelerations follow {gain:.2f} × the action of {name}: its sign is reversed"
-            remedy = "reverse the sign of the action, or of the joint's position and velocity"
+            remedy = "reverse the sign of the action (scale: -1), or of the joint's position and velocity"
             findings.append(Finding(CHECK, "severe", words, None, remedy))
             continue
         below, above = gain + settings.significance * error < low, gain - settings.significance * error > high

@@ -188,7 +188,7 @@ def _wrapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
         # otherwise the position is in another unit, or its rows are out of order
         if turns.sum() > 0.8 * (np.abs(moved) > 0.25 * turn).sum() > 0.0:
             words = f"{pair.name} jumps by {unit}: the angle is wrapped"
-            remedy = "unwrap it (numpy.unwrap): the simulator counts turns"
+            remedy = "write unwrap: true in its column: the simulator counts turns"
             return [Finding(CHECK, "warning", words, Rows.of(turns, settings.examples), remedy)]
     return []
 
