@@ -340,7 +340,8 @@ def test_contradicting_columns_are_refused(columns, message):
         ({"offset": float("nan")}, "offset nan must be finite"),
         ({"unwrap": True, "unit": "m"}, "unwrap is for observed or commanded angles"),
         ({"unwrap": True, "unit": "rad", "role": "ignore"}, "unwrap is for observed or commanded angles"),
-        ({"unwrap": 1, "unit": "rad"}, "unwrap 1 must be true or false"),
+        ({"unwrap": -1, "unit": "rad"}, "unwrap -1 must be true, false, or the size of a turn"),
+        ({"unwrap": "yes", "unit": "rad"}, "unwrap 'yes' must be true, false, or the size of a turn"),
     ],
 )
 def test_invalid_columns_are_refused(entries, message):
@@ -363,8 +364,16 @@ def test_an_angle_is_unwrapped_behind_its_gear_and_shifted_in_si(tmp_path):
         "  - {name: q, role: observation, unit: deg, scale: 0.5, offset: 1.0, unwrap: true}\n"
         "  - {name: u, role: action, unit: deg, unwrap: true}\n"
     )
-    (tmp_path / "log.txt").write_text("350 170\n10 -170\n30 -150\n")
+    (tmp_path / "log.txt").write_text("310 130\n330 150\n350 170\n10 -170\n30 -150\n")
     td = load(tmp_path / "log.txt", columns=tmp_path / "log.yaml")
     angle = torch.cat([td["observation"], td["next", "observation"][-1:]])
-    assert angle.flatten().tolist() == pytest.approx([1.0 + np.radians(a) for a in (175.0, 185.0, 195.0)])
-    assert td["action"].flatten().tolist() == pytest.approx([np.radians(a) for a in (170.0, 190.0)])
+    assert angle.flatten().tolist() == pytest.approx([1.0 + np.radians(a) for a in (155.0, 165.0, 175.0, 185.0, 195.0)])
+    assert td["action"].flatten().tolist() == pytest.approx([np.radians(a) for a in (130.0, 150.0, 170.0, 190.0)])
+
+
+def test_the_counts_of_an_encoder_are_unwrapped_by_the_size_of_its_turn():
+    counts, rad = np.array([4000.0, 4050.0, 4090.0, 30.0, 80.0, 120.0]), 2.0 * np.pi / 4096
+    column = Column("q", "observation", unit="rad", scale=rad, unwrap=4096)
+    assert column.in_si(counts) == pytest.approx(rad * np.array([4000.0, 4050.0, 4090.0, 4126.0, 4176.0, 4216.0]))
+    with pytest.raises(ValueError, match="give the size of its turn, such as unwrap: 4096"):
+        Column("q", "observation", unit="rad", scale=rad, unwrap=True).in_si(counts)

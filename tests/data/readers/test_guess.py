@@ -115,8 +115,9 @@ def test_irregular_stamps_are_resampled(tmp_path):
     assert np.diff(td["time"].flatten().numpy()) == pytest.approx(0.01, rel=0.05)
 
 
-TIME = 0.01 * np.arange(400)
+TIME = 0.01 * np.arange(1500)
 ANGLE = 4.0 * np.sin(TIME)
+COMMAND = np.cos(7.0 * TIME)
 
 
 def guessed(tmp_path, names: str, columns, model=None) -> str:
@@ -135,7 +136,7 @@ def test_an_angle_that_jumps_by_a_turn_is_unwrapped(tmp_path, unit, factor):
 
 
 def test_an_angle_that_is_read_wrongly_now_and_then_is_not_unwrapped(tmp_path):
-    broken = ANGLE + 3.0 * (np.arange(400) % 50 == 0)
+    broken = ANGLE + 3.0 * (np.arange(1500) % 50 == 0)
     assert "unwrap" not in guessed(tmp_path, "time,q,tau", [TIME, broken, TIME])
 
 
@@ -151,10 +152,41 @@ def test_a_velocity_that_does_not_follow_its_position_is_estimated_instead(tmp_p
 @pytest.mark.parametrize(("names", "role"), [("time,q,drive", "action"), ("time,q,tau", "action")])
 def test_the_only_column_left_is_the_action_of_the_only_actuator(tmp_path, names, role):
     model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
-    assert f"role: {role}" in guessed(tmp_path, names, [TIME, ANGLE, TIME], model)
+    assert f"role: {role}" in guessed(tmp_path, names, [TIME, ANGLE, COMMAND], model)
 
 
 def test_of_several_columns_left_none_is_taken_for_the_action(tmp_path):
     model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
-    text = guessed(tmp_path, "time,q,drive,mode", [TIME, ANGLE, TIME, TIME], model)
+    text = guessed(tmp_path, "time,q,drive,other", [TIME, ANGLE, COMMAND, COMMAND], model)
     assert "role: action" not in text
+
+
+@pytest.mark.parametrize(("name", "values"), [("temperature", COMMAND), ("ddq", COMMAND), ("drive", TIME)])
+def test_what_is_no_command_is_not_taken_for_one(tmp_path, name, values):
+    model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
+    assert "role: action" not in guessed(tmp_path, f"time,q,{name}", [TIME, ANGLE, values], model)
+
+
+def test_an_estimated_velocity_has_a_name_of_its_own(tmp_path):
+    text = guessed(tmp_path, "time,hip,hip_velocity,tau", [TIME, ANGLE, ANGLE, COMMAND])
+    assert 'name: "hip_velocity_estimated", role: observation, derivative_of: "hip"' in text
+    (tmp_path / "log.yaml").write_text(text)
+    assert read_robot_log(tmp_path / "log.csv", tmp_path / "log.yaml")["observation"].shape[1] == 2
+
+
+RESETS = 0.5 * (np.arange(1500) // 50 % 2)
+RANDOM = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("time", "position", "velocity"),
+    [
+        (TIME, np.sin(8.0 * np.pi * TIME), 8.0 * np.pi * np.cos(8.0 * np.pi * TIME) + 0.05),
+        (TIME, ANGLE + RESETS, 4.0 * np.cos(TIME)),
+        (TIME + 60.0 * (TIME > 7.0), ANGLE, 4.0 * np.cos(TIME)),
+        (TIME, ANGLE + 0.01 * RANDOM.standard_normal(1500), 4.0 * np.cos(TIME) + 0.5),
+    ],
+    ids=["a period of 25 rows, biased", "resets", "a gap", "noise and bias"],
+)
+def test_a_sound_velocity_is_kept(tmp_path, time, position, velocity):
+    assert "derivative_of" not in guessed(tmp_path, "time,q,qdot,tau", [time, position, velocity, COMMAND])

@@ -17,7 +17,7 @@ CHECK = "actions"
 
 
 def check_actions(
-    log: Log, response: Response | None, settings: AuditSettings, *, lateness: float = 0.0
+    log: Log, response: Response | None, settings: AuditSettings, *, lateness: float = 0.0, gains: bool = True
 ) -> list[Finding]:
     """Compares the measured accelerations with those that the actions cause in the simulator.
 
@@ -30,11 +30,12 @@ def check_actions(
         settings: thresholds.
         lateness: rows by which the velocities are late against their positions; the accelerations are as late, which
             is no lag of the actions.
+        gains: whether to compare the sizes of the actions' effects as well.
     """
     found = _plain(log, response, settings)
     if response is None or not log.action.shape[1] or not np.ptp(log.action, axis=0).any():
         return found
-    return [*found, *_against_accelerations(response, settings, lateness)]
+    return [*found, *_against_accelerations(response, settings, lateness, gains)]
 
 
 def _plain(log: Log, response: Response | None, settings: AuditSettings) -> list[Finding]:
@@ -88,7 +89,7 @@ def _beyond_range(log: Log, response: Response, settings: AuditSettings) -> list
     return found
 
 
-def _against_accelerations(response: Response, settings: AuditSettings, lateness: float) -> list[Finding]:
+def _against_accelerations(response: Response, settings: AuditSettings, lateness: float, gains: bool) -> list[Finding]:
     reversed_ones = _reversed(response, settings)
     if reversed_ones:
         return reversed_ones
@@ -124,7 +125,7 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     else:
         best = int(-lags[0])
     order = _exchanged(response, target, nuisance, int(lags[best]), settings)
-    if order or friction_dominates(response, settings):
+    if order or not gains or friction_dominates(response, settings):
         return [*found, *order]
     return [*found, *_gains(response, fits[best], settings)]
 

@@ -20,20 +20,26 @@ def with_rotors(response: Response, settings: AuditSettings) -> Response:
         response: simulated windows.
         settings: the rotors that are tried, and how much better one has to be.
     """
-    from torchrl_h2o.effects import Armature
-
     plain = unexplained(response, settings)
-    if plain <= settings.misfit or not response.log.pairs:
+    if plain <= settings.misfit:
         return response
-    model, best, least = response.simulation.model, response, min(settings.better * plain, settings.rotors_leave)
+    best, least = response, min(settings.better * plain, settings.rotors_leave)
     for share in settings.rotors:
-        rotors = [
-            Armature(
-                share / max(float(model.dof_invweight0[pair.dof]), 1e-9), model.joint(model.dof_jntid[pair.dof]).name
-            )
-            for pair in response.log.pairs
-        ]
+        rotors = _rotors(response, share)
         heavier = replace(response, simulation=response.simulation.with_effects(*rotors))
-        if (left := unexplained(heavier, settings)) < least:
+        if rotors and (left := unexplained(heavier, settings)) < least:
             best, least = heavier, left
     return best
+
+
+def _rotors(response: Response, share: float) -> list:
+    """A rotor on each hinge and slide joint that has a name, of a share of the joint's inertia in the model."""
+    from torchrl_h2o.effects import Armature
+
+    model, rotors = response.simulation.model, []
+    for pair in response.log.pairs:
+        joint = int(model.dof_jntid[pair.dof])
+        name = model.joint(joint).name
+        if name and int(model.jnt_type[joint]) in (2, 3):  # mjtJoint: slide, hinge
+            rotors.append(Armature(share / max(float(model.dof_invweight0[pair.dof]), 1e-9), name))
+    return rotors

@@ -17,6 +17,7 @@ from torchrl_h2o.data.audit.settings import AuditSettings
 CHECK = "model"
 _GRIDS = ((30.0, 180.0), (5.0, 30.0), (1.0, 5.0))  # steps and half widths of successive grids of shifts, in degrees
 _FEWEST, _SMALLEST = 12, 0.04  # windows of a part of the log with its own zero, and their share of all
+_COARSE = 100  # windows with which a shift is sought first
 
 
 def check_large_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
@@ -34,37 +35,60 @@ def check_large_zeros(response: Response, settings: AuditSettings) -> list[Findi
     """
     if _errors(response).mean() <= settings.misfit:
         return []
-    angles = [pair for pair in response.log.pairs if pair.angle]
+    found: list[tuple[float, Pair, np.ndarray]] = []
     one, runs = np.zeros(len(response.starts), int), response.log.run[response.starts]
-    for groups, change in ((one, np.inf), (runs, settings.zero_change)):
-        found: list[tuple[float, float, Pair, np.ndarray]] = []
-        for pair in angles:
-            shifts = _shifts(response, pair, groups, change, settings)
-            shifts = _confirmed(response, pair, groups, shifts, settings)
-            if shifts.any():
-                both = (response, _shifted(response, pair, shifts))
-                plain, left = (unexplained(each, settings, shifts != 0.0) for each in both)
-                if unexplained(both[1], settings) < settings.zero_explained:
-                    found.append((left, plain, pair, shifts))
-        if found:
-            left, plain, pair, shifts = min(found, key=lambda each: each[0])
-            return [_finding(response, pair, shifts, plain, left, settings)]
-    return []
+    for pair in (pair for pair in response.log.pairs if pair.angle):
+        for groups, change in ((one, np.inf), (runs, settings.zero_change)):
+            shifts = _confirmed(response, pair, groups, _shifts(response, pair, groups, change, settings), settings)
+            shifted = _shifted(response, pair, shifts)
+            if not shifts.any() or unexplained(shifted, settings) >= settings.zero_explained:
+                continue
+            cost = float(_errors(shifted).sum())
+            if groups is runs:  # several parts have to be clearly better than one shift
+                changes = len(_equal(shifts, runs)) - len(np.unique(runs))
+                cost = cost / settings.zero_better + settings.zero_change * changes
+            found.append((cost, pair, shifts))
+    if not found:
+        return []
+    _, pair, shifts = min(found, key=lambda each: each[0])
+    both = (response, _shifted(response, pair, shifts))
+    plain, left = (unexplained(each, settings, shifts != 0.0) for each in both)
+    return [_finding(response, pair, shifts, plain, left, settings)]
 
 
 def _confirmed(
     response: Response, pair: Pair, groups: np.ndarray, shifts: np.ndarray, settings: AuditSettings
 ) -> np.ndarray:
-    """The shifts (W,) without those of parts that gains, friction and small shifts explain nearly as well."""
-    shifted, confirmed = _shifted(response, pair, shifts), shifts.copy()
+    """The shifts (W,) without those of parts that gains, friction and constant forces explain nearly as well.
+
+    These are fitted to the part alone, so that a force that begins there is no shift. Only where the angle jumps as
+    well, otherwise than its velocity says, are they fitted to all parts together.
+    """
+    confirmed, shifted = shifts.copy(), _shifted(response, pair, shifts)
     for part in _equal(shifts, groups):
-        if shifts[part.start] != 0.0:
-            mask = np.zeros(len(shifts), bool)
-            mask[part] = True
+        if shifts[part.start] == 0.0:
+            continue
+        mask = np.zeros(len(shifts), bool)
+        mask[part] = True
+        if _jumps(response, pair, part, groups, shifts):
             plain, left = (unexplained(each, settings, mask) for each in (response, shifted))
-            if left >= settings.better * plain or plain - left <= 0.1:
-                confirmed[part] = 0.0
+        else:
+            own = replace(response, starts=response.starts[part], states=response.states[part])
+            plain, left = (unexplained(each, settings) for each in (own, _shifted(own, pair, shifts[part])))
+        if left >= settings.better * plain or plain - left <= 0.1:
+            confirmed[part] = 0.0
     return confirmed
+
+
+def _jumps(response: Response, pair: Pair, part: slice, groups: np.ndarray, shifts: np.ndarray) -> bool:
+    """Whether the angle jumps by about the change of the shift at the beginning of a part, beyond what it moves."""
+    if part.start == 0 or groups[part.start - 1] != groups[part.start]:
+        return False
+    log, change = response.log, shifts[part.start] - shifts[part.start - 1]
+    rows = slice(int(response.starts[part.start - 1]), int(response.starts[part.start]) + response.horizon)
+    moved = log.following[rows, pair.position] - log.observation[rows, pair.position]
+    integral = 0.5 * log.dt * (log.following[rows, pair.velocity] + log.observation[rows, pair.velocity])
+    return bool(abs((moved - integral).sum() + change) < 0.3 * abs(change))
 
 
 def _finding(
@@ -79,15 +103,16 @@ def _finding(
         shift = parts[0][1]
         half = ", half a turn" if abs(abs(shift) - np.pi) < 0.1 else ""
         words = f"{explained}if the zero of {pair.name} is shifted by {-shift:.2f} rad{half}"
-        remedy = f"if the log counts this angle from elsewhere, add offset: {shift:.4g} to its column"
+        remedy = f"if the log counts this angle from elsewhere, add offset: {shift:.4g} to its column; if the robot is "
+        remedy += "mounted otherwise than in the model, turn the model"
         return Finding(CHECK, "severe", words, None, remedy)
     mask = np.zeros(len(response.log), bool)
     for rows, shift in parts:
         mask[rows] = shift != 0.0
     shifted = [(rows, shift) for rows, shift in parts if shift != 0.0]
     sizes = ", ".join(f"{-shift:.2f} rad in about rows {rows.start} to {rows.stop - 1}" for rows, shift in shifted)
-    words = f"{explained}if the zero of {pair.name} changes (shifted by {sizes}): its sensor slipped, lost counts, or "
-    words += "was set to zero elsewhere"
+    words = f"{explained}if the zero of {pair.name} is shifted by {sizes}: its sensor slipped, lost counts, or was set "
+    words += "to zero elsewhere"
     remedy = "leave these rows out, or correct the column"
     return Finding(CHECK, "severe", words, Rows.of(mask, settings.examples), remedy)
 
@@ -118,10 +143,14 @@ def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, s
     shifts = np.zeros(len(groups))
     for turn, (step, half_width) in enumerate(_GRIDS):
         grid = np.radians(np.arange(-half_width + (step if turn == 0 else 0.0), half_width + 0.5 * step, step))
-        errors = np.stack([_errors(_shifted(response, pair, shifts + shift)) for shift in grid])  # (K, W)
         if turn == 0:
-            shifts = grid[_viterbi(errors + settings.zero_gain * (grid != 0.0)[:, None], groups, change)]
+            some = np.isin(response.starts, response.thinned(_COARSE).starts)  # spares most angles the other windows
+            coarse = replace(response, starts=response.starts[some], states=response.states[some])
+            if not _coarse_shifts(coarse, pair, groups[some], grid, change, settings).any():
+                return shifts
+            shifts = _coarse_shifts(response, pair, groups, grid, change, settings)
         else:
+            errors = _errors_of(response, pair, [shifts + shift for shift in grid])
             for part in _equal(shifts, groups):
                 shifts[part] += grid[errors[:, part].mean(1).argmin()]
         if not shifts.any():
@@ -132,6 +161,19 @@ def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, s
         if not lasts or part.stop - part.start < fewest or abs(shifts[part.start]) < settings.zero_severe:
             shifts[part] = 0.0
     return shifts
+
+
+def _coarse_shifts(
+    response: Response, pair: Pair, groups: np.ndarray, grid: np.ndarray, change: float, settings: AuditSettings
+) -> np.ndarray:
+    """The shift of a grid (K,) in each window that leaves the least error, (W,)."""
+    errors = _errors_of(response, pair, [np.full(len(groups), shift) for shift in grid])
+    return grid[_viterbi(errors + settings.zero_gain * (grid != 0.0)[:, None], groups, change)]
+
+
+def _errors_of(response: Response, pair: Pair, shifts: list[np.ndarray]) -> np.ndarray:
+    """:func:`_errors` with each of some shifts (W,), (K, W)."""
+    return np.stack([_errors(_shifted(response, pair, each)) for each in shifts])
 
 
 def _viterbi(errors: np.ndarray, groups: np.ndarray, change: float) -> np.ndarray:

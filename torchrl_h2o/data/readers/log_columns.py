@@ -12,6 +12,7 @@ import numpy as np
 
 from torchrl_h2o.data.readers.units import to_si
 
+_MOST_JUMPS = 0.3  # share of rows that may differ from the row before by more than half a turn of the angle
 ROLES = ("observation", "action", "reward", "done", "time", "ignore")
 
 
@@ -26,8 +27,9 @@ class Column:
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
         scale: a factor in addition to the unit's, such as a gear ratio or a sign.
         offset: a constant in SI that is added after unit and scale, such as the zero of an angle.
-        unwrap: whether the column is an angle that jumps by a turn at the end of its range; its turns are then counted
-            from the first row on.
+        unwrap: for an angle that jumps by a turn at the end of its range, ``True``, or the size of a turn in the file,
+            such as 4096 for an encoder's counts; its turns are then counted from the first row on. ``True`` takes the
+            angle before ``scale``, such as a gear ratio, to have a turn of 2π.
         bounds: lowest and highest value in SI, for actions only.
         index: position in the file, counted from 0, for files without names; all columns have it, or none.
         derivative_of: the observed position whose velocity this column is, for a velocity that is not in the file. It
@@ -47,7 +49,7 @@ class Column:
     unit: str = "1"
     scale: float = 1.0
     offset: float = 0.0
-    unwrap: bool = False
+    unwrap: bool | float = False
     bounds: tuple[float, float] | None = None
     index: int | None = None
     derivative_of: str | None = None
@@ -67,8 +69,10 @@ class Column:
             raise ValueError(f"scale {self.scale} must be finite and not zero")
         if not math.isfinite(self.offset):
             raise ValueError(f"offset {self.offset} must be finite")
-        if not isinstance(self.unwrap, bool):
-            raise ValueError(f"unwrap {self.unwrap!r} must be true or false")
+        if not isinstance(self.unwrap, bool) and not (
+            isinstance(self.unwrap, int | float) and 0 < self.unwrap < math.inf
+        ):
+            raise ValueError(f"unwrap {self.unwrap!r} must be true, false, or the size of a turn in the file")
         if self.unwrap and (si_unit != "rad" or self.role not in ("observation", "action")):
             raise ValueError("unwrap is for observed or commanded angles: give the unit, rad or deg")
         if self.bounds is not None:
@@ -94,10 +98,19 @@ class Column:
         return to_si(self.unit)[1] * self.scale
 
     def in_si(self, values: np.ndarray) -> np.ndarray:
-        """Values of the file (rows,) in SI, with ``offset``; for ``unwrap``, without jumps by a turn."""
+        """Values of the file (rows,) in SI, with ``offset``; for ``unwrap``, without jumps by a turn.
+
+        Raises:
+            ValueError: if the values cannot be an angle with such a turn.
+        """
         values = values * self.factor
         if self.unwrap:
-            values = np.unwrap(values, period=2.0 * math.pi * abs(self.scale))
+            turn = 2.0 * math.pi * abs(self.scale) if self.unwrap is True else self.unwrap * abs(self.factor)
+            if (np.abs(np.diff(values)) > 0.5 * turn).mean() > _MOST_JUMPS:
+                size = f"half a turn of {turn / abs(self.factor):.4g} in the file"
+                remedy = "give the size of its turn, such as unwrap: 4096, or correct unit and scale"
+                raise ValueError(f"{self.name}: many rows differ by more than {size}; {remedy}")
+            values = np.unwrap(values, period=turn)
         return values + self.offset
 
 

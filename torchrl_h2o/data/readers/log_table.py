@@ -79,7 +79,10 @@ def read_table(path: str | Path, layout: LogColumns) -> LogTable:
         values, numbers = values[: len(values) - zero_rows], numbers[: len(values) - zero_rows]
     if len(values) < 2:
         raise DataError("only rows of zeros remain", "record the log again", source=raw.source)
-    values = np.stack([column.in_si(values[:, index]) for index, (_, column) in enumerate(chosen)], axis=1)
+    try:
+        values = np.stack([column.in_si(values[:, index]) for index, (_, column) in enumerate(chosen)], axis=1)
+    except ValueError as error:
+        raise DataError(str(error), "correct the column description", source=raw.source) from error
     require_finite(values, names, source=raw.source, row_of=lambda index: int(numbers[index]))
     return LogTable(str(raw.source), tuple(names), values, numbers, int(zero_rows))
 

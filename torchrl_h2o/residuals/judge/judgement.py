@@ -114,8 +114,9 @@ def judge(
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
     verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings)
-    if verdict.kind == NOT_EXPLAINED and not effects:
-        verdict = replace(verdict, too_few=too_few_rows(simulation, measured, rejected, error, settings.verdict))
+    if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None:
+        too_few = too_few_rows(simulation, measured, rejected, error, explanation.trace.loss, settings.verdict)
+        verdict = replace(verdict, too_few=too_few)
     if verdict.kind == NOTHING_MISSING and explanation.ended_in is not None:
         verdict = replace(verdict, kind=UNDECIDED)
     if verdict.kind == NOTHING_MISSING and not explanation.failures:
@@ -150,13 +151,23 @@ def too_few_rows(
     measured: Measured,
     rejected: Sequence[tuple[Attempt, float]],
     error: ErrorSummary,
+    loss: float,
     rules: VerdictSettings,
 ) -> str:
     """An effect that was not put in although it clearly lowers the error on data that chose nothing, in words.
 
     The catalogue may then explain what is missing, and only the part of the data by which effects are chosen is too
-    short for the tests.
+    short for the tests. It has to lower the loss there as well: otherwise the two parts contradict each other.
+
+    Args:
+        simulation: the simulator without effects.
+        measured: the data.
+        rejected: attempts, and the error with each of them alone.
+        error: the error without them.
+        loss: the loss without them on the part by which effects are chosen.
+        rules: how much lower an error has to be.
     """
+    rejected = [(attempt, after) for attempt, after in rejected if attempt.loss < rules.lowers_much * loss]
     attempt, after = min(rejected, key=lambda pair: (np.isnan(pair[1]), pair[1]), default=(None, math.nan))
     if attempt is None or not after < rules.lowers_much * error.before:
         return ""
@@ -164,8 +175,8 @@ def too_few_rows(
     words = effect_words(attempt.effect, simulation.names)
     less = f"{1.0 - after / error.before:.0%}"
     return (
-        f"For example, {words} lowers the error by {less} on the rows that chose nothing, but the {rows} rows by which "
-        "effects are chosen are too few, or move too little, to exclude chance: record more, or give more logs"
+        f"For example, {words} lowers the error by {less} on the rows kept aside for this report, but the {rows} rows "
+        "by which effects are chosen are too few, or move too little, to exclude chance: record more, or give more logs"
     )
 
 

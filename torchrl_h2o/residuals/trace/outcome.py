@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -81,6 +82,7 @@ class Trace:
         others: other sets of effects with an equivalent loss, the most usual ones first.
         horizon: control steps per window that were chosen for the data.
         ended_in: stage in which the time for the search was up; None if it came to its end.
+        loss: where nothing was found, the mean robust loss on held-out windows without the attempts; else NaN.
         by_forces: whether the effects are those of a regression of the missing forces, because torques are so noisy
             that the motion does not show them.
     """
@@ -94,3 +96,4 @@ class Trace:
     horizon: int = 1
     ended_in: str | None = None
     by_forces: bool = False
+    loss: float = math.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -209,6 +210,6 @@ def _outcome(state: SearchState) -> Trace:
     tried = sorted(state.attempts.values(), key=lambda attempt: attempt.loss)
     attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
     groups = state.groups or ((),) * len(state.entries)  # alternatives are looked for after the effects
-    return Trace(
-        state.entries, state.fit, attempts, groups, state.exact, horizon=state.chosen_horizon or state.problem.horizon
-    )
+    loss = math.nan if state.entries else float(state.problem.selection_losses(()).mean())
+    horizon = state.chosen_horizon or state.problem.horizon
+    return Trace(state.entries, state.fit, attempts, groups, state.exact, horizon=horizon, loss=loss)

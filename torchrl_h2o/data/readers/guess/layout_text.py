@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
-from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force
+from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
 from torchrl_h2o.data.readers.units import to_si
 
 JUMP = 0.5  # share of the median step by which a step must differ for the run to end there
 UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the steps differ from the median by this share
 
-_SPAN = 25  # rows over which displacements are compared with a velocity; single steps are often smaller than a sensor's
+_SPANS = (1, 3, 10, 25, 60)  # rows over which displacements are compared with a velocity; the best span counts
 _RELATED = 0.5  # correlation of both below which the column is not that velocity
 
 
@@ -84,7 +84,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     if model is not None and not contents.named:
         columns = _by_order(columns, model)
     elif model is not None:
-        columns = _actions_left(columns, len(model.actuators))
+        columns = _actions_left(columns, contents, len(model.actuators))
     columns, pairs = _without_strangers(columns, contents, _pairs(columns))
     found = {} if model is None else _coordinates(columns, pairs, model)
     units = {column.name: column.unit for column in columns}
@@ -144,9 +144,11 @@ def _by_order(columns: Sequence[Guess], model: Coordinates) -> list[Guess]:
     return [Guess(*parts, note=note) for parts in zip(names, kinds, units, names, strict=True)]
 
 
-def _actions_left(columns: Sequence[Guess], number: int) -> list[Guess]:
+def _actions_left(columns: Sequence[Guess], contents: Contents, number: int) -> list[Guess]:
     """The columns that nothing recognised as actions, if there are as many as actuators and no other actions."""
+    values = contents.values
     left = [column for column in columns if column.kind == "unknown" and not column.note]
+    left = [column for column in left if may_be_command(column.name, np.asarray(values[column.name]))]
     if len(left) != number or any(column.kind == "action" for column in columns):
         return list(columns)
     note = "not recognised, but as many columns as the model has actuators are left: check role and unit"
@@ -181,7 +183,9 @@ def _coordinates(columns: Sequence[Guess], pairs: Mapping[str, str], model: Coor
     velocity_of = {position: velocity for velocity, position in pairs.items()}
     for position, joint in list(found.items()):
         if f"{joint}_velocity" in model.units:
-            found[velocity_of.get(position, _estimated(position))] = f"{joint}_velocity"
+            found[velocity_of.get(position, _estimated(position, [column.name for column in columns]))] = (
+                f"{joint}_velocity"
+            )
     return found
 
 
@@ -227,16 +231,33 @@ def _without_strangers(
 def _relation(
     velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
 ) -> tuple[float, float] | None:
-    """Correlation of displacements over some rows with the integral of a velocity, and their ratio; None if at rest."""
+    """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
     name = pairs.get(velocity.name, "")
     position, values, time = contents.values.get(name), contents.values.get(velocity.name), _time(contents)
     if position is None or values is None or time is None:
         return None
     if _is_wrapped(position, units[name]):
         position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
-    rows = min(_SPAN, len(time) - 1)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
-    moved, expected = position[rows:] - position[:-rows], integral[rows:] - integral[:-rows]
+    steps, moved = np.diff(time), np.diff(position)
+    expected = 0.5 * (values[1:] + values[:-1]) * steps
+    usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved), 0.95)
+    good = (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
+    found = [_correlation(moved, expected, good, rows) for rows in _SPANS if rows < len(time)]
+    return max((one for one in found if one is not None), key=lambda one: abs(one[0]), default=None)
+
+
+def _correlation(moved: np.ndarray, expected: np.ndarray, good: np.ndarray, rows: int) -> tuple[float, float] | None:
+    """Correlation of displacements over some rows with those expected, and their ratio; None where nothing moves."""
+    bad = np.concatenate([[0], np.cumsum(~good)])
+    whole = bad[rows:] == bad[:-rows]
+    sums = (np.concatenate([[0.0], np.cumsum(each)]) for each in (moved, expected))
+    moved, expected = ((each[rows:] - each[:-rows])[whole] for each in sums)
+    if len(moved) < 3:
+        return None
+    level = max(np.abs(moved).max(), 1e-300), max(np.abs(expected).max(), 1e-300)
+    moved, expected = moved - moved.mean(), expected - expected.mean()
+    if np.abs(moved).max() < 1e-6 * level[0] or np.abs(expected).max() < 1e-6 * level[1]:
+        return None  # a constant velocity has no correlation
     size = np.sqrt((moved @ moved) * (expected @ expected))
     return (float(moved @ expected / size), float(moved @ expected / (expected @ expected))) if size > 0.0 else None
 
@@ -250,8 +271,10 @@ def _time(contents: Contents) -> np.ndarray | None:
     return None
 
 
-def _estimated(position: str) -> str:
-    return f"{position}_velocity"
+def _estimated(position: str, taken: Collection[str]) -> str:
+    """Name of the estimated velocity of a position, that no column of the file has."""
+    name = f"{position}_velocity"
+    return f"{name}_estimated" if name in taken else name
 
 
 def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs: Mapping[str, str]) -> str:
@@ -275,14 +298,16 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
         elif role == "unknown":
             role, note = "ignore", note or "not recognised: observation, action or ignore?"
         unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""
-        if column.kind == "position" and _is_wrapped(contents.values.get(column.name), column.unit):
+        if role in ("observation", "action") and _is_wrapped(contents.values.get(column.name), column.unit):
             unit += ", unwrap: true"
-            note = f"jumps by a turn; {note}"
+            note = f"jumps by a turn; {'check that it begins in the turn of its position; ' * (role == 'action')}{note}"
         comment = f"  # {note}" if note else ""
         lines.append(f'  - {{name: "{column.name}", role: {role}{unit}}}{comment}')
     for column in columns:
         if column.kind == "position" and column.name not in pairs.values():
-            entry = f'name: "{_estimated(column.name)}", role: observation, derivative_of: "{column.name}"'
+            entry = (
+                f'name: "{_estimated(column.name, contents.values)}", role: observation, derivative_of: "{column.name}"'
+            )
             lines.append(f"  - {{{entry}}}  # no such column was found: it is estimated")
     return "\n".join(lines) + "\n"
 

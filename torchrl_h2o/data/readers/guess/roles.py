@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +43,24 @@ _WORDS = {
 _WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
 _SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
+_NO_COMMANDS = (
+    *(
+        "dt",
+        "temp",
+        "temperature",
+        "battery",
+        "humidity",
+        "id",
+        "seq",
+        "index",
+        "count",
+        "error",
+        "err",
+        "mode",
+        "state",
+    ),
+    *("status", "acc", "acceleration", "accel", "imu", "mag"),
+)
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 _LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 
@@ -114,12 +132,21 @@ def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str,
 
 def _kind(words: list[str], numbers: np.ndarray) -> str:
     fits = {kind for kind, known in _WORDS.items() if any(word in known for word in words)}
+    if "".join(words) in _VOLTS:  # V_in
+        return "action"
     if "time" in fits and not ((np.diff(numbers) >= 0).mean() > 0.9 and np.ptp(numbers) > 0):
         fits.remove("time")
     if fits & {"desired", "command"}:
         motion = () if any(word in _FORCES for word in words) else ("velocity", "position")
         return next((f"desired {kind}" for kind in motion if kind in fits), "action")
     return next((kind for kind in _WORDS if kind in fits), "unknown")
+
+
+def may_be_command(name: str, values: np.ndarray) -> bool:
+    """Whether a column of which nothing else is known may hold the commands of an actuator: it goes up and down."""
+    words, steps = _words(name), np.diff(values)
+    known = any(word in _NO_COMMANDS or word.startswith("dd") or word.endswith("ddot") for word in words)
+    return not known and bool((steps > 0).any() and (steps < 0).any() and np.ptp(np.sign(values)) > 0)
 
 
 def is_force(name: str) -> bool:
@@ -182,7 +209,7 @@ def _unit_of_time(numbers: np.ndarray, unit: str | None) -> tuple[str, str, str]
     return unit, "", f"check: the median step is {step:.4g}, which is {seconds:.4g} s{rate}"
 
 
-def _unit_of(kind: str, si: str | None, words: Iterable[str], numbers: np.ndarray) -> tuple[str, str]:
+def _unit_of(kind: str, si: str | None, words: list[str], numbers: np.ndarray) -> tuple[str, str]:
     unit, largest = si or _SI.get(kind, "1"), float(np.abs(numbers).max())
     if si is not None and (kind != "position" or si != "rad"):
         return unit, f"check the unit: the largest value is {largest:.3g}"
@@ -193,7 +220,8 @@ def _unit_of(kind: str, si: str | None, words: Iterable[str], numbers: np.ndarra
         )
     if kind == "action":
         units = {"A": ("current",), "N": ("force",), "V": _VOLTS}
-        unit = next((unit for unit, known in units.items() if any(word in known for word in words)), "N·m")
+        spelled = [*words, "".join(words)]
+        unit = next((unit for unit, known in units.items() if any(word in known for word in spelled)), "N·m")
     elif kind not in _SI:
         return unit, ""
     elif si is None and any(word in _LENGTHS for word in words):
