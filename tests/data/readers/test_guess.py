@@ -185,8 +185,9 @@ RANDOM = np.random.default_rng(0)
         (TIME, ANGLE + RESETS, 4.0 * np.cos(TIME)),
         (TIME + 60.0 * (TIME > 7.0), ANGLE, 4.0 * np.cos(TIME)),
         (TIME, ANGLE + 0.01 * RANDOM.standard_normal(1500), 4.0 * np.cos(TIME) + 0.5),
+        (TIME, 0.01 * RANDOM.standard_normal(1500), RANDOM.standard_normal(1500)),
     ],
-    ids=["a period of 25 rows, biased", "resets", "a gap", "noise and bias"],
+    ids=["a period of 25 rows, biased", "resets", "a gap", "noise and bias", "at rest"],
 )
 def test_a_sound_velocity_is_kept(tmp_path, time, position, velocity):
     assert "derivative_of" not in guessed(tmp_path, "time,q,qdot,tau", [time, position, velocity, COMMAND])

@@ -16,6 +16,7 @@ JUMP = 0.5  # share of the median step by which a step must differ for the run t
 UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the steps differ from the median by this share
 
 _SPANS = (1, 3, 10, 25, 60)  # rows over which displacements are compared with a velocity; the best span counts
+_MOVES = 3.0  # times by which displacements over some rows exceed those over one row where a joint moves
 _RELATED = 0.5  # correlation of both below which the column is not that velocity
 
 
@@ -183,9 +184,8 @@ def _coordinates(columns: Sequence[Guess], pairs: Mapping[str, str], model: Coor
     velocity_of = {position: velocity for velocity, position in pairs.items()}
     for position, joint in list(found.items()):
         if f"{joint}_velocity" in model.units:
-            found[velocity_of.get(position, _estimated(position, [column.name for column in columns]))] = (
-                f"{joint}_velocity"
-            )
+            estimated = _estimated(position, [column.name for column in columns])
+            found[velocity_of.get(position, estimated)] = f"{joint}_velocity"
     return found
 
 
@@ -234,7 +234,7 @@ def _relation(
     """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
     name = pairs.get(velocity.name, "")
     position, values, time = contents.values.get(name), contents.values.get(velocity.name), _time(contents)
-    if position is None or values is None or time is None:
+    if position is None or values is None or time is None or len(time) < 3:
         return None
     if _is_wrapped(position, units[name]):
         position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
@@ -242,7 +242,10 @@ def _relation(
     expected = 0.5 * (values[1:] + values[:-1]) * steps
     usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved), 0.95)
     good = (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
-    found = [_correlation(moved, expected, good, rows) for rows in _SPANS if rows < len(time)]
+    spans = [rows for rows in _SPANS if rows < len(time)]
+    if max(np.std(position[rows:] - position[:-rows]) for rows in spans) < _MOVES * np.std(moved):
+        return None  # noise of a joint at rest does not grow with the span
+    found = [_correlation(moved, expected, good, rows) for rows in spans]
     return max((one for one in found if one is not None), key=lambda one: abs(one[0]), default=None)
 
 
