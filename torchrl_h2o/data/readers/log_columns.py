@@ -36,12 +36,13 @@ class Column:
             is estimated, in SI; see :func:`~torchrl_h2o.data.readers.velocity.estimate_velocity`.
 
     Example:
+        >>> import numpy as np
         >>> from torchrl_h2o.data import Column
         >>> Column("pitch", "observation", unit="deg").factor
         0.017453292519943295
         >>> pole = Column("pole", "observation", unit="deg", offset=3.1416, unwrap=True)  # hangs at 0 in the model
-        >>> pole.in_si(np.array([170.0, -170.0])).round(2).tolist()
-        [6.11, 6.46]
+        >>> pole.in_si(np.array([140.0, 150.0, 160.0, 170.0, 180.0, -170.0])).round(2).tolist()
+        [5.59, 5.76, 5.93, 6.11, 6.28, 6.46]
     """
 
     name: str

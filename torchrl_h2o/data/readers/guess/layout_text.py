@@ -75,7 +75,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         <BLANKLINE>
           - {name: "t", role: time, unit: "s"}  # check: the median step is 0.01, which is 0.01 s, 100 Hz
           - {name: "hip", role: observation, unit: "rad"}  # check the unit: the largest value is 0.02
-          - {name: "hip_vel", role: observation, unit: "rad/s"}  # slope of hip: 1 times this; check ...
+          - {name: "hip_vel", role: observation, unit: "rad/s"}  # check the unit: the largest value is 1
           - {name: "tau", role: action, unit: "N·m"}  # check the unit: the largest value is 0
         <BLANKLINE>
     """
