@@ -93,9 +93,7 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     reversed_ones = _reversed(response, settings)
     if reversed_ones:
         return reversed_ones
-    actions = response.limited[response.rows].mean(1)
-    effect = response.by_action * actions[:, None]
-    target, nuisance = response.target, friction_responses(response)
+    effect, target, nuisance = response.by_gain, response.target, friction_responses(response)
     known = np.isfinite(target).all(1) & np.isfinite(effect).all((1, 2))
     if known.sum() < settings.min_windows:
         return []
@@ -103,7 +101,7 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     at_zero = robust_fit(target, np.concatenate([effect, nuisance], -1), response.scale, settings.robust)
     left = target - np.concatenate([effect, nuisance], -1) @ at_zero.values
     weights = robust_weights(left / response.scale, settings.robust)
-    claimed = _share(effect.sum(-1), target, response.scale, weights * known[:, None])
+    claimed = _share(effect.sum(-1), target, response.scale, weights * known.reshape(-1, 1))
     if claimed < settings.action_matters:
         return []
     lags, explained, fits = _over_lags(response, target, nuisance, base, settings)
@@ -179,7 +177,7 @@ def friction_dominates(response: Response, settings: AuditSettings) -> bool:
     the motion, and the fit trades the gain of a motor against friction. Constant forces and gravity, which a motor may
     have to hold, are no friction: they are taken out first.
     """
-    effect = (response.by_action * response.limited[response.rows].mean(1)[:, None]).sum(-1)
+    effect = response.by_gain.sum(-1)
     dry, viscous, constant = np.split(friction_responses(response), 3, axis=-1)
     held = np.concatenate([constant, response.by_zero], -1)
     with_friction = np.concatenate([held, dry, viscous], -1)
@@ -282,8 +280,7 @@ def _gains(response: Response, found: Fit, settings: AuditSettings) -> list[Find
 
 def _sizes(response: Response) -> np.ndarray:
     """Usual size of each action's effect in the simulator, in usual changes of the velocities, (nu,)."""
-    actions = response.limited[response.rows].mean(1)
-    effect = np.abs(response.by_action * actions[:, None]) / response.scale[:, None]
+    effect = np.abs(response.by_gain) / response.scale[:, None]
     return np.nanmedian(effect.max(1), axis=0)
 
 

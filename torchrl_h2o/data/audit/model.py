@@ -12,7 +12,8 @@ from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
-from torchrl_h2o.data.audit.zeros import check_large_zeros, check_small_zeros, percent, unexplained
+from torchrl_h2o.data.audit.unexplained import percent, unexplained
+from torchrl_h2o.data.audit.zeros import check_large_zeros, check_small_zeros
 
 CHECK = "model"
 Change = Callable[[np.ndarray], np.ndarray]

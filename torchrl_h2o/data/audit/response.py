@@ -195,6 +195,11 @@ class Response:
         return np.moveaxis(reached - self.before - self.simulated, 0, -1) / steps[:, None]
 
     @cached_property
+    def by_gain(self) -> np.ndarray:
+        """Derivative of the change by the gain of each action, (W, m, nu)."""
+        return self.by_action * self.limited[self.rows].mean(1)[:, None]
+
+    @cached_property
     def by_force(self) -> np.ndarray:
         """Derivative of the change by a constant force on each pair's degree of freedom, (W, m, pairs)."""
         pairs, nv = self.log.pairs, self.simulation.model.nv

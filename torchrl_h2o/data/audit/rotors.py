@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
-from torchrl_h2o.data.audit.zeros import unexplained
+from torchrl_h2o.data.audit.unexplained import unexplained
 
 
 def with_rotors(response: Response, settings: AuditSettings) -> Response:

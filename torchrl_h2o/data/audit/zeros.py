@@ -13,6 +13,7 @@ from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.regression import robust_fit
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
+from torchrl_h2o.data.audit.unexplained import percent, unexplained
 
 CHECK = "model"
 _GRIDS = ((30.0, 180.0), (5.0, 30.0), (1.0, 5.0))  # steps and half widths of successive grids of shifts, in degrees
@@ -119,15 +120,17 @@ def _finding(
 
 def _parts(response: Response, shifts: np.ndarray) -> Iterator[tuple[slice, float]]:
     """Rows and shift of each part of the log; a part begins with its first window, or with its run."""
-    runs = response.log.run[response.starts]
-    begins = np.flatnonzero(np.append(True, (np.diff(shifts) != 0.0) | (np.diff(runs) != 0)))
-    first = [int(response.starts[i]) if i and runs[i] == runs[i - 1] else None for i in begins]
+    starts, runs = response.starts, response.log.run[response.starts]
     of_run = {int(response.log.run[rows.start]): rows for rows in response.log.runs}
-    for place, begin in enumerate(begins):
-        rows, start = of_run[int(runs[begin])], first[place]
-        following = first[place + 1] if place + 1 < len(begins) else None
-        stop = rows.stop if following is None else following
-        yield slice(rows.start if start is None else start, stop), float(shifts[begin])
+    for part in _equal(shifts, runs):
+        run, first, after = int(runs[part.start]), part.start, part.stop
+        begins = first == 0 or runs[first - 1] != run
+        ends = after == len(runs) or runs[after] != run
+        rows = of_run[run]
+        yield (
+            slice(rows.start if begins else int(starts[first]), rows.stop if ends else int(starts[after])),
+            shifts[first],
+        )
 
 
 def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, settings: AuditSettings) -> np.ndarray:
@@ -213,21 +216,6 @@ def _errors(response: Response) -> np.ndarray:
     return np.minimum(np.where(np.isfinite(share), share, 3.0), 3.0).mean(1)
 
 
-def unexplained(response: Response, settings: AuditSettings, windows: np.ndarray | None = None) -> float:
-    """Usual share of the accelerations that no gains, friction, constant forces and small shifts of zeros explain.
-
-    Args:
-        response: simulated windows, to all of which these are fitted.
-        settings: thresholds.
-        windows: mask (W,) of those whose usual share is meant; None for all.
-    """
-    gains = response.by_action * response.limited[response.rows].mean(1)[:, None]
-    responses = np.concatenate([gains, friction_responses(response), response.by_zero], -1)
-    found = robust_fit(response.target, responses, response.scale, settings.robust)
-    left = np.abs(response.target - responses @ found.values)
-    return float(np.mean(np.nanmedian(left if windows is None else left[windows], axis=0) / response.scale))
-
-
 def check_small_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
     """Angles whose zero is shifted a little: fitted beside gains and friction, then confirmed by simulation."""
     pairs = response.log.pairs
@@ -235,8 +223,7 @@ def check_small_zeros(response: Response, settings: AuditSettings) -> list[Findi
     if not angles:
         return []
     others = friction_responses(response)[..., : 2 * len(pairs)]
-    gains = response.by_action * response.limited[response.rows].mean(1)[:, None]
-    responses = np.concatenate([response.by_zero[..., angles], gains, others], -1)
+    responses = np.concatenate([response.by_zero[..., angles], response.by_gain, others], -1)
     found = robust_fit(response.target, responses, response.scale, settings.robust)
     findings = []
     misfit = response.misfit()
@@ -252,8 +239,3 @@ def check_small_zeros(response: Response, settings: AuditSettings) -> list[Findi
             remedy = f"measure the angle's zero, for example at rest; offset: {shift:.3g} in its column corrects it"
             findings.append(Finding(CHECK, "warning", words, None, remedy))
     return findings
-
-
-def percent(share: float) -> str:
-    """A share in words."""
-    return "all" if share >= 0.995 else f"{share:.0%}"

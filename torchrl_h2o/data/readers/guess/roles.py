@@ -44,22 +44,8 @@ _WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a p
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
 _SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
 _NO_COMMANDS = (
-    *(
-        "dt",
-        "temp",
-        "temperature",
-        "battery",
-        "humidity",
-        "id",
-        "seq",
-        "index",
-        "count",
-        "error",
-        "err",
-        "mode",
-        "state",
-    ),
-    *("status", "acc", "acceleration", "accel", "imu", "mag"),
+    *("dt", "temp", "temperature", "battery", "humidity", "id", "seq", "index", "count", "error", "err", "mode"),
+    *("state", "status", "acc", "acceleration", "accel", "imu", "mag"),
 )
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 _LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
