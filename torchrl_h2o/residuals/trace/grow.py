@@ -124,13 +124,15 @@ def _closest(states: Sequence[SearchState]) -> list[SearchState]:
     """The states whose loss comes close to the lowest one, in ascending order of their loss.
 
     The losses are compared with residuals scaled by what the best list leaves. Scaled by their size before the first
-    effect, the residuals would hardly show what the last effect changes.
+    effect, the residuals would hardly show what the last effect changes. Of lists with nearly equal losses, the one
+    with the fewest parameters is kept: one friction for both joints, not the same friction for each.
     """
     rules = states[0].settings.trace
     means = [float(losses.mean()) for losses in _comparable_losses(states)]
-    pairs = sorted(zip(means, states, strict=True), key=lambda pair: (pair[0], _size(pair[1])))
-    near = [pair for pair in pairs if pair[0] <= rules.beam_loss * pairs[0][0]]
-    return [state for _, state in distinct(near, itemgetter(0), rules.same_fit)[: rules.beam_width]]
+    near = [pair for pair in zip(means, states, strict=True) if pair[0] <= rules.beam_loss * min(means)]
+    near.sort(key=lambda pair: (_size(pair[1])[0], pair[0]))
+    kept = sorted(distinct(near, itemgetter(0), rules.same_fit), key=itemgetter(0))
+    return [state for _, state in kept[: rules.beam_width]]
 
 
 def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
