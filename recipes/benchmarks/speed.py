@@ -58,11 +58,13 @@ class CountingSimulation(Simulation):
     def rollout(self, states: np.ndarray, actions: np.ndarray, **options: np.ndarray) -> np.ndarray:
         return self._counted(super().rollout, states, actions, **options)
 
-    def follow(self, states: np.ndarray, actions: np.ndarray, time: np.ndarray) -> np.ndarray:
-        return self._counted(super().follow, states, actions, time)
+    def follow(
+        self, states: np.ndarray, actions: np.ndarray, time: np.ndarray, activations: np.ndarray | None = None
+    ) -> np.ndarray:
+        return self._counted(super().follow, states, actions, time, activations)
 
     def _counted(
-        self, simulate: Callable[..., np.ndarray], states: np.ndarray, actions: np.ndarray, *args: np.ndarray, **options
+        self, simulate: Callable[..., np.ndarray], states: np.ndarray, actions: np.ndarray, *args, **options
     ) -> np.ndarray:
         with self.count.simulating(actions.shape[0] * actions.shape[1]):
             return simulate(states, actions, *args, **options)

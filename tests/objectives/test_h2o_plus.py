@@ -273,6 +273,7 @@ def as_compiled(monkeypatch):
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
 
 
+@pytest.mark.slow
 def test_a_compiled_loss_that_knows_where_the_real_rows_are_is_the_same():
     expected = losses_and_gradients(Parts().h2o_plus(), make_batch(4, 3))
     terms, gradients = losses_and_gradients(Parts().h2o_plus(num_real=4), make_batch(4, 3))
@@ -287,6 +288,7 @@ def without_v(parts, **kwargs):
     return H2OPlusLoss(bellman, ratio_loss=DynamicsRatioLoss(parts.estimator), **kwargs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [Parts.h2o_plus, without_v])
 def test_compiled_losses_are_nan_if_the_real_rows_are_elsewhere_than_promised(build):
     losses, _ = losses_and_gradients(build(Parts(), num_real=5), make_batch(4, 3))

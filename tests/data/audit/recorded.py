@@ -73,6 +73,17 @@ def holding(rows: int = 2000, noise: float = 0.01) -> Measured:
     return measured(rows_seen + noise * rows_seen.std(0) * rng.standard_normal(rows_seen.shape), np.array(action))
 
 
+def pumped(*effects, rows: int = 1500, noise: float = 0.1) -> Measured:
+    """One run of the arm with effects, swung up by torques that follow its noisy velocities, noise in rad/s."""
+    rng, reality, state = np.random.default_rng(0), arm(*effects), np.array([0.3, 0.0, 0.0, 0.0])
+    observed, action = [], []
+    for _ in range(rows + 1):
+        observed.append(state + np.array([0.001, 0.001, noise, noise]) * rng.standard_normal(4))
+        action.append(np.clip(np.array([0.25, 0.06]) * observed[-1][2:], -1.0, 1.0))
+        state = reality.rollout(state[None], action[-1][None, None])[0, 0]
+    return measured(np.array(observed), np.array(action[:-1]))
+
+
 def measured(observed: np.ndarray, action: np.ndarray, time: np.ndarray | None = None) -> Measured:
     """Transitions of one run from rows (T + 1, 4) and actions (T, 2)."""
     rows = len(action)

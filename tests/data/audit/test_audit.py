@@ -14,6 +14,7 @@ from tests.data.audit.recorded import (
     changed,
     holding,
     measured,
+    pumped,
     recording,
     rows_of,
     scaled,
@@ -163,6 +164,13 @@ def test_noise(good, simulation):
 def test_actions_of_another_run(good, simulation):
     other = with_action(good, recording(seed=1).action)
     assert "another run" in severe(other, simulation, "actions")
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.1])
+def test_torques_that_follow_the_velocity_are_not_blamed_for_a_heavier_robot(simulation, noise):
+    """Earlier, their sign was called reversed or they were called 300 ms late: they act as viscous friction does."""
+    found = audit(pumped(BodyMass(2.4), JointFrictionLoss(0.1), noise=noise), simulation)
+    assert [finding for finding in (*found.severe, *found.warnings) if finding.check == "actions"] == []
 
 
 @pytest.mark.parametrize("actuator", [0, 1])

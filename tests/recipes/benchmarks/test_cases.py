@@ -374,6 +374,14 @@ def test_steps_are_counted_in_all_that_is_made_of_a_simulation():
     assert counting.count.seconds > 0.0
 
 
+def test_steps_are_counted_where_coordinates_are_not_observed():
+    """Earlier, each case of the robot whose log lacks the speed of its wheels failed."""
+    simulation, measured = plain("wheel_legged", 0)
+    counting = CountingSimulation.of(simulation)
+    starts = np.arange(7)
+    assert (residuals(counting, measured, starts, 3) == residuals(simulation, measured, starts, 3)).all()
+
+
 def test_families_are_chosen_by_name_and_logs_by_their_folder(tmp_path):
     assert list(choose_families(["nothing", "paper16"])) == ["paper16", "nothing"]
     assert list(choose_families(["nothing"], tmp_path)) == ["nothing", "log_wheel_legged", "log_pendulum"]

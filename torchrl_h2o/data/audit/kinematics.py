@@ -40,7 +40,7 @@ def check_kinematics(
         step: windows of one control step; None if the simulator was not consulted.
         settings: thresholds.
     """
-    found: list[Finding] = []
+    found = _without_velocity(log)
     time_is_wrong = common_factor(derivatives, settings) is not None
     exchanged: set[str] = set()
     for index, derivative in enumerate(derivatives):
@@ -62,6 +62,14 @@ def check_kinematics(
         found += filtered
         found += _bias(log, derivative, step, settings)
     return [*found, *_noisy(log, noise, settings)]
+
+
+def _without_velocity(log: Log) -> list[Finding]:
+    if not log.alone:
+        return []
+    words = f"no velocity is given for {', '.join(log.alone)}: the simulator alone would have to tell it, with all its "
+    remedy = "add a column for each to the description of the log, such as {name: hip_velocity, role: observation, "
+    return [Finding(CHECK, "warning", words + "errors", None, remedy + "derivative_of: hip}")]
 
 
 def _moves(log: Log, pair: Pair) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -107,6 +107,7 @@ class Log:
         pairs: positions with an observed velocity.
         clipped: (T,), transitions with a value at the end of the range that the simulator's own sensors have.
         estimated_std: (n,), errors of columns that were estimated from others, 0 for measured ones; None if none was.
+        alone: names of the positions whose velocity is not observed.
     """
 
     observation: np.ndarray
@@ -122,6 +123,7 @@ class Log:
     pairs: tuple[Pair, ...]
     clipped: np.ndarray
     estimated_std: np.ndarray | None = None
+    alone: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, measured: TensorDictBase | AuditedTransitions, simulation: AuditedSimulation) -> Log:
@@ -162,6 +164,7 @@ class Log:
             find_pairs(state_map, simulation.model),
             clipped,
             estimated_std,
+            positions_alone(state_map, simulation.model),
         )
 
     def __len__(self) -> int:
@@ -194,20 +197,41 @@ def find_pairs(state_map: Any, model: Any) -> tuple[Pair, ...]:
 
     Quaternions have no pairs, and columns that are not single coordinates of the state have none.
     """
+    column, pairs = _single_columns(state_map), []
+    for position, dof, angle in _scalar_coordinates(model):
+        velocity = model.nq + dof
+        if position in column and velocity in column:
+            p, v = column[position], column[velocity]
+            pairs.append(Pair(state_map.names[p], state_map.names[v], p, v, position, dof, angle))
+    return tuple(pairs)
+
+
+def positions_alone(state_map: Any, model: Any) -> tuple[str, ...]:
+    """Names of the observed positions whose velocity is not observed."""
+    column = _single_columns(state_map)
+    return tuple(
+        state_map.names[column[position]]
+        for position, dof, _ in _scalar_coordinates(model)
+        if position in column and model.nq + dof in state_map.hidden
+    )
+
+
+def _single_columns(state_map: Any) -> dict[int, int]:
+    """Column of each coordinate of the state that an observation shows as it is."""
     single = (np.abs(state_map.observe) == 1.0).sum(1) == (state_map.observe != 0.0).sum(1)
     single &= (state_map.observe != 0.0).sum(1) == 1
-    column = {int(np.argmax(row)): i for i, row in enumerate(state_map.observe) if single[i] and row.max() == 1.0}
-    pairs = []
+    return {int(np.argmax(row)): i for i, row in enumerate(state_map.observe) if single[i] and row.max() == 1.0}
+
+
+def _scalar_coordinates(model: Any) -> Iterator[tuple[int, int, bool]]:
+    """Each position that is a number of its own: its index in qpos, that of its velocity in qvel, and if it is a hinge.
+
+    These are hinges, slides, and the three translations of a free joint.
+    """
     for joint in range(model.njnt):
         kind, coordinate, dof = int(model.jnt_type[joint]), int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        # mjtJoint: 0 free (its three translations pair), 1 ball, 2 slide, 3 hinge
-        for axis in range({0: 3, 1: 0}.get(kind, 1)):
-            position, velocity = coordinate + axis, model.nq + dof + axis
-            if position in column and velocity in column:
-                p, v = column[position], column[velocity]
-                names = state_map.names[p], state_map.names[v]
-                pairs.append(Pair(*names, p, v, position, dof + axis, kind == 3))
-    return tuple(pairs)
+        for axis in range({0: 3, 1: 0}.get(kind, 1)):  # mjtJoint: 0 free, 1 ball, 2 slide, 3 hinge
+            yield coordinate + axis, dof + axis, kind == 3
 
 
 def _float64(tensor: Any) -> np.ndarray:

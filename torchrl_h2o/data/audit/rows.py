@@ -47,15 +47,7 @@ def _order(log: Log, settings: AuditSettings) -> list[Finding]:
 
 
 def _repeated(log: Log, settings: AuditSettings) -> list[Finding]:
-    same = (log.following == log.observation).all(1)
-    moving = np.zeros(len(log), bool)
-    for pair in log.pairs:
-        velocity = 0.5 * (log.observation[:, pair.velocity] + log.following[:, pair.velocity])
-        step = _resolution(log.observation[:, pair.position])
-        fast = np.abs(velocity) > settings.moving * log.observation[:, pair.velocity].std()
-        moving |= fast & (np.abs(velocity) * log.dt > 3.0 * step)
-    if not log.pairs:
-        moving[:] = True
+    same, moving = (log.following == log.observation).all(1), _in_motion(log, settings)
     repeated, share = same & moving, (same & moving).sum() / max(1, moving.sum())
     if share <= settings.repeated:
         return []
@@ -69,6 +61,27 @@ def _repeated(log: Log, settings: AuditSettings) -> list[Finding]:
             "over them, or log at the rate of the sensors",
         )
     ]
+
+
+def _in_motion(log: Log, settings: AuditSettings) -> np.ndarray:
+    """Rows in which a joint moves so fast that an equal next reading is no chance, (T,)."""
+    moving = np.zeros(len(log), bool)
+    columns = {pair.position: 0.5 * (log.observation + log.following)[:, pair.velocity] for pair in log.pairs}
+    if not columns:  # each column's own slope, over more rows than are lost together
+        columns = {column: _slope(log, column) for column in range(len(log.names))}
+    for column, velocity in columns.items():
+        fast = np.abs(velocity) > settings.moving * velocity.std()
+        moving |= fast & (np.abs(velocity) * log.dt > 3.0 * _resolution(log.observation[:, column]))
+    return moving
+
+
+def _slope(log: Log, column: int) -> np.ndarray:
+    """Mean slope of a column over rows about each row, per second, (T,); 0 at the ends of runs."""
+    values, slope, half = log.observation[:, column], np.zeros(len(log)), _SLOPE_ROWS // 2
+    middle = np.arange(half, len(log) - half)
+    middle = middle[log.run[middle - half] == log.run[middle + half]]
+    slope[middle] = (values[middle + half] - values[middle - half]) / (2 * half * log.dt)
+    return slope
 
 
 def _duplicates(log: Log, settings: AuditSettings) -> list[Finding]:

@@ -138,9 +138,15 @@ class AuditSettings:
     """Share of this misfit that a cause must leave at most."""
     action_matters: float = 0.15
     """Share of the explained change that must be due to actions before conclusions about them are drawn."""
+    action_shows: float = 0.1
+    """Square of what the actions do in the simulator and friction would not, over that of what stays unexplained, from
+    which conclusions about them are drawn."""
     unrelated: float = 0.05
-    """Share of the variance beyond friction that actions explain at their best lag, below which they belong to another
-    run."""
+    """Share of the variance beyond friction that actions explain at their best lag, below which they may belong to
+    another run."""
+    foreign_significance: float = 3.0
+    """Standard errors by which the gain of all motors together must be below ``gain_warning`` for actions that surely
+    belong to another run."""
     action_lags: tuple[int, int] = (-5, 40)
     """Rows by which actions may act early or late."""
     clear_lag: int = 4
