@@ -3,16 +3,19 @@
 from dataclasses import replace
 
 import hydra
+import mujoco
 import numpy as np
 import pytest
 import torch
 
 from torchrl_h2o.commands.close_the_loop import make_simulation
-from torchrl_h2o.commands.recording import read_recording, split_by_name
+from torchrl_h2o.commands.recording import Recording, read_recording, split_by_name
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.data.readers.observed import words_of_estimates
 from torchrl_h2o.data.readers.ted import to_ted
+from torchrl_h2o.residuals import Simulation, StateMap
 from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.simulation.state_map import coordinate_names
 
 LAYOUT = """
 dt: 0.01
@@ -156,12 +159,12 @@ def test_a_free_motion_has_the_model_s_actuators_at_zero(logs):
     (logs / "log.yaml").write_text("\n".join(line for line in text.splitlines() if "torque" not in line))
     recording, simulation = read("data=logs")
     assert recording.transitions["action"].shape == (57, 0)
-    free = recording.for_model(simulation.model)
+    free = recording.for_simulation(simulation)
     assert free.transitions["action"].shape == (57, 1)
     assert not free.transitions["action"].any()
     assert recording.transitions["action"].shape == (57, 0)
     Measured.from_ted(free.transitions, simulation)
-    assert read("data=logs")[0].for_model(simulation.model).logs == recording.logs
+    assert read("data=logs")[0].for_simulation(simulation).logs == recording.logs
 
 
 def test_an_estimated_velocity_is_part_of_the_recording(logs):
@@ -177,3 +180,22 @@ def test_an_estimated_velocity_is_part_of_the_recording(logs):
     assert words.startswith("not measured but estimated: rate from pivot, with an error of ")
     assert words.count("other from pivot") == words.count("smooth over time") == 1
     torch.testing.assert_close(recording.transitions["observation"][:, 1], torch.full((39,), 300.0), rtol=1e-3, atol=0)
+
+
+def test_quaternions_of_a_tracker_get_a_continuous_sign(tmp_path):
+    body = "<body><freejoint name='root'/><geom size='0.1'/></body>"
+    (tmp_path / "body.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    names, units = coordinate_names(mujoco.MjModel.from_xml_path(str(tmp_path / "body.xml")))
+    state_map = StateMap.of_coordinates(tuple(names), tuple(units), range(13), num_states=13)
+    simulation = Simulation(lambda: mujoco.MjSpec.from_file(str(tmp_path / "body.xml")), 1, state_map)
+    rows = np.random.default_rng(0).standard_normal((6, 13))
+    rows[:, 3:7] = np.array([1.0, 0.2, 0.0, 0.0]) * np.array([1, -1, -1, 1, 1, -1])[:, None]
+    none = np.zeros(5, bool)
+    td = to_ted(
+        observation=rows[:-1], action=np.zeros((5, 0)), next_observation=rows[1:], terminated=none, truncated=none
+    )
+    made = Recording(td, "rows").for_simulation(simulation).transitions
+    assert (made["observation"][:, 3] == 1.0).all()
+    assert (made["next", "observation"][:, 3] == 1.0).all()
+    assert (made["observation"][:, 7:] == td["observation"][:, 7:]).all()
+    assert (td["observation"][:, 3] != 1.0).any()

@@ -80,7 +80,7 @@ def main(cfg: DictConfig) -> None:
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
     simulation = make_simulation(cfg, recording)
-    recording = recording.for_model(simulation.model)
+    recording = recording.for_simulation(simulation)
     report = close_the_loop(
         simulation,
         recording.transitions,

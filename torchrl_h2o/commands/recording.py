@@ -16,10 +16,13 @@ from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDictBase
 
 from torchrl_h2o.data import LogColumns, load, sources_of
+from torchrl_h2o.data.audit.log import find_turning
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
+from torchrl_h2o.data.readers.quaternion_signs import continuous_quaternions
 from torchrl_h2o.data.readers.sources import Source, is_log, names_of, unique, words_of
 from torchrl_h2o.data.readers.units import to_si
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT
+from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.training.real_data import RECORDED
 from torchrl_h2o.training.task import Task
 
@@ -68,12 +71,17 @@ class Recording:
         units = {column.name: to_si(column.unit)[0] for column in self.columns.columns}
         return tuple(units[name] for name in self.columns.action)
 
-    def for_model(self, model: mujoco.MjModel) -> Recording:
-        """Returns the recording of a free motion with the model's actuators at zero; any other recording unchanged."""
-        if self.columns is None or not self.columns.free_motion:
-            return self
-        transitions = self.transitions.clone(recurse=False)
-        transitions["action"] = torch.zeros(len(transitions), model.nu)
+    def for_simulation(self, simulation: Simulation) -> Recording:
+        """Returns the recording as a simulation has it.
+
+        A free motion gets the model's actuators at zero. Quaternions get a continuous sign, which is the same rotation.
+        """
+        model, transitions = simulation.model, self.transitions.clone(recurse=False)
+        if self.columns is not None and self.columns.free_motion:
+            transitions["action"] = torch.zeros(len(transitions), model.nu)
+        if transitions["observation"].shape[-1] == len(simulation.state_map.names):
+            for body in find_turning(simulation.state_map, model):
+                transitions = continuous_quaternions(transitions, body.quaternion)
         return replace(self, transitions=transitions)
 
     def coordinates(self, chosen: Mapping[str, str] | Sequence[str] | None) -> Mapping[str, str] | list[str]:

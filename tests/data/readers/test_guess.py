@@ -190,3 +190,67 @@ RANDOM = np.random.default_rng(0)
 )
 def test_a_sound_velocity_is_kept(tmp_path, time, position, velocity):
     assert "derivative_of" not in guessed(tmp_path, "time,q,qdot,tau", [time, position, velocity, COMMAND])
+
+
+FREE = ("root_x", "root_y", "root_z", "root_qw", "root_qx", "root_qy", "root_qz")
+FREE_VELOCITIES = ("root_x", "root_y", "root_z", "root_roll", "root_pitch", "root_yaw")
+DRONE = Coordinates(
+    dict(zip(FREE, ["m"] * 3 + ["1"] * 4, strict=True))
+    | {f"{name}_velocity": "m/s" if name[-1] in "xyz" else "rad/s" for name in FREE_VELOCITIES},
+    ["thrust"],
+)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz"),
+        (
+            *(f"pose.position.{axis}" for axis in "xyz"),
+            *(f"pose.orientation.{axis}" for axis in "wxyz"),
+            *(f"twist.linear.{axis}" for axis in "xyz"),
+            *(f"twist.angular.{axis}" for axis in "xyz"),
+        ),
+        (
+            *(f"pos_{axis}" for axis in "xyz"),
+            *(f"quat_{axis}" for axis in "wxyz"),
+            *(f"{axis}_dot" for axis in "xyz"),
+            *(f"gyro_{axis}" for axis in "xyz"),
+        ),
+    ],
+)
+def test_columns_of_a_free_body_are_assigned_to_the_coordinates_of_a_free_joint(tmp_path, names):
+    """Earlier, the quaternion and the velocities of a drone were columns to ignore."""
+    time = 0.01 * np.arange(50)
+    rows = np.zeros((50, 15))
+    rows[:, 0], rows[:, 1], rows[:, 4], rows[:, 8], rows[:, 14] = (
+        time,
+        np.sin(time),
+        1.0,
+        np.cos(time),
+        np.sin(9 * time),
+    )
+    header = ",".join(("t", *names, "thrust"))
+    np.savetxt(tmp_path / "fly.csv", rows, delimiter=",", header=header, comments="")
+    guessed = guess_layout(tmp_path / "fly.csv", DRONE)
+    expected = dict(zip(names, DRONE.units, strict=True))
+    assert guessed.coordinates == {name: other for name, other in expected.items() if name != other}
+    assert guessed.text.count("role: observation") == 13
+    assert "expected in the axes of the body, as a gyroscope measures it" in guessed.text
+
+
+def test_of_a_free_body_without_velocities_the_translation_s_are_estimated(tmp_path):
+    rows = np.zeros((50, 8))
+    rows[:, 0], rows[:, 4] = 0.01 * np.arange(50), 1.0
+    names = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    np.savetxt(tmp_path / "fly.csv", rows, delimiter=",", header=",".join(("t", *names)), comments="")
+    guessed = guess_layout(tmp_path / "fly.csv", DRONE)
+    assert guessed.text.count("derivative_of") == 3
+    assert guessed.coordinates["z_velocity"] == "root_z_velocity"
+
+
+def test_four_numbers_that_are_no_unit_quaternion_are_not_assigned(tmp_path):
+    names = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    rows = np.column_stack([0.01 * np.arange(50), np.full((50, 7), 2.0)])
+    np.savetxt(tmp_path / "fly.csv", rows, delimiter=",", header=",".join(("t", *names)), comments="")
+    assert "root_qw" not in guess_layout(tmp_path / "fly.csv", DRONE).coordinates.values()

@@ -9,6 +9,7 @@ import numpy as np
 from torchrl_h2o.data.audit.derivative import Derivative, deviation, related, steps_of, windowed
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import Log, Pair
+from torchrl_h2o.data.audit.orientation import check_orientation
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
 from torchrl_h2o.data.audit.time import common_factor
@@ -40,7 +41,7 @@ def check_kinematics(
         step: windows of one control step; None if the simulator was not consulted.
         settings: thresholds.
     """
-    found = _without_velocity(log)
+    found = [*_without_velocity(log), *check_orientation(log, settings)]
     time_is_wrong = common_factor(derivatives, settings) is not None
     exchanged: set[str] = set()
     for index, derivative in enumerate(derivatives):

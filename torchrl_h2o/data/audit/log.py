@@ -89,6 +89,25 @@ class Pair:
         return "rad" if self.angle else "m"
 
 
+@dataclass(frozen=True)
+class Turning:
+    """The columns of a body that turns about any axis: of a free joint or a ball joint whose quaternion is observed.
+
+    Args:
+        name: name of the joint.
+        quaternion: columns of w, x, y and z.
+        rates: columns of the angular velocities; empty if one of them is not observed.
+        place: columns of a free joint's place; empty if one is not observed.
+        velocity: columns of its velocity; empty if one is not observed.
+    """
+
+    name: str
+    quaternion: tuple[int, ...]
+    rates: tuple[int, ...]
+    place: tuple[int, ...] = ()
+    velocity: tuple[int, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Log:
     """Measured transitions and the meaning of their columns.
@@ -108,6 +127,7 @@ class Log:
         clipped: (T,), transitions with a value at the end of the range that the simulator's own sensors have.
         estimated_std: (n,), errors of columns that were estimated from others, 0 for measured ones; None if none was.
         alone: names of the positions whose velocity is not observed.
+        turning: bodies whose quaternion is observed.
     """
 
     observation: np.ndarray
@@ -124,6 +144,7 @@ class Log:
     clipped: np.ndarray
     estimated_std: np.ndarray | None = None
     alone: tuple[str, ...] = ()
+    turning: tuple[Turning, ...] = ()
 
     @classmethod
     def of(cls, measured: TensorDictBase | AuditedTransitions, simulation: AuditedSimulation) -> Log:
@@ -165,6 +186,7 @@ class Log:
             clipped,
             estimated_std,
             positions_alone(state_map, simulation.model),
+            find_turning(state_map, simulation.model),
         )
 
     def __len__(self) -> int:
@@ -214,6 +236,27 @@ def positions_alone(state_map: Any, model: Any) -> tuple[str, ...]:
         for position, dof, _ in _scalar_coordinates(model)
         if position in column and model.nq + dof in state_map.hidden
     )
+
+
+def find_turning(state_map: Any, model: Any) -> tuple[Turning, ...]:
+    """The bodies on free joints and ball joints whose quaternion is observed."""
+    column, found = _single_columns(state_map), []
+
+    def columns(first: int, number: int) -> tuple[int, ...]:
+        observed = tuple(column[index] for index in range(first, first + number) if index in column)
+        return observed if len(observed) == number else ()
+
+    for joint in range(model.njnt):
+        kind, position = int(model.jnt_type[joint]), int(model.jnt_qposadr[joint])
+        velocity = model.nq + int(model.jnt_dofadr[joint])
+        if kind > 1:  # mjtJoint: 0 free, 1 ball
+            continue
+        places = (columns(position, 3), columns(velocity, 3)) if kind == 0 else ((), ())
+        shift = 3 if kind == 0 else 0
+        if quaternion := columns(position + shift, 4):
+            name = model.joint(joint).name or f"joint_{joint}"
+            found.append(Turning(name, quaternion, columns(velocity + shift, 3), *places))
+    return tuple(found)
 
 
 def _single_columns(state_map: Any) -> dict[int, int]:

@@ -100,6 +100,13 @@ class AuditSettings:
     bias_warning: float = 0.3
     """Constant error of a velocity, in spreads of the velocity, from which a warning is given."""
 
+    quaternion_norm: float = 0.05
+    """Distance of a quaternion's norm from 1 from which it is none."""
+    turned: float = 0.2
+    """Share of a body's rotations or displacements that its velocities leave unexplained, from which they are wrong."""
+    better_orientation: float = 0.5
+    """Share of this misfit that another meaning of the columns must leave at most."""
+
     # model and actions
     windows: int = 300
     """Windows that are simulated."""

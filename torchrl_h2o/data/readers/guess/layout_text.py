@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
+from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body
 from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
 from torchrl_h2o.data.readers.units import to_si
 
@@ -81,13 +82,15 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     """
     contents = read_contents(path)
     columns = guess_columns(contents.values, None if model is None else model.quantities)
+    body = FreeBody(columns, {}) if model is None else free_body(columns, contents.values, list(model.units))
+    columns = body.columns
     columns = _one_set(_servo_commands(columns) if model is not None and model.servos else columns)
     if model is not None and not contents.named:
         columns = _by_order(columns, model)
     elif model is not None:
         columns = _actions_left(columns, contents, len(model.actuators))
     columns, pairs = _without_strangers(columns, contents, _pairs(columns))
-    found = {} if model is None else _coordinates(columns, pairs, model)
+    found = {} if model is None else _coordinates(columns, pairs, model, body.coordinates)
     units = {column.name: column.unit for column in columns}
     columns = [_checked(column, contents, pairs, found, model, units) for column in columns]
     return GuessedLayout(
@@ -170,10 +173,13 @@ def _pairs(columns: Sequence[Guess]) -> dict[str, str]:
     return pairs | (dict(zip(alone, rest, strict=True)) if len(alone) == len(rest) else {})
 
 
-def _coordinates(columns: Sequence[Guess], pairs: Mapping[str, str], model: Coordinates) -> dict[str, str]:
+def _coordinates(
+    columns: Sequence[Guess], pairs: Mapping[str, str], model: Coordinates, of_body: Mapping[str, str]
+) -> dict[str, str]:
     """Return the coordinate of each position and velocity, also of the velocities that are to be estimated."""
-    joints = [name for name in model.units if not name.endswith("_velocity")]
-    positions = [column.name for column in columns if column.kind == "position"]
+    taken = set(of_body.values())
+    joints = [name for name in model.units if not name.endswith("_velocity") and name not in taken]
+    positions = [column.name for column in columns if column.kind == "position" and column.name not in of_body]
     found: dict[str, str] = {}
     for joint in sorted(joints, key=len, reverse=True):
         like = [name for name in positions if joint.lower() in name.lower() and name not in found]
@@ -181,6 +187,7 @@ def _coordinates(columns: Sequence[Guess], pairs: Mapping[str, str], model: Coor
             found[min(like, key=len)] = joint
     if not found and len(positions) == len(joints):
         found = dict(zip(positions, joints, strict=True))
+    found |= of_body
     velocity_of = {position: velocity for velocity, position in pairs.items()}
     for position, joint in list(found.items()):
         if f"{joint}_velocity" in model.units:
@@ -294,7 +301,7 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
     lines += _clock(_time(contents))
     lines.append("columns:")
     for column in columns:
-        role = {"position": "observation", "velocity": "observation"}.get(column.kind, column.kind)
+        role = "observation" if column.kind in ("position", "velocity", ORIENTATION, RATE) else column.kind
         note = column.note
         if role.startswith("desired"):
             role, note = "ignore", f"a {role}; the role is action if the model's actuators are servos"

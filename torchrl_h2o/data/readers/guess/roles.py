@@ -105,7 +105,7 @@ def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str,
     if numbers is None:
         return Guess(name, "unknown", note="not numbers")
     plain, unit = _without_unit(name)
-    words = _words(plain)
+    words = words_of(plain)
     kind, si = known.get(_letters(plain), (_kind(words, numbers), None))
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
     if kind == "time":
@@ -130,27 +130,27 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
 
 def may_be_command(name: str, values: np.ndarray) -> bool:
     """Whether a column of which nothing else is known may hold the commands of an actuator: it goes up and down."""
-    words, steps = _words(name), np.diff(values)
+    words, steps = words_of(name), np.diff(values)
     known = any(word in _NO_COMMANDS or word.startswith("dd") or word.endswith("ddot") for word in words)
     return not known and bool((steps > 0).any() and (steps < 0).any() and np.ptp(np.sign(values)) > 0)
 
 
 def is_force(name: str) -> bool:
     """Whether a column's name is that of a force, a torque or a current."""
-    return any(word in _FORCES for word in _words(name))
+    return any(word in _FORCES for word in words_of(name))
 
 
 def _is_supply(guess: Guess, values: Mapping[str, np.ndarray | None]) -> bool:
     """Whether a voltage has one sign and hardly changes."""
     numbers = values[guess.name]
     finite = np.zeros(0) if numbers is None else numbers[np.isfinite(numbers)]
-    if not len(finite) or not any(word in _VOLTS for word in _words(guess.name)):
+    if not len(finite) or not any(word in _VOLTS for word in words_of(guess.name)):
         return False
     least, most = np.quantile(np.abs(finite), (0.05, 0.95))
     return bool(np.ptp(np.sign(finite)) == 0 and least > (1.0 - _STEADY) * most)
 
 
-def _words(name: str) -> list[str]:
+def words_of(name: str) -> list[str]:
     """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2."""
     words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
     return [part for word in words for part in _derivative(word)]
