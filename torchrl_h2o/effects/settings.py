@@ -17,6 +17,7 @@ class EffectSettings:
             to the y axis.
         large_factor: factor beyond which a wrong property of the model is surprising; see
             :func:`~torchrl_h2o.effects.catalogue.plausibility.surprise`.
+        late: delay or time constant of a drive or a sensor, in s, beyond which it is surprising.
         inertia_change: relative change of a body's inertia above which a geom contributes to it.
     """
 
@@ -27,6 +28,7 @@ class EffectSettings:
     aligned: float = 1e-3
     inertia_change: float = 1e-9
     large_factor: float = 2.0
+    late: float = 0.3
 
 
 EFFECT_SETTINGS = EffectSettings()

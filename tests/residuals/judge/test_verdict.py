@@ -184,3 +184,17 @@ def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques
     rotor = of(Armature(0.1, "elbow"))
     assert not rotor.recommended
     assert any("is missing in the measured motion of elbow" in reason for reason in rotor.reasons)
+
+
+def test_effects_whose_value_the_data_leave_open_are_not_recommended():
+    effect = JointFrictionLoss(0.1)
+    measured = recorded(SIMULATION.with_effects(effect), 1500)
+    mended = SIMULATION.with_effects(effect)
+    error = error_summary(SIMULATION, mended, measured)
+    plain, left_open = (
+        reach_verdict(SIMULATION, mended, measured, (effect,), error, TwoSample(0.9, 0.5), undetermined=reasons)
+        for reasons in ((), ("'friction' is not determined by the data",))
+    )
+    assert plain.recommended
+    assert not left_open.recommended
+    assert "'friction' is not determined by the data" in left_open.reasons

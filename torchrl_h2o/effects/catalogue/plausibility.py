@@ -29,6 +29,8 @@ USUAL = (
     ObservationDelay,
     ObservationBias,
 )
+#: lateness of drives and sensors, in s
+LATE = (ActionDelay, ActionLag, ObservationDelay)
 #: known without a measurement
 KNOWN = (Gravity, Timestep)
 
@@ -38,11 +40,12 @@ def surprise(effect: Effect, settings: EffectSettings = EFFECT_SETTINGS) -> int:
 
     Friction, damping, rotor inertia, delays and offsets are usual; a wrong mass, length or motor constant is less so,
     and a different gravity or time step is an error of the model. A property that differs by a large factor, and
-    friction, damping or rotor inertia below those of the model, count one more.
+    friction, damping or rotor inertia below those of the model, count one more, and so does a drive or a sensor that is
+    so late that it does next to nothing.
 
     Args:
         effect: the effect at its fitted value.
-        settings: factor beyond which a property differs by a lot.
+        settings: factor beyond which a property differs by a lot, and lateness that is surprising.
 
     Examples:
         >>> from torchrl_h2o.effects import ActionGain, Armature, Gravity
@@ -53,6 +56,8 @@ def surprise(effect: Effect, settings: EffectSettings = EFFECT_SETTINGS) -> int:
     for parameter in effect.parameters.values():
         if parameter.neutral == 1.0 and parameter.value > 0.0:
             far = abs(math.log(parameter.value)) > math.log(settings.large_factor)
+        elif isinstance(effect, LATE):
+            far = parameter.value > settings.late
         else:
             far = isinstance(effect, USUAL[:4]) and parameter.value < 0.0
         rank += far

@@ -42,28 +42,46 @@ def headline_horizon(
     return chosen
 
 
-def headline_error(simulation: Simulation, mended: Simulation, measured: Measured, steps: int) -> HeadlineError:
+def headline_error(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    steps: int,
+    settings: JudgeSettings = DEFAULTS.judge,
+) -> HeadlineError:
     """The median error some steps ahead of the quantity in which it is largest, in units of the quantity's spread.
 
-    A position is preferred to a velocity, because it is easier to picture.
+    A position is preferred to a velocity, because it is easier to picture. Quantities whose error is that of their
+    sensor, such as the angle of a body that does not turn, are left out if there are others.
 
     Args:
         simulation: the simulator before effects are put in.
         mended: the simulator with them.
         measured: the data.
         steps: control steps ahead.
+        settings: what counts as more than noise.
     """
     starts = measured.reported_on(steps)
     before, after = (_median(which, measured, starts, steps) for which in (simulation, mended))
     names, units = simulation.state_map.names, simulation.state_map.units
     spread = np.maximum(measured.observation.std(0), 1e-12)
     positions = np.array([unit not in VELOCITY_UNITS for unit in units])
-    if not positions.any():
-        positions[:] = True
-    index = int(np.where(positions, before / spread, -1.0).argmax())
+    beyond_noise = _beyond_noise(simulation, measured, steps, settings)
+    choices = (positions & beyond_noise, beyond_noise, positions, np.ones_like(positions))
+    chosen = next(which for which in choices if which.any())
+    index = int(np.where(chosen, before / spread, -1.0).argmax())
     return HeadlineError(
         names[index], units[index], steps * simulation.control_step, float(before[index]), float(after[index])
     )
+
+
+def _beyond_noise(simulation: Simulation, measured: Measured, steps: int, settings: JudgeSettings) -> np.ndarray:
+    """Quantities whose error, on the part of the data for fits, clearly exceeds what sensor noise causes, (n,)."""
+    sensor_std, starts = sensor_noise(simulation, measured), thinned(measured.fitted(steps), settings.noise_windows)
+    if sensor_std is None or not len(starts):
+        return np.ones(len(simulation.state_map.names), bool)
+    ratio = error_over_noise(simulation, measured, starts, steps, sensor_std, np.random.default_rng(0))
+    return ratio > settings.headline_least
 
 
 def _median(simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:

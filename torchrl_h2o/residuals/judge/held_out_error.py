@@ -41,7 +41,7 @@ def error_summary(
         floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
         per_dimension=tuple(map(DimensionError, names, units, *columns)),
         horizons=_horizons(simulation, mended, measured, settings),
-        headline=None if ahead is None else headline_error(simulation, mended, measured, ahead),
+        headline=None if ahead is None else headline_error(simulation, mended, measured, ahead, settings),
     )
 
 

@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.judge.separation import difference_between, separated
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.undetectable import undetectable_effects
+from torchrl_h2o.residuals.judge.undetermined import undetermined_values
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -113,7 +114,8 @@ def judge(
     # random effects are drawn in the two-sample test
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
     rejected, failures = _rejected(simulation, measured, explanation, settings)
-    verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings)
+    undetermined = undetermined_values(explanation.parts, simulation.names)
+    verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings, undetermined)
     if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None:
         too_few = too_few_rows(simulation, measured, rejected, error, explanation.trace.loss, settings.verdict)
         verdict = replace(verdict, too_few=too_few)

@@ -18,6 +18,8 @@ class JudgeSettings:
     """Times ahead, in s, from which that of the report's sentence is chosen."""
     headline_windows: int = 8
     """Smallest number of held-out windows for such a time."""
+    headline_least: float = 1.5
+    """Median error over that by noise alone from which a quantity may be the sentence's."""
     headline_stands_out: float = 3.0
     """Median error over the median error by sensor noise at which the sentence's time is chosen."""
     noise_windows: int = 100

@@ -43,6 +43,7 @@ def reach_verdict(
     error: ErrorSummary,
     two_sample: TwoSample,
     settings: LoopSettings = DEFAULTS,
+    undetermined: Sequence[str] = (),
 ) -> Verdict:
     """Reaches a verdict from the part of the data that neither a fit nor a choice has used.
 
@@ -58,6 +59,7 @@ def reach_verdict(
         error: errors before and after.
         two_sample: AUC of the classifier before and after.
         settings: thresholds.
+        undetermined: reasons against effects whose value the data leave open.
     """
     rules = settings.verdict
     with_noise = simulation.with_effects(*effects)
@@ -68,7 +70,7 @@ def reach_verdict(
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
     of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects, settings)
-    against, signs = (*against, *of_forces), (*signs, *of_motion)
+    against, signs = (*against, *undetermined, *of_forces), (*signs, *of_motion)
     raised = False
     if (head := error.headline) is not None:
         steps = max(1, round(head.seconds / simulation.control_step))
