@@ -7,11 +7,13 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 from torchrl_h2o.commands.close_the_loop import make_simulation
 from torchrl_h2o.commands.recording import Recording, read_recording, split_by_name
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.data.readers.observed import words_of_estimates
+from torchrl_h2o.data.readers.quaternion_signs import continuous_quaternions
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.residuals import Simulation, StateMap
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -199,3 +201,9 @@ def test_quaternions_of_a_tracker_get_a_continuous_sign(tmp_path):
     assert (made["next", "observation"][:, 3] == 1.0).all()
     assert (made["observation"][:, 7:] == td["observation"][:, 7:]).all()
     assert (td["observation"][:, 3] != 1.0).any()
+
+
+def test_a_tracker_that_loses_the_body_for_a_row_does_not_lose_the_sign():
+    rows = torch.tensor([1.0, 1.0, 0.0, -1.0, -1.0])[:, None] * torch.tensor([1.0, 0.0, 0.0, 0.0])
+    td = TensorDict({"observation": rows[:-1], "next": {"observation": rows[1:]}}, [4])
+    assert continuous_quaternions(td, range(4))["observation"][:, 0].tolist() == [1.0, 1.0, 0.0, 1.0]

@@ -254,3 +254,44 @@ def test_four_numbers_that_are_no_unit_quaternion_are_not_assigned(tmp_path):
     rows = np.column_stack([0.01 * np.arange(50), np.full((50, 7), 2.0)])
     np.savetxt(tmp_path / "fly.csv", rows, delimiter=",", header=",".join(("t", *names)), comments="")
     assert "root_qw" not in guess_layout(tmp_path / "fly.csv", DRONE).coordinates.values()
+
+
+def drone_log(path, names, **moving):
+    """A log of 4 s in which all columns but some are zero; the quaternions are 1, 0, 0, 0."""
+    time = 0.01 * np.arange(400)
+    rows = [time, *(np.ones(400) if name.endswith("qw") else np.zeros(400) for name in names)]
+    for name, values in moving.items():
+        rows[1 + names.index(name)] = values(time)
+    np.savetxt(path, np.stack(rows, 1), delimiter=",", header=",".join(("t", *names)), comments="")
+    return guess_layout(path, DRONE)
+
+
+def test_neither_commands_nor_targets_nor_accelerations_are_the_state_of_a_free_body(tmp_path):
+    state = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "imu.angular.x", "imu.angular.y", "imu.angular.z")
+    others = ("cmd_vx", "cmd_vy", "cmd_vz", "target_qw", "target_qx", "target_qy", "target_qz", "gyro_bias_x")
+    accelerations = tuple(f"imu.linear_acceleration.{axis}" for axis in "xyz")
+    guessed = drone_log(tmp_path / "fly.csv", (*others, *accelerations, *state))
+    assert guessed.coordinates == dict(zip(state, DRONE.units, strict=True))
+
+
+def test_units_in_the_names_of_a_free_body_s_columns_are_kept(tmp_path):
+    names = ("x [mm]", "y [mm]", "z [mm]", "qw", "qx", "qy", "qz", "gyro_x (deg/s)", "gyro_y (deg/s)", "gyro_z (deg/s)")
+    guessed = drone_log(tmp_path / "fly.csv", names)
+    assert guessed.coordinates["gyro_x (deg/s)"] == "root_roll_velocity"
+    assert guessed.text.count('unit: "deg/s"') == 3
+    assert guessed.text.count('unit: "mm"') == 3
+
+
+def test_velocities_of_odometry_are_estimated_all_three(tmp_path):
+    """Earlier, the command that --guess prints named a column that it had left out."""
+    names = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz")
+    guessed = drone_log(tmp_path / "fly.csv", names, x=np.sin, vx=lambda t: np.sin(3.0 * t), y=np.sin, vy=np.cos)
+    assert {name for name, other in guessed.coordinates.items() if other.endswith("_velocity")} == {
+        f"{axis}_velocity" for axis in "xyz"
+    }
+    assert guessed.text.count("perhaps in the axes of the body") == 3
+
+
+def test_velocities_of_a_body_whose_place_is_not_logged_are_not_those_of_other_joints(tmp_path):
+    guessed = drone_log(tmp_path / "walk.csv", ("qw", "qx", "qy", "qz", "vx", "vy", "vz", "hip", "knee", "ankle"))
+    assert guessed.coordinates["vx"] == "root_x_velocity"

@@ -105,8 +105,8 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     best = int(np.argmax(explained))
     found, lag = [], int(lags[best])
     if explained[best] < settings.unrelated:
-        sure = _are_foreign(response, {0, lag}, nuisance, settings)
-        return [] if response.drowned else [_foreign_actions(explained[best], caused, sure)]
+        foreign = not response.drowned and _are_foreign(response, {0, lag}, nuisance, settings)
+        return [_foreign_actions(explained[best], caused)] if foreign else []
     gained = (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]])
     sharp = 0 if gained else lag_of_events(response, settings)
     if sharp >= settings.clear_lag and explained[sharp - lags[0]] > settings.unrelated:
@@ -253,14 +253,15 @@ def _are_foreign(response: Response, lags: Iterable[int], nuisance: np.ndarray, 
     return max(gains) < settings.gain_warning[0]
 
 
-def _foreign_actions(explained: float, caused: float, sure: bool) -> Finding:
-    words = f"the actions explain {max(0.0, explained):.0%} of the accelerations at any lag and sign; in the simulator "
-    words += f"they cause {min(caused, 1.0):.0%}: "
-    if sure:
-        words += "they belong to another run"
-        return Finding(CHECK, "severe", words, None, "pair the log with its own actions")
-    words += "noise or a heavier robot hides what they do, or they belong to another run"
-    return Finding(CHECK, "warning", words, None, "check that the actions are the log's own")
+def _foreign_actions(explained: float, caused: float) -> Finding:
+    return Finding(
+        CHECK,
+        "severe",
+        f"the actions explain {max(0.0, explained):.0%} of the accelerations at any lag and sign; in the simulator "
+        f"they cause {min(caused, 1.0):.0%}: they belong to another run",
+        None,
+        "pair the log with its own actions",
+    )
 
 
 def _out_of_step(lag: int) -> Finding:

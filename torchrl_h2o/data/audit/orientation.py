@@ -14,28 +14,17 @@ from torchrl_h2o.data.audit.settings import AuditSettings
 
 CHECK = "kinematics"
 _SPANS = (1, 2, 4, 8, 16, 32)  # rows over which rotations and displacements are compared with integrals
+_LAGS = (1, 2, 3, 4, 6, 8, -1, -2, -3, -4, -6, -8)  # rows by which angular velocities may be late
 _SMALL = 0.5  # rad; integrals of angular velocities are compared with rotations up to this angle
+_TURNS = 0.05  # rad per row beyond which a body surely turns
 _ABOUT = ("x", "y", "z")
-_ORDER = (
-    "the quaternion of {name} is in the order x, y, z, w",
-    "assign the columns anew: the last one is the quaternion's w",
-)
-_INVERSE = (
-    "the quaternion of {name} is inverted: it turns the world's axes into the body's",
-    "reverse its x, y and z (scale: -1)",
-)
-_WORLD = (
-    "the angular velocities of {name} are in the axes of the world",
-    "turn them into the body's axes, in which a free joint of MuJoCo has them",
-)
-_DEGREES = ("the angular velocities of {name} look like degrees per second", "correct their unit")
 
 
 def check_orientation(log: Log, settings: AuditSettings) -> list[Finding]:
     """Whether quaternions are unit quaternions in the right order, and fit the angular velocities.
 
-    MuJoCo's convention: a quaternion w, x, y, z turns the body's axes into the world's; angular velocities are in the
-    body's axes, and a free joint's velocity is in the world's.
+    MuJoCo's convention: a quaternion w, x, y, z turns the body's axes into those of its parent, for a free joint the
+    world's; angular velocities are in the body's axes, and a free joint's velocity is in the world's.
 
     Args:
         log: the data.
@@ -44,74 +33,110 @@ def check_orientation(log: Log, settings: AuditSettings) -> list[Finding]:
     found = []
     for body in log.turning:
         faults = _quaternion(log, body, settings)
-        if not faults:
-            faults = _angular_velocities(log, body, settings)
-        found += faults or _velocity(log, body, settings)
+        if not any(finding.severity == "severe" for finding in faults):
+            faults += _angular_velocities(log, body, settings)
+            faults += _velocity(log, body, settings)
+        found += faults
     return found
 
 
 def _quaternion(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
-    quaternion = log.observation[:, body.quaternion]
-    wrong = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > settings.quaternion_norm
-    if wrong.mean() > 0.5:
-        words = f"the four numbers of {body.name} are no unit quaternion: their norm is "
-        words += f"{np.median(np.linalg.norm(quaternion, axis=1)):.3g}"
-        return [Finding(CHECK, "severe", words, Rows.of(wrong, settings.examples), "check columns and units")]
-    following = log.following[:, body.quaternion]
-    flips = (quaternion * following).sum(1) < 0.0
-    if not flips.any():
-        return []
-    words = f"the quaternion of {body.name} changes its sign, which is the same rotation; the simulator's does not"
-    remedy = "reverse the sign of all four numbers from there on"
-    return [Finding(CHECK, "severe", words, Rows.of(flips, settings.examples), remedy)]
+    found, wrong = [], _wrong(log, body, settings)
+    if wrong.mean() > settings.lost_quaternions:
+        norm = np.median(np.linalg.norm(log.observation[wrong][:, body.quaternion], axis=1))
+        words = (
+            f"in {wrong.mean():.1%} of the rows, the four numbers of {body.name} are no unit quaternion: their norm is "
+        )
+        severity = "severe" if wrong.mean() > settings.many_repeated else "warning"
+        remedy = "check columns and units, or leave out the rows in which the tracker has lost the body"
+        found.append(Finding(CHECK, severity, f"{words}{norm:.3g}", Rows.of(wrong, settings.examples), remedy))
+    flips = (log.observation[:, body.quaternion] * log.following[:, body.quaternion]).sum(1) < 0.0
+    if flips.any():
+        words = f"the quaternion of {body.name} changes its sign, which is the same rotation; the simulator's does not"
+        remedy = "reverse the sign of all four numbers from there on"
+        found.append(Finding(CHECK, "severe", words, Rows.of(flips, settings.examples), remedy))
+    return found
+
+
+def _wrong(log: Log, body: Turning, settings: AuditSettings) -> np.ndarray:
+    """Transitions before or after which the four numbers are no unit quaternion, (T,)."""
+    norms = (np.linalg.norm(rows[:, body.quaternion], axis=1) for rows in (log.observation, log.following))
+    return np.any([~(np.abs(norm - 1.0) <= settings.quaternion_norm) for norm in norms], axis=0)
 
 
 def _angular_velocities(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
     if not body.rates:
-        return []
-    quaternion, rates = _rows(log, body.quaternion), _rows(log, body.rates)
-    plain = _misfits(log, Rotation.from_quat(quaternion, scalar_first=True), rates)
+        words = f"no angular velocity is given for {body.name}: the simulator alone would have to tell it"
+        return [Finding(CHECK, "warning", words, None, "add the columns of its angular velocities, as of a gyroscope")]
+    quaternion, rates = np.array(body.quaternion), np.array(body.rates)
+    plain = _unexplained_turns(log, body, (quaternion, np.ones(4)), (rates, np.ones(3)), settings)
     if plain is None:
         return []
     best, told = min(settings.better_orientation * plain, settings.turned), None
-    for turned, measured, in_world, words, remedy in _hypotheses(log, body, quaternion, rates):
-        left = _misfits(log, turned, measured, in_world)
+    for (order, signs), (axes, factors), outside, severity, words, remedy in _hypotheses(log, body):
+        meant = (quaternion[order], signs), (rates[axes], factors)
+        left = _unexplained_turns(log, body, *meant, settings, outside)
         if left is not None and left < best:
-            severity = "warning" if in_world and plain <= settings.turned else "severe"
-            best, told = settings.better_orientation * left, (severity, words.format(name=body.name), remedy)
+            severity = "warning" if outside and plain <= settings.turned else severity
+            best, told = settings.better_orientation * left, Finding(CHECK, severity, words, None, remedy)
     if told is not None:
-        severity, words, remedy = told
-        return [Finding(CHECK, severity, words, None, remedy)]
+        return [told]
+    lag = _lag(log, body, plain, settings)
+    if lag is not None:
+        words = (
+            f"the angular velocities of {body.name} are {abs(lag)} rows {'late' if lag > 0 else 'early'} against its "
+        )
+        return [Finding(CHECK, "warning", words + "quaternion", None, "shift the columns of one of them")]
     if plain <= settings.turned:
         return []
     words = f"the angular velocities of {body.name} are not the derivative of its quaternion"
-    return [Finding(CHECK, "severe", words, None, "check order, signs and units of the columns")]
+    remedy = "check order, signs and units of the columns; it may also be noise, where the body hardly turns"
+    return [Finding(CHECK, "warning", words, None, remedy)]
 
 
-def _hypotheses(
-    log: Log, body: Turning, quaternion: np.ndarray, rates: np.ndarray
-) -> Iterator[tuple[Rotation, np.ndarray, bool, str, str]]:
-    """Other meanings of the columns: rotations, angular velocities, whether these are in the world's axes, words."""
-    plain = Rotation.from_quat(quaternion, scalar_first=True)
-    yield plain, rates * np.pi / 180.0, False, *_DEGREES
-    yield plain, rates, True, *_WORLD
-    yield Rotation.from_quat(quaternion, scalar_first=False), rates, False, *_ORDER
-    yield plain.inv(), rates, False, *_INVERSE
+def _hypotheses(log: Log, body: Turning) -> Iterator[tuple]:
+    """Other meanings of the columns.
+
+    Each is the order and signs of the quaternion's columns, the order and factors of those of the angular velocities,
+    whether these are in the axes of the world or the parent, the severity, and what to say and to do.
+    """
+    name, outside = body.name, "the world" if body.place or body.velocity else "the parent body"
+    plain, all_axes = (np.arange(4), np.ones(4)), (np.arange(3), np.ones(3))
+    words = f"the angular velocities of {name} look like degrees per second"
+    yield plain, (np.arange(3), np.full(3, np.pi / 180.0)), False, "severe", words, "correct their unit"
+    words = f"the angular velocities of {name} are in the axes of {outside}"
+    yield plain, all_axes, True, "severe", words, "turn them into the body's axes, in which MuJoCo has them"
+    words = f"the quaternion of {name} is in the order x, y, z, w"
+    remedy = "assign the columns anew: the last one is the quaternion's w"
+    yield (np.array([3, 0, 1, 2]), np.ones(4)), all_axes, False, "severe", words, remedy
+    words = f"the quaternion of {name} is inverted: it turns the axes of {outside} into the body's"
+    remedy = "reverse its x, y and z (scale: -1)"
+    yield (np.arange(4), np.array([1.0, -1.0, -1.0, -1.0])), all_axes, False, "severe", words, remedy
     for axes, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        names = [log.names[body.rates[axis]] for axis in axes]
-        pairs = zip(_ABOUT, names, signs, strict=True)
-        about = ", ".join(f"about {axis} {'minus ' * (sign < 0.0)}{name}" for axis, name, sign in pairs)
-        words = "the quaternion of {name} turns as if the angular velocities were " + about
-        yield plain, rates[:, axes] * np.array(signs), False, words, "correct the order and the signs of the columns"
+        pairs = zip(_ABOUT, (log.names[body.rates[axis]] for axis in axes), signs, strict=True)
+        about = ", ".join(f"about {axis} {'minus ' * (sign < 0.0)}{rate}" for axis, rate, sign in pairs)
+        words = f"the quaternion of {name} turns as if the angular velocities were {about}"
+        remedy = "correct the order and the signs of the columns"
+        yield plain, (np.array(axes), np.array(signs)), False, "severe", words, remedy
+
+
+def _lag(log: Log, body: Turning, plain: float, settings: AuditSettings) -> int | None:
+    """Rows by which the angular velocities are late, if that explains most of what they leave."""
+    quaternion, rates = (np.array(body.quaternion), np.ones(4)), (np.array(body.rates), np.ones(3))
+    left = {lag: _unexplained_turns(log, body, quaternion, rates, settings, lag=lag) for lag in _LAGS}
+    known = {lag: share for lag, share in left.items() if share is not None}
+    if not known or plain <= settings.turned:
+        return None
+    lag = min(known, key=lambda one: known[one])
+    return lag if known[lag] < settings.better_orientation * plain else None
 
 
 def _velocity(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
     """Whether a free body's velocity is in its own axes, as in a robot's odometry."""
     if not body.place or not body.velocity:
         return []
-    velocity = _rows(log, body.velocity)
-    turned = Rotation.from_quat(_rows(log, body.quaternion), scalar_first=True).apply(velocity)
-    plain, other = (_moved(log, _rows(log, body.place), each) for each in (velocity, turned))
+    wrong = _wrong(log, body, settings)
+    plain, other = (_unexplained_moves(log, body, wrong, turned) for turned in (False, True))
     if plain is None or other is None or not other < settings.better_orientation * plain:
         return []
     words = f"the velocity of {body.name} is in the axes of the body, as odometry gives it"
@@ -119,41 +144,72 @@ def _velocity(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]
     return [Finding(CHECK, "severe" if plain > settings.turned else "warning", words, None, remedy)]
 
 
-def _rows(log: Log, columns: tuple[int, ...]) -> np.ndarray:
-    """Some columns of all rows and of the last transition's end, (T + 1, k)."""
-    return np.vstack([log.observation[:, columns], log.following[-1:, columns]])
+def _unexplained_turns(
+    log: Log,
+    body: Turning,
+    quaternion: tuple[np.ndarray, np.ndarray],
+    rates: tuple[np.ndarray, np.ndarray],
+    settings: AuditSettings,
+    outside: bool = False,
+    lag: int = 0,
+) -> float | None:
+    """Share of the squared rotations that angular velocities leave unexplained, at the best span; None at rest.
 
-
-def _misfits(log: Log, turned: Rotation, rates: np.ndarray, in_world: bool = False) -> float | None:
-    """Share of the squared rotations that angular velocities leave unexplained, at the best span; None at rest."""
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * log.dt * (rates[1:] + rates[:-1]), axis=0)])
-    left, sizes = [], []
+    A constant offset of the angular velocities is left out.
+    """
+    wrong, (axes, factors) = _wrong(log, body, settings), rates
+    turned = factors * 0.5 * log.dt * (log.observation + log.following)[:, axes]
+    integral, left, sizes = _integral(np.roll(turned, -lag, axis=0)), [], []
     for rows in _SPANS:
-        starts = log.starts(rows, 2000)
+        starts = _whole(log, rows, wrong, margin=abs(lag))
         if len(starts) < 20:
             break
-        before, after = turned[starts], turned[starts + rows]
-        rotated = (after * before.inv() if in_world else before.inv() * after).as_rotvec()
+        before = _rotation(log.observation[starts], quaternion)
+        after = _rotation(log.following[starts + rows - 1], quaternion)
+        rotated = (after * before.inv() if outside else before.inv() * after).as_rotvec()
         size = float(np.median(np.linalg.norm(rotated, axis=1)))
         if size > _SMALL and left:
             break
         left.append(_unexplained(rotated, integral[starts + rows] - integral[starts]))
         sizes.append(size)
-    return min(left) if left and max(sizes) > 3.0 * sizes[0] else None
+    turns = bool(sizes) and (sizes[0] > _TURNS or max(sizes) > 3.0 * sizes[0])
+    return min(left) if turns else None
 
 
-def _moved(log: Log, place: np.ndarray, velocity: np.ndarray) -> float | None:
-    """The same share of the displacements that a velocity leaves unexplained."""
-    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * log.dt * (velocity[1:] + velocity[:-1]), axis=0)])
-    left = []
+def _unexplained_moves(log: Log, body: Turning, wrong: np.ndarray, turned: bool) -> float | None:
+    """The same share of the displacements that a velocity leaves unexplained, as it is or turned by the quaternion."""
+    velocity = 0.5 * log.dt * (log.observation + log.following)[:, body.velocity]
+    if turned:
+        velocity[~wrong] = _rotation(log.observation[~wrong], (np.array(body.quaternion), np.ones(4))).apply(
+            velocity[~wrong]
+        )
+    integral, left = _integral(velocity), []
     for rows in _SPANS:
-        starts = log.starts(rows, 2000)
+        starts = _whole(log, rows, wrong)
         if len(starts) >= 20:
-            left.append(_unexplained(place[starts + rows] - place[starts], integral[starts + rows] - integral[starts]))
+            moved = log.following[starts + rows - 1][:, body.place] - log.observation[starts][:, body.place]
+            left.append(_unexplained(moved, integral[starts + rows] - integral[starts]))
     return min(left, default=None)
 
 
+def _whole(log: Log, rows: int, wrong: np.ndarray, margin: int = 0) -> np.ndarray:
+    """First rows of windows of one run without wrong quaternions, (W,)."""
+    starts, bad = log.starts(rows, 2000, margin), np.concatenate([[0], np.cumsum(wrong)])
+    return starts[bad[starts + rows] == bad[starts]]
+
+
+def _rotation(rows: np.ndarray, quaternion: tuple[np.ndarray, np.ndarray]) -> Rotation:
+    columns, signs = quaternion
+    return Rotation.from_quat(rows[:, columns] * signs, scalar_first=True)
+
+
+def _integral(steps: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(np.nan_to_num(steps), axis=0)])
+
+
 def _unexplained(measured: np.ndarray, integral: np.ndarray) -> float:
-    """Median squared difference of two vectors (W, 3), over the median square of the measured ones."""
-    difference, size = ((vectors**2).sum(1) for vectors in (measured - integral, measured))
+    """Median squared difference of two vectors (W, 3) without its offset, over the median square of the measured."""
+    difference = measured - integral
+    difference = difference - np.median(difference, axis=0)
+    difference, size = ((vectors**2).sum(1) for vectors in (difference, measured))
     return float(np.median(difference) / max(np.median(size), 1e-300))

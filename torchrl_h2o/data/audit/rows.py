@@ -76,11 +76,15 @@ def _in_motion(log: Log, settings: AuditSettings) -> np.ndarray:
 
 
 def _slope(log: Log, column: int) -> np.ndarray:
-    """Mean slope of a column over rows about each row, per second, (T,); 0 at the ends of runs."""
-    values, slope, half = log.observation[:, column], np.zeros(len(log)), _SLOPE_ROWS // 2
-    middle = np.arange(half, len(log) - half)
-    middle = middle[log.run[middle - half] == log.run[middle + half]]
-    slope[middle] = (values[middle + half] - values[middle - half]) / (2 * half * log.dt)
+    """Mean slope of a column before or after each row, the smaller one, per second, (T,); 0 at the ends of runs.
+
+    Beside a sudden stop, one of them is 0; lost packets leave both.
+    """
+    values, slope, rows = log.observation[:, column], np.zeros(len(log)), _SLOPE_ROWS // 2
+    middle = np.arange(rows, len(log) - rows)
+    middle = middle[log.run[middle - rows] == log.run[middle + rows]]
+    changes = values[middle] - values[middle - rows], values[middle + rows] - values[middle]
+    slope[middle] = np.minimum(*np.abs(changes)) / (rows * log.dt)
     return slope
 
 

@@ -102,6 +102,8 @@ class AuditSettings:
 
     quaternion_norm: float = 0.05
     """Distance of a quaternion's norm from 1 from which it is none."""
+    lost_quaternions: float = 0.001
+    """Share of rows with other numbers from which they are named; severe beyond ``many_repeated``."""
     turned: float = 0.2
     """Share of a body's rotations or displacements that its velocities leave unexplained, from which they are wrong."""
     better_orientation: float = 0.5
@@ -145,7 +147,7 @@ class AuditSettings:
     """Share of this misfit that a cause must leave at most."""
     action_matters: float = 0.15
     """Share of the explained change that must be due to actions before conclusions about them are drawn."""
-    action_shows: float = 0.1
+    action_shows: float = 0.3
     """Square of what the actions do in the simulator and friction would not, over that of what stays unexplained, from
     which conclusions about them are drawn."""
     unrelated: float = 0.05

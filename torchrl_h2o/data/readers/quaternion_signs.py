@@ -31,17 +31,15 @@ def continuous_quaternions(td: TensorDictBase, columns: Sequence[int]) -> Tensor
     columns = list(columns)
     before = cast("torch.Tensor", td["observation"]).clone()
     after = cast("torch.Tensor", td["next", "observation"]).clone()
-    within = _same_side(before[:, columns], after[:, columns])
-    between = _same_side(after[:-1, columns], before[1:, columns])
-    sign = torch.cumprod(torch.cat([torch.ones_like(within[:1]), within[:-1] * between]), dim=0)
-    before[:, columns] *= sign[:, None]
-    after[:, columns] *= (sign * within)[:, None]
+    rows = torch.stack([before[:, columns], after[:, columns]], 1).reshape(-1, 4)
+    valid = rows.square().sum(-1) > 0.0  # a tracker that has lost the body may write zeros
+    last = torch.where(valid, torch.arange(len(rows)), 0).cummax(0).values
+    known = rows[last]
+    same = torch.where((known[1:] * known[:-1]).sum(-1) < 0.0, -1.0, 1.0).to(rows.dtype)
+    sign = torch.cat([torch.ones_like(same[:1]), same]).cumprod(0) if len(same) else torch.ones_like(rows[:, 0])
+    before[:, columns] *= sign[0::2, None]
+    after[:, columns] *= sign[1::2, None]
     changed, following = td.clone(recurse=False), cast("TensorDictBase", td["next"]).clone(recurse=False)
     following["observation"] = after
     changed["observation"], changed["next"] = before, following
     return changed
-
-
-def _same_side(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """1 where two quaternions (T, 4) are nearer to each other than to their opposites, else -1, (T,)."""
-    return torch.where((one * other).sum(-1) < 0.0, -1.0, 1.0).to(one.dtype)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from torchrl_h2o.data.readers.guess.roles import Guess, words_of
+from torchrl_h2o.data.readers.guess.roles import Guess, without_unit, words_of
 from torchrl_h2o.data.readers.units import to_si
 
 PLACE, ORIENTATION, VELOCITY, RATE = "position", "orientation", "velocity", "angular velocity"
@@ -20,6 +20,38 @@ _KINDS = {  # words beside an axis; the first kind that fits
     VELOCITY: ("vel", "velocity", "linear", "linvel", "dot", "speed", "v"),
     PLACE: ("pos", "position", "pose", "p", "translation"),
 }
+_NO_STATE = (  # a column with such a word is no state of the body
+    *(
+        "acc",
+        "accel",
+        "acceleration",
+        "cmd",
+        "command",
+        "commanded",
+        "des",
+        "desired",
+        "ref",
+        "reference",
+        "target",
+        "goal",
+    ),
+    *(
+        "setpoint",
+        "sp",
+        "err",
+        "error",
+        "bias",
+        "offset",
+        "std",
+        "cov",
+        "var",
+        "foot",
+        "feet",
+        "wind",
+        "force",
+        "torque",
+    ),
+)
 _TURNS = {"x": "roll", "y": "pitch", "z": "yaw"}  # as the model's angular velocities are named
 _NOTES = {
     VELOCITY: "expected in the axes of the world, not of the body",
@@ -78,33 +110,52 @@ def free_body(
 
 
 def _groups(columns: Sequence[Guess], values: Mapping[str, np.ndarray | None]) -> dict[str, dict[str, str]]:
-    """The columns of each kind by axis, of the kinds that have one column for each axis."""
-    found: dict[str, dict[str, str]] = {kind: {} for kind in _AXES}
+    """The columns of each kind by axis, of the kinds that have one column for each axis, with one beginning.
+
+    Of several such groups, the one with the shortest beginning is taken: ``pos_x`` rather than ``second_pos_x``.
+    """
+    found: dict[str, dict[tuple[str, ...], dict[str, str]]] = {kind: {} for kind in _AXES}
     for column in columns:
-        kind, axis = _kind_and_axis(column)
+        kind, axis, beginning = _kind_and_axis(column)
         if kind is not None and values.get(column.name) is not None:
-            found[kind].setdefault(axis, column.name)
-    whole = {kind: names for kind, names in found.items() if set(names) == set(_AXES[kind])}
-    if ORIENTATION in whole:
-        quaternion = np.stack([np.asarray(values[name]) for name in whole[ORIENTATION].values()])
-        if np.nanmedian(np.abs((quaternion**2).sum(0) - 1.0)) > 0.1:
-            del whole[ORIENTATION]
-    return whole
+            found[kind].setdefault(beginning, {}).setdefault(axis, column.name)
+    whole = {
+        kind: [
+            names
+            for _, names in sorted(groups.items(), key=lambda group: len(group[0]))
+            if set(names) == set(_AXES[kind])
+        ]
+        for kind, groups in found.items()
+    }
+    whole[ORIENTATION] = [
+        names for names in whole[ORIENTATION] if _is_quaternion([values[name] for name in names.values()])
+    ]
+    return {kind: groups[0] for kind, groups in whole.items() if groups}
 
 
-def _kind_and_axis(column: Guess) -> tuple[str | None, str]:
-    """The kind and axis of a column's name, such as ``vx``, ``gyro_x`` or ``pose.orientation.w``; None for others."""
-    words = words_of(column.name)
-    if column.kind.startswith("desired") or not words:
-        return None, ""
-    (axis, *letter), rest = reversed(words[-1]), set(words[:-1])
+def _is_quaternion(numbers: Sequence[np.ndarray | None]) -> bool:
+    quaternion = np.stack([np.asarray(each) for each in numbers])
+    return bool(np.nanmedian(np.abs((quaternion**2).sum(0) - 1.0)) <= 0.1)
+
+
+def _kind_and_axis(column: Guess) -> tuple[str | None, str, tuple[str, ...]]:
+    """The kind and axis of a name such as ``vx``, ``gyro_x`` or ``pose.orientation.w``, and its other words.
+
+    The kind is None for names of something else.
+    """
+    words = words_of(without_unit(column.name)[0])
+    nothing = None, "", ()
+    if column.kind == "action" or column.kind.startswith("desired") or not words or set(words) & set(_NO_STATE):
+        return nothing
+    (axis, *letter), rest = reversed(words[-1]), words[:-1]
     if words[-1] == "dot" and len(words) > 1:  # x_dot
-        axis, letter, rest = words[-2][-1], list(words[-2][:-1]), {"dot", *words[:-2]}
+        axis, letter, rest = words[-2][-1], list(words[-2][:-1]), ["dot", *words[:-2]]
     if len(letter) > 1 or axis not in "wxyz" or (letter and letter[0] not in _LETTERS):
-        return None, ""
-    kinds = [kind for kind, known in _KINDS.items() if not rest.isdisjoint(known)]
+        return nothing
+    kinds = [kind for kind, known in _KINDS.items() if not set(rest).isdisjoint(known)]
     kind = _LETTERS[letter[0]] if letter else next(iter(kinds), None if rest else PLACE)
-    return (kind, axis) if kind is not None and axis in _AXES[kind] else (None, "")
+    other = tuple(word for word in rest if not any(word in known for known in _KINDS.values()))
+    return (kind, axis, other) if kind is not None and axis in _AXES[kind] else nothing
 
 
 def _coordinate(joint: str, kind: str, axis: str) -> str:
@@ -118,4 +169,23 @@ def _coordinate(joint: str, kind: str, axis: str) -> str:
 def _of_body(column: Guess, kind: str, axis: str) -> Guess:
     unit = column.unit if to_si(column.unit)[0] == _UNITS[kind] else _UNITS[kind]
     stem = f"free body {axis}" if kind in (PLACE, VELOCITY) else ""
-    return replace(column, kind=kind, unit=unit, stem=stem, note=_NOTES.get(kind, ""))
+    note = "; ".join(filter(None, [_NOTES.get(kind, ""), column.note if kind != ORIENTATION else ""]))
+    return replace(column, kind=kind, unit=unit, stem=stem, note=note)
+
+
+def velocities_together(columns: Sequence[Guess], coordinates: Mapping[str, str]) -> list[Guess]:
+    """All three velocities of the body as columns to ignore, if one of them does not follow its position.
+
+    They may be in the body's axes, as those of a robot's odometry.
+
+    Args:
+        columns: the columns, among them velocities that were found not to be slopes.
+        coordinates: the model's coordinate of each column of the body.
+    """
+    moves = [
+        name for name, other in coordinates.items() if other.endswith(("_x_velocity", "_y_velocity", "_z_velocity"))
+    ]
+    if all(column.kind == VELOCITY for column in columns if column.name in moves):
+        return list(columns)
+    note = "not the slope of its position: perhaps in the axes of the body; it is estimated instead"
+    return [replace(column, kind="unknown", note=note) if column.name in moves else column for column in columns]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
-from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body
+from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body, velocities_together
 from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
 from torchrl_h2o.data.readers.units import to_si
 
@@ -89,7 +89,11 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         columns = _by_order(columns, model)
     elif model is not None:
         columns = _actions_left(columns, contents, len(model.actuators))
-    columns, pairs = _without_strangers(columns, contents, _pairs(columns))
+    columns, pairs = _without_strangers(columns, contents, _pairs(columns, body.coordinates))
+    columns = velocities_together(columns, body.coordinates)
+    pairs = {
+        column.name: pairs[column.name] for column in columns if column.kind == "velocity" and column.name in pairs
+    }
     found = {} if model is None else _coordinates(columns, pairs, model, body.coordinates)
     units = {column.name: column.unit for column in columns}
     columns = [_checked(column, contents, pairs, found, model, units) for column in columns]
@@ -159,7 +163,7 @@ def _actions_left(columns: Sequence[Guess], contents: Contents, number: int) -> 
     return [replace(column, kind="action", note=note) if column in left else column for column in columns]
 
 
-def _pairs(columns: Sequence[Guess]) -> dict[str, str]:
+def _pairs(columns: Sequence[Guess], of_body: Collection[str]) -> dict[str, str]:
     """Return the position of each velocity: by the rest of their names, or by order if as many are left."""
     positions = [column for column in columns if column.kind == "position"]
     velocities = [column for column in columns if column.kind == "velocity"]
@@ -168,8 +172,8 @@ def _pairs(columns: Sequence[Guess]) -> dict[str, str]:
         same = [p.name for p in positions if p.stem == velocity.stem and p.name not in pairs.values()]
         if len(same) == 1:
             pairs[velocity.name] = same[0]
-    rest = [p.name for p in positions if p.name not in pairs.values()]
-    alone = [v.name for v in velocities if v.name not in pairs]
+    rest = [p.name for p in positions if p.name not in pairs.values() and p.name not in of_body]
+    alone = [v.name for v in velocities if v.name not in pairs and v.name not in of_body]
     return pairs | (dict(zip(alone, rest, strict=True)) if len(alone) == len(rest) else {})
 
 
@@ -187,7 +191,10 @@ def _coordinates(
             found[min(like, key=len)] = joint
     if not found and len(positions) == len(joints):
         found = dict(zip(positions, joints, strict=True))
-    found |= of_body
+    observed = ("position", "velocity", ORIENTATION, RATE)
+    found |= {
+        column.name: of_body[column.name] for column in columns if column.name in of_body and column.kind in observed
+    }
     velocity_of = {position: velocity for velocity, position in pairs.items()}
     for position, joint in list(found.items()):
         if f"{joint}_velocity" in model.units:

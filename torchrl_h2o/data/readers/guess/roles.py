@@ -104,7 +104,7 @@ def guess_columns(
 def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str, str | None]]) -> Guess:
     if numbers is None:
         return Guess(name, "unknown", note="not numbers")
-    plain, unit = _without_unit(name)
+    plain, unit = without_unit(name)
     words = words_of(plain)
     kind, si = known.get(_letters(plain), (_kind(words, numbers), None))
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
@@ -169,7 +169,7 @@ def _letters(name: str) -> str:
     return "".join(re.findall(r"[a-z0-9]", name.lower()))
 
 
-def _without_unit(name: str) -> tuple[str, str | None]:
+def without_unit(name: str) -> tuple[str, str | None]:
     """Split a name such as ``hip_vel (deg/s)``, ``hip[rad]`` or ``t_ms`` into the name and its unit, if it has one."""
     bracket = re.search(r"[\[(]([^\])]+)[\])]\s*$", name)
     candidates = [(bracket.start(), bracket.group(1))] if bracket else []
