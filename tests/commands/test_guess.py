@@ -47,7 +47,7 @@ def test_a_first_layout_is_written_and_can_be_read(folder, capsys, monkeypatch):
         "slider_pos": ("observation", "m"),
         "hip.angle [deg]": ("observation", "deg"),
         "hip.rate": ("observation", "rad/s"),
-        "tau_cmd": ("action", "N·m"),
+        "tau_cmd": ("action", "N"),
         "phase": ("ignore", "1"),
         "slider_pos_velocity": ("observation", "1"),
     }
@@ -150,3 +150,16 @@ def test_other_formats_are_guessed_too(folder, name):
     td = load(name, columns="log.yaml")
     assert (td["observation"].shape, td["action"].shape) == ((299, 4), (299, 1))
     assert not LogColumns.load("log.yaml").derivatives
+
+
+@pytest.mark.parametrize(
+    ("motor", "unit"),
+    [('site="hub" gear="0 0 1 0 0 0.02"', "N"), ('site="hub" gear="0 0 0 0 0 1"', "N·m"), ('joint="hip"', "N·m")],
+)
+def test_the_unit_of_actions_is_that_of_what_the_actuators_exert(folder, motor, unit):
+    """Earlier, the thrusts of a quadrotor were N·m."""
+    body = '<body><joint name="hip"/><geom size="0.1"/><site name="hub"/></body>'
+    actuator = f"<actuator><motor {motor}/></actuator>"
+    (folder / "robot.xml").write_text(f"<mujoco><worldbody>{body}</worldbody>{actuator}</mujoco>")
+    guess_columns(["--guess", "data=log.csv", "simulator=robot.xml"])
+    assert {column.unit for column in LogColumns.load("log.yaml").columns if column.role == "action"} == {unit}

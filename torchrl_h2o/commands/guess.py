@@ -63,7 +63,16 @@ def _coordinates_of(simulator: str) -> Coordinates:
         dict(zip(names, units, strict=True)),
         [model.actuator(i).name or str(i) for i in range(model.nu)],
         servos=model.nu > 0 and all(map(is_servo, spec.actuators)),
+        forces=model.nu > 0 and all(_pushes(model, actuator) for actuator in range(model.nu)),
     )
+
+
+def _pushes(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether an actuator exerts a force: on a sliding joint, or on a site along an axis."""
+    kind, target = mujoco.mjtTrn(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
+    if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
+        return model.jnt_type[target] == mujoco.mjtJoint.mjJNT_SLIDE
+    return kind == mujoco.mjtTrn.mjTRN_SITE and bool(model.actuator_gear[actuator, :3].any())
 
 
 def _command(given: dict[str, str], path: Path, coordinates) -> str:

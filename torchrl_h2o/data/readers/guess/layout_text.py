@@ -29,11 +29,13 @@ class Coordinates:
         units: the unit of each coordinate by its name, positions before velocities; velocities end in ``_velocity``.
         actuators: the actuators' names.
         servos: whether all actuators are position servos, whose commands are desired positions.
+        forces: whether all actuators push along an axis, as a propeller or a linear motor does.
     """
 
     units: Mapping[str, str]
     actuators: Sequence[str]
     servos: bool = False
+    forces: bool = False
 
     @property
     def quantities(self) -> dict[str, tuple[str, str | None]]:
@@ -89,6 +91,8 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         columns = _by_order(columns, model)
     elif model is not None:
         columns = _actions_left(columns, contents, len(model.actuators))
+    if model is not None and model.forces:
+        columns = [replace(one, unit="N") if one.kind == "action" and one.unit == "N·m" else one for one in columns]
     columns, pairs = _without_strangers(columns, contents, _pairs(columns, body.coordinates))
     columns = velocities_together(columns, body.coordinates)
     pairs = {
