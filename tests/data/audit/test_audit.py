@@ -10,7 +10,6 @@ import torch
 
 from tests.data.audit.recorded import (
     NAMES,
-    arm,
     changed,
     holding,
     measured,
@@ -27,16 +26,6 @@ from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gra
 from torchrl_h2o.residuals import Simulation
 
 DEGREES = 180.0 / np.pi
-
-
-@pytest.fixture(scope="module")
-def good():
-    return recording()
-
-
-@pytest.fixture(scope="module")
-def simulation():
-    return arm()
 
 
 def severe(data, simulation, check: str) -> str:

@@ -12,16 +12,6 @@ from torchrl_h2o.effects import Armature
 from torchrl_h2o.residuals import Simulation, StateMap
 
 
-@pytest.fixture(scope="module")
-def good():
-    return recording()
-
-
-@pytest.fixture(scope="module")
-def simulation():
-    return arm()
-
-
 def test_zero_on_the_other_side_of_the_turn(good, simulation):
     (found,) = audit(changed(good, lambda rows: rows - np.array([np.pi, 0, 0, 0])), simulation).severe
     words = found.words

@@ -1,70 +1,33 @@
-"""The benchmark of close_the_loop: correctness of its cases' ground truth and of its scores."""
+"""The benchmark of close_the_loop: correctness of its cases' ground truth."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from cases import Case, draw_case
+from cases import draw_case
 from drawn_cases import HIDDEN, VISIBLE, plain, visibility
-from families import FAMILIES, all_families, choose_families
+from families import FAMILIES, choose_families
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from paper_cases import GAPS, what_mends
-from results_table import table
 from robot_cases import EFFECTS
-from running import Job, run_all
-from scoring import (
-    is_exact_set,
-    is_listed_set,
-    is_marked_undeclared,
-    is_named_first,
-    is_reported_as_group,
-    parameter_error,
-    reduction,
-    says_nothing_is_missing,
-)
-from speed import CountingSimulation
 from systems import SYSTEMS, with_sensor_noise
 from torchrl.envs import GymEnv, TransformedEnv
 from undeclared_effects import CubicWind, LateForce, MovingSpring, PlaceFriction, TorqueRipple
 
 import torchrl_h2o
+from tests.recipes.benchmarks.made_up import report
 from torchrl_h2o.effects import (
     ActionGain,
     BodyMass,
-    GeomFriction,
-    GeomSize,
     Gravity,
-    JointSpring,
-    ObservationNoise,
-    ResidualForce,
 )
 from torchrl_h2o.envs import DynamicsGap, mujoco_model
-from torchrl_h2o.residuals import Measured, Simulation, residuals
-from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, IndistinguishableGroup, OtherExplanation
-from torchrl_h2o.residuals.report.document import Report
-from torchrl_h2o.residuals.report.errors import ErrorSummary
+from torchrl_h2o.residuals import Measured, residuals
 
 SEED = 5
-
-
-def report(*effects, before=1.0, after=0.0, floor=None, declared=True, groups=(), conclusion=None):
-    return Report(
-        simulator="made up",
-        data=DataSummary("made up", 100, 30),
-        error=ErrorSummary("one-step RMSE", "1", before, after, floor),
-        found=tuple(FoundEffect(effect, declared, {}, after) for effect in effects),
-        indistinguishable=tuple(IndistinguishableGroup(tuple(g), (after,) * len(g), "more motion") for g in groups),
-        conclusion=conclusion,
-    )
-
-
-@pytest.fixture(scope="module")
-def cheetah():
-    return Simulation.from_env(SYSTEMS["HalfCheetah"].env())
 
 
 def one_step_error(case, *effects, rows=300):
@@ -229,168 +192,11 @@ def test_a_recording_is_the_simulator_s_own_when_nothing_is_missing(system):
     assert (np.median(np.abs(residuals(simulation, measured, starts)[:, 0]), axis=0) < 1e-2 * change).all()
 
 
-def test_named_first_counts_parts_and_groups_but_no_other_class_or_place(cheetah):
-    truth = (GeomSize(0.5, geoms="*thigh*"),)
-    part, other_place = GeomSize(0.5, geoms="bthigh"), GeomSize(0.5, geoms="torso")
-    assert is_named_first(report(part), truth, cheetah)
-    assert not is_named_first(report(other_place, part), truth, cheetah)
-    assert not is_named_first(report(Gravity(0.5)), truth, cheetah)
-    assert not is_named_first(report(), truth, cheetah)
-    group = (Gravity(0.5), part)
-    assert is_named_first(report(Gravity(0.5), groups=[group]), truth, cheetah)
-    assert not is_named_first(report(other_place, groups=[group]), truth, cheetah)
-
-
-def test_an_exact_set_has_no_more_and_no_less_than_the_truth(cheetah):
-    mass, gravity = BodyMass(2.0, bodies="torso"), Gravity(0.5)
-    thighs = GeomSize(0.5, geoms="*thigh*")
-    one, other = GeomSize(0.5, geoms="bthigh"), GeomSize(0.6, geoms="fthigh")
-    assert is_exact_set(report(gravity, mass), (mass, gravity), cheetah)
-    assert not is_exact_set(report(gravity), (mass, gravity), cheetah)
-    assert not is_exact_set(report(gravity, mass, thighs), (mass, gravity), cheetah)
-    assert is_exact_set(report(one, other), (thighs,), cheetah)
-    assert not is_exact_set(report(one), (thighs,), cheetah)
-    gain = ActionGain(0.5)
-    assert is_exact_set(report(gain, gravity, groups=[(gain, mass)]), (mass, gravity), cheetah)
-
-
-def test_the_truth_may_be_another_set_that_the_report_lists(cheetah):
-    mass, gravity, gain = BodyMass(2.0, bodies="torso"), Gravity(0.5), ActionGain(0.5)
-    listed = [OtherExplanation((gain,), 0.0, "more motion"), OtherExplanation((gravity, mass), 0.0, "more motion")]
-    found = replace(report(gain), others=tuple(listed))
-    assert is_listed_set(found, (mass, gravity), cheetah)
-    assert not is_listed_set(found, (mass,), cheetah)
-    assert not is_listed_set(report(mass, gravity), (mass, gravity), cheetah)
-
-
-def test_patterns_and_names_of_the_same_elements_are_the_same(cheetah):
-    names = tuple(geom.name for geom in cheetah.spec().geoms)
-    assert is_exact_set(report(GeomFriction(3.0, geoms=names)), (GeomFriction(3.0),), cheetah)
-    assert is_exact_set(report(ActionGain(0.5, actuators=tuple(range(6)))), (ActionGain(0.5),), cheetah)
-    assert not is_exact_set(report(ActionGain(0.5, actuators=(0,))), (ActionGain(0.5),), cheetah)
-
-
-def test_parameter_error_is_the_worst_of_all_truths(cheetah):
-    springs = (JointSpring(120.0, joints="bfoot"), JointSpring(60.0, joints="ffoot"))
-    found = (JointSpring(121.2, joints="bfoot"), JointSpring(63.0, joints="ffoot"))
-    assert parameter_error(report(*found), springs, cheetah) == pytest.approx(0.05)
-    assert parameter_error(report(found[0]), springs, cheetah) == np.inf
-    mass = BodyMass(0.9, bodies="torso")
-    assert parameter_error(report(Gravity(2.0), groups=[(Gravity(2.0), mass)]), (mass,), cheetah) == 0.0
-
-
-def test_reduction_is_of_what_lies_above_the_floor():
-    assert reduction(report(before=2.0, after=1.0)) == 0.5
-    assert reduction(report(before=2.0, after=1.2), floor=1.0) == pytest.approx(0.8)
-    assert np.isnan(reduction(report(before=1.0), floor=1.0))
-
-
-def test_undeclared_nothing_and_group_are_read_off_the_report():
-    assert is_marked_undeclared(report(Gravity(2.0), declared=False))
-    assert not is_marked_undeclared(report(Gravity(2.0)))
-    assert says_nothing_is_missing(report())
-    assert not says_nothing_is_missing(report(ObservationNoise(0.1)))
-    assert not says_nothing_is_missing(report(conclusion="too few rows"))
-    pair = (BodyMass(2.0, bodies="arm"), ActionGain(0.5))
-    assert is_reported_as_group(report(pair[0], groups=[pair]), pair)
-    assert not is_reported_as_group(report(pair[0], groups=[(pair[0], Gravity(2.0))]), pair)
-
-
-def perfect(simulation, data, **options):
-    """The report that would be correct for the first decoy case."""
-    return report(Gravity(2.0), groups=[(BodyMass(2.0, bodies="arm"), ActionGain(0.5))])
-
-
-def failing(simulation, data, **options):
-    raise RuntimeError("diverged")
-
-
-@pytest.fixture
-def short(monkeypatch):
-    monkeypatch.setattr(Case, "measure", lambda self: SYSTEMS[self.system].record(self.in_reality, 20, 0))
-    monkeypatch.setattr(Report, "save", lambda self, folder: folder)
-
-
-@pytest.mark.usefixtures("short")
-def test_a_case_that_fails_is_a_row_and_the_others_go_on(tmp_path):
-    jobs = [Job("decoy", number, SEED, tmp_path) for number in range(2)]
-    calls = iter([failing, perfect])
-    rows = run_all(jobs, 1, lambda *args, **kw: next(calls)(*args, **kw), progress=False)
-    assert [row["ok"] for row in rows] == [False, True]
-    assert "diverged" in rows[0]["found"]
-    saved = json.loads((tmp_path / "results.json").read_text())
-    assert [row["number"] for row in saved] == [0, 1]
-    lines = (tmp_path / "results.csv").read_text().splitlines()
-    assert lines[0].startswith("family,number,name,system,truth,found,ok")
-    assert len(lines) == 3
-    printed = table(choose_families(["decoy"]), rows)
-    assert "1 of 2" in printed
-    assert "4 of 4" in printed
-
-
-def test_slow_effects_pass_by_their_friction_or_by_a_torque_in_time():
-    viscous, drift = (draw_case(FAMILIES, "slow", number, SEED) for number in (0, 1))
-    assert viscous.judge(report(*viscous.truth), viscous)["ok"]
-    assert not viscous.judge(report(JointSpring(0.1, joints="pivot")), viscous)["ok"]
-    grows = ResidualForce(("torque on pivot: 0.01 · t",))
-    pulls = ResidualForce(("torque on pivot: 0.01 · sin(7 q)",))
-    assert drift.judge(report(grows), drift)["ok"]
-    assert not drift.judge(report(pulls), drift)["ok"]
-    assert not drift.judge(report(grows, *viscous.truth), drift)["ok"]
-
-
 def test_a_family_draws_the_same_cases_beside_others():
     alone = draw_case(choose_families(["slow"]), "slow", 2, SEED)
     assert draw_case(choose_families(["nothing", "slow"]), "slow", 2, SEED).truth == alone.truth
     streams = [family.stream for family in FAMILIES.values()]
     assert len(set(streams)) == len(streams)
-
-
-@pytest.mark.usefixtures("short")
-def test_the_code_under_test_is_shown_neither_the_truth_nor_the_case(tmp_path):
-    seen = []
-
-    def spy(*args, **options):
-        seen.append((args, options))
-        return report()
-
-    run_all([Job("paper16_noise", 0, SEED, tmp_path)], 1, spy, progress=False)
-    ((simulation, data), options) = seen[0]
-    assert isinstance(simulation, Simulation)
-    assert set(data.keys()) == {"observation", "action", "done", "terminated", "truncated", "next"}
-    assert options.keys() == {"source", "held_out", "seed", "progress"}
-    assert "gravity" not in options["source"]
-
-
-def test_steps_are_counted_in_all_that_is_made_of_a_simulation():
-    simulation, measured = plain("pendulum", 0)
-    counting = CountingSimulation.of(simulation)
-    mended = counting.with_effects(Gravity(0.5))
-    starts = np.arange(7)
-    expected = residuals(simulation.with_effects(Gravity(0.5)), measured, starts, 3)
-    before = counting.count.steps
-    assert (residuals(mended, measured, starts, 3) == expected).all()
-    assert counting.count.steps - before == 21
-    assert counting.count.seconds > 0.0
-
-
-def test_steps_are_counted_where_coordinates_are_not_observed():
-    """Earlier, each case of the robot whose log lacks the speed of its wheels failed."""
-    simulation, measured = plain("wheel_legged", 0)
-    counting = CountingSimulation.of(simulation)
-    starts = np.arange(7)
-    assert (residuals(counting, measured, starts, 3) == residuals(simulation, measured, starts, 3)).all()
-
-
-def test_families_are_chosen_by_name_and_logs_by_their_folder(tmp_path):
-    assert list(choose_families(["nothing", "paper16"])) == ["paper16", "nothing"]
-    assert list(choose_families(["nothing"], tmp_path)) == ["nothing", "log_wheel_legged", "log_pendulum"]
-    assert list(choose_families(["log_pendulum"], tmp_path)) == ["log_pendulum"]
-    with pytest.raises(ValueError, match="cases=paper: choose from paper16"):
-        choose_families(["paper"])
-    with pytest.raises(FileNotFoundError, match="no such folder"):
-        choose_families([], tmp_path / "nowhere")
-    assert set(all_families(tmp_path)) - set(FAMILIES) == {"log_wheel_legged", "log_pendulum"}
 
 
 def test_undeclared_forces_reach_the_env():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
@@ -105,8 +105,7 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
     best = int(np.argmax(explained))
     found, lag = [], int(lags[best])
     if explained[best] < settings.unrelated:
-        foreign = not response.drowned and _are_foreign(response, {0, lag}, nuisance, settings)
-        return [_foreign_actions(explained[best], caused)] if foreign else []
+        return [] if response.drowned else [_foreign_actions(explained[best], caused)]
     gained = (1.0 - explained[best]) <= settings.lag_share * (1.0 - explained[-lags[0]])
     sharp = 0 if gained else lag_of_events(response, settings)
     if sharp >= settings.clear_lag and explained[sharp - lags[0]] > settings.unrelated:
@@ -235,22 +234,6 @@ def _over_lags(
         explained.append(1.0 - found.unexplained / max(without.unexplained, 1e-300))
         fits.append(found)
     return lags, np.array(explained), fits
-
-
-def _are_foreign(response: Response, lags: Iterable[int], nuisance: np.ndarray, settings: AuditSettings) -> bool:
-    """Whether, at each of some lags, all motors together surely do far less than in the simulator.
-
-    Noise, a heavier robot and friction that follows the actions make the share that actions explain small as well, but
-    with a gain that is uncertain.
-    """
-    gains = []
-    for lag in lags:
-        actions, known = response.mean_action(lag)
-        together = (response.by_action * actions[:, None]).sum(-1, keepdims=True)
-        responses = np.concatenate([together, nuisance], -1)[known]
-        found = robust_fit(response.target[known], responses, response.scale, settings.robust)
-        gains.append(found.values[0] + settings.foreign_significance * found.errors[0])
-    return max(gains) < settings.gain_warning[0]
 
 
 def _foreign_actions(explained: float, caused: float) -> Finding:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
@@ -64,71 +65,76 @@ def _wrong(log: Log, body: Turning, settings: AuditSettings) -> np.ndarray:
     return np.any([~(np.abs(norm - 1.0) <= settings.quaternion_norm) for norm in norms], axis=0)
 
 
+@dataclass(frozen=True)
+class _Meaning:
+    """What the columns of a body may mean.
+
+    Args:
+        order: places of w, x, y and z among the four columns of the quaternion.
+        signs: their signs.
+        axes: places of the angular velocities about x, y and z among their three columns.
+        factors: their signs, or their unit in rad/s.
+        outside: whether the angular velocities are in the axes of the parent or the world, not of the body.
+        lag: rows by which they are late.
+    """
+
+    order: tuple[int, ...] = (0, 1, 2, 3)
+    signs: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    axes: tuple[int, ...] = (0, 1, 2)
+    factors: tuple[float, ...] = (1.0, 1.0, 1.0)
+    outside: bool = False
+    lag: int = 0
+
+
 def _angular_velocities(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
     if not body.rates:
         words = f"no angular velocity is given for {body.name}: the simulator alone would have to tell it"
         return [Finding(CHECK, "warning", words, None, "add the columns of its angular velocities, as of a gyroscope")]
-    quaternion, rates = np.array(body.quaternion), np.array(body.rates)
-    plain = _unexplained_turns(log, body, (quaternion, np.ones(4)), (rates, np.ones(3)), settings)
+    plain = _unexplained_turns(log, body, _Meaning(), settings)
     if plain is None:
         return []
     best, told = min(settings.better_orientation * plain, settings.turned), None
-    for (order, signs), (axes, factors), outside, severity, words, remedy in _hypotheses(log, body):
-        meant = (quaternion[order], signs), (rates[axes], factors)
-        left = _unexplained_turns(log, body, *meant, settings, outside)
+    for meaning, words, remedy in _meanings(log, body):
+        left = _unexplained_turns(log, body, meaning, settings)
         if left is not None and left < best:
-            severity = "warning" if outside and plain <= settings.turned else severity
+            severity = "warning" if meaning.outside and plain <= settings.turned else "severe"
             best, told = settings.better_orientation * left, Finding(CHECK, severity, words, None, remedy)
     if told is not None:
         return [told]
-    lag = _lag(log, body, plain, settings)
-    if lag is not None:
-        words = (
-            f"the angular velocities of {body.name} are {abs(lag)} rows {'late' if lag > 0 else 'early'} against its "
-        )
-        return [Finding(CHECK, "warning", words + "quaternion", None, "shift the columns of one of them")]
     if plain <= settings.turned:
         return []
+    if lag := _lag(log, body, plain, settings):
+        words = f"the angular velocities of {body.name} are {abs(lag)} rows {'late' if lag > 0 else 'early'} "
+        return [Finding(CHECK, "warning", words + "against its quaternion", None, "shift the columns of one of them")]
     words = f"the angular velocities of {body.name} are not the derivative of its quaternion"
     remedy = "check order, signs and units of the columns; it may also be noise, where the body hardly turns"
     return [Finding(CHECK, "warning", words, None, remedy)]
 
 
-def _hypotheses(log: Log, body: Turning) -> Iterator[tuple]:
-    """Other meanings of the columns.
-
-    Each is the order and signs of the quaternion's columns, the order and factors of those of the angular velocities,
-    whether these are in the axes of the world or the parent, the severity, and what to say and to do.
-    """
+def _meanings(log: Log, body: Turning) -> Iterator[tuple[_Meaning, str, str]]:
+    """Other meanings of the columns, each with what to say and to do."""
     name, outside = body.name, "the world" if body.place or body.velocity else "the parent body"
-    plain, all_axes = (np.arange(4), np.ones(4)), (np.arange(3), np.ones(3))
+    degree = np.pi / 180.0
     words = f"the angular velocities of {name} look like degrees per second"
-    yield plain, (np.arange(3), np.full(3, np.pi / 180.0)), False, "severe", words, "correct their unit"
+    yield _Meaning(factors=(degree, degree, degree)), words, "correct their unit"
     words = f"the angular velocities of {name} are in the axes of {outside}"
-    yield plain, all_axes, True, "severe", words, "turn them into the body's axes, in which MuJoCo has them"
+    yield _Meaning(outside=True), words, "turn them into the body's axes, in which MuJoCo has them"
     words = f"the quaternion of {name} is in the order x, y, z, w"
-    remedy = "assign the columns anew: the last one is the quaternion's w"
-    yield (np.array([3, 0, 1, 2]), np.ones(4)), all_axes, False, "severe", words, remedy
+    yield _Meaning(order=(3, 0, 1, 2)), words, "assign the columns anew: the last one is the quaternion's w"
     words = f"the quaternion of {name} is inverted: it turns the axes of {outside} into the body's"
-    remedy = "reverse its x, y and z (scale: -1)"
-    yield (np.arange(4), np.array([1.0, -1.0, -1.0, -1.0])), all_axes, False, "severe", words, remedy
+    yield _Meaning(signs=(1.0, -1.0, -1.0, -1.0)), words, "reverse its x, y and z (scale: -1)"
     for axes, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         pairs = zip(_ABOUT, (log.names[body.rates[axis]] for axis in axes), signs, strict=True)
         about = ", ".join(f"about {axis} {'minus ' * (sign < 0.0)}{rate}" for axis, rate, sign in pairs)
         words = f"the quaternion of {name} turns as if the angular velocities were {about}"
-        remedy = "correct the order and the signs of the columns"
-        yield plain, (np.array(axes), np.array(signs)), False, "severe", words, remedy
+        yield _Meaning(axes=axes, factors=signs), words, "correct the order and the signs of the columns"
 
 
-def _lag(log: Log, body: Turning, plain: float, settings: AuditSettings) -> int | None:
-    """Rows by which the angular velocities are late, if that explains most of what they leave."""
-    quaternion, rates = (np.array(body.quaternion), np.ones(4)), (np.array(body.rates), np.ones(3))
-    left = {lag: _unexplained_turns(log, body, quaternion, rates, settings, lag=lag) for lag in _LAGS}
-    known = {lag: share for lag, share in left.items() if share is not None}
-    if not known or plain <= settings.turned:
-        return None
-    lag = min(known, key=lambda one: known[one])
-    return lag if known[lag] < settings.better_orientation * plain else None
+def _lag(log: Log, body: Turning, plain: float, settings: AuditSettings) -> int:
+    """Rows by which the angular velocities are late, if that explains most of what they leave; else 0."""
+    left = {lag: _unexplained_turns(log, body, _Meaning(lag=lag), settings) for lag in _LAGS}
+    share, lag = min(((share, lag) for lag, share in left.items() if share is not None), default=(plain, 0))
+    return lag if share < settings.better_orientation * plain else 0
 
 
 def _velocity(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
@@ -144,29 +150,22 @@ def _velocity(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]
     return [Finding(CHECK, "severe" if plain > settings.turned else "warning", words, None, remedy)]
 
 
-def _unexplained_turns(
-    log: Log,
-    body: Turning,
-    quaternion: tuple[np.ndarray, np.ndarray],
-    rates: tuple[np.ndarray, np.ndarray],
-    settings: AuditSettings,
-    outside: bool = False,
-    lag: int = 0,
-) -> float | None:
+def _unexplained_turns(log: Log, body: Turning, meaning: _Meaning, settings: AuditSettings) -> float | None:
     """Share of the squared rotations that angular velocities leave unexplained, at the best span; None at rest.
 
     A constant offset of the angular velocities is left out.
     """
-    wrong, (axes, factors) = _wrong(log, body, settings), rates
-    turned = factors * 0.5 * log.dt * (log.observation + log.following)[:, axes]
-    integral, left, sizes = _integral(np.roll(turned, -lag, axis=0)), [], []
+    quaternion, rates = np.take(body.quaternion, meaning.order), np.take(body.rates, meaning.axes)
+    wrong = _wrong(log, body, settings)
+    turned = np.array(meaning.factors) * 0.5 * log.dt * (log.observation + log.following)[:, rates]
+    integral, left, sizes = _integral(np.roll(turned, -meaning.lag, axis=0)), [], []
     for rows in _SPANS:
-        starts = _whole(log, rows, wrong, margin=abs(lag))
+        starts = _whole(log, rows, wrong, margin=abs(meaning.lag))
         if len(starts) < 20:
             break
-        before = _rotation(log.observation[starts], quaternion)
-        after = _rotation(log.following[starts + rows - 1], quaternion)
-        rotated = (after * before.inv() if outside else before.inv() * after).as_rotvec()
+        before = _rotation(log.observation[starts], quaternion, meaning.signs)
+        after = _rotation(log.following[starts + rows - 1], quaternion, meaning.signs)
+        rotated = (after * before.inv() if meaning.outside else before.inv() * after).as_rotvec()
         size = float(np.median(np.linalg.norm(rotated, axis=1)))
         if size > _SMALL and left:
             break
@@ -180,9 +179,7 @@ def _unexplained_moves(log: Log, body: Turning, wrong: np.ndarray, turned: bool)
     """The same share of the displacements that a velocity leaves unexplained, as it is or turned by the quaternion."""
     velocity = 0.5 * log.dt * (log.observation + log.following)[:, body.velocity]
     if turned:
-        velocity[~wrong] = _rotation(log.observation[~wrong], (np.array(body.quaternion), np.ones(4))).apply(
-            velocity[~wrong]
-        )
+        velocity[~wrong] = _rotation(log.observation[~wrong], body.quaternion).apply(velocity[~wrong])
     integral, left = _integral(velocity), []
     for rows in _SPANS:
         starts = _whole(log, rows, wrong)
@@ -198,9 +195,8 @@ def _whole(log: Log, rows: int, wrong: np.ndarray, margin: int = 0) -> np.ndarra
     return starts[bad[starts + rows] == bad[starts]]
 
 
-def _rotation(rows: np.ndarray, quaternion: tuple[np.ndarray, np.ndarray]) -> Rotation:
-    columns, signs = quaternion
-    return Rotation.from_quat(rows[:, columns] * signs, scalar_first=True)
+def _rotation(rows: np.ndarray, columns: Sequence[int] | np.ndarray, signs: Sequence[float] = (1.0,) * 4) -> Rotation:
+    return Rotation.from_quat(rows[:, columns] * np.array(signs), scalar_first=True)
 
 
 def _integral(steps: np.ndarray) -> np.ndarray:

@@ -153,9 +153,6 @@ class AuditSettings:
     unrelated: float = 0.05
     """Share of the variance beyond friction that actions explain at their best lag, below which they may belong to
     another run."""
-    foreign_significance: float = 3.0
-    """Standard errors by which the gain of all motors together must be below ``gain_warning`` for actions that surely
-    belong to another run."""
     action_lags: tuple[int, int] = (-5, 40)
     """Rows by which actions may act early or late."""
     clear_lag: int = 4
