@@ -70,6 +70,13 @@ def test_a_sound_flight_has_no_findings(flight, simulation):
     assert of_kinematics(*flight, simulation) == []
 
 
+def test_noise_on_the_quaternion_with_which_an_episode_begins_is_no_finding(flight, simulation):
+    """Gymnasium's Ant begins so; MuJoCo makes it a unit quaternion in the first step."""
+    rows = flight[0].copy()
+    rows[0, QUATERNION] *= 0.92
+    assert of_kinematics(rows, flight[1], simulation) == []
+
+
 def in_degrees(rows):
     rows[:, RATES] *= 180.0 / np.pi
 

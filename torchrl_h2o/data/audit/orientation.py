@@ -42,7 +42,9 @@ def check_orientation(log: Log, settings: AuditSettings) -> list[Finding]:
 
 
 def _quaternion(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
-    found, wrong = [], _wrong(log, body, settings)
+    found, wrong = [], _wrong(log, body, settings.quaternion_norm)
+    if wrong.mean() <= settings.many_repeated:  # an episode may begin with noise on its quaternion
+        wrong = _wrong(log, body, settings.lost_norm)
     if wrong.mean() > settings.lost_quaternions:
         norm = np.median(np.linalg.norm(log.observation[wrong][:, body.quaternion], axis=1))
         words = (
@@ -59,10 +61,10 @@ def _quaternion(log: Log, body: Turning, settings: AuditSettings) -> list[Findin
     return found
 
 
-def _wrong(log: Log, body: Turning, settings: AuditSettings) -> np.ndarray:
-    """Transitions before or after which the four numbers are no unit quaternion, (T,)."""
+def _wrong(log: Log, body: Turning, distance: float) -> np.ndarray:
+    """Transitions before or after which the norm of the four numbers is further from 1 than a distance, (T,)."""
     norms = (np.linalg.norm(rows[:, body.quaternion], axis=1) for rows in (log.observation, log.following))
-    return np.any([~(np.abs(norm - 1.0) <= settings.quaternion_norm) for norm in norms], axis=0)
+    return np.any([~(np.abs(norm - 1.0) <= distance) for norm in norms], axis=0)
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ def _velocity(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]
     """Whether a free body's velocity is in its own axes, as in a robot's odometry."""
     if not body.place or not body.velocity:
         return []
-    wrong = _wrong(log, body, settings)
+    wrong = _wrong(log, body, settings.quaternion_norm)
     plain, other = (_unexplained_moves(log, body, wrong, turned) for turned in (False, True))
     if plain is None or other is None or not other < settings.better_orientation * plain:
         return []
@@ -156,7 +158,7 @@ def _unexplained_turns(log: Log, body: Turning, meaning: _Meaning, settings: Aud
     A constant offset of the angular velocities is left out.
     """
     quaternion, rates = np.take(body.quaternion, meaning.order), np.take(body.rates, meaning.axes)
-    wrong = _wrong(log, body, settings)
+    wrong = _wrong(log, body, settings.quaternion_norm)
     turned = np.array(meaning.factors) * 0.5 * log.dt * (log.observation + log.following)[:, rates]
     integral, left, sizes = _integral(np.roll(turned, -meaning.lag, axis=0)), [], []
     for rows in _SPANS:

@@ -102,6 +102,8 @@ class AuditSettings:
 
     quaternion_norm: float = 0.05
     """Distance of a quaternion's norm from 1 from which it is none."""
+    lost_norm: float = 0.5
+    """The same distance in few rows: a tracker that has lost the body writes zeros."""
     lost_quaternions: float = 0.001
     """Share of rows with other numbers from which they are named; severe beyond ``many_repeated``."""
     turned: float = 0.2
