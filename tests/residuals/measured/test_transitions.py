@@ -121,6 +121,32 @@ def test_named_logs_are_reported_on_and_chosen_by_no_fit():
         of(data, held_out=[0, 1, 2, 3])
 
 
+def four_logs(actions_of_the_first_two):
+    """Logs of 75 rows, of which the last is reported on; each moves for its first 25 rows only."""
+    data, row = ted(), torch.arange(300)
+    data["log"] = row // 75
+    moves = (row % 75 < 25)[:, None]
+    data["observation"] *= moves
+    data["next", "observation"][:-1] = data["observation"][1:]
+    data["next", "done"][74::75] = True
+    data["action"] *= torch.where(row < 150, actions_of_the_first_two, 1.0)[:, None] * moves
+    return data
+
+
+def test_each_of_several_logs_is_divided_where_they_differ_in_kind():
+    """The first two logs have hardly any action, so no gain of a motor could be fitted to them."""
+    split = of(four_logs(0.1)).split.reshape(4, 75)
+    assert (split[3] == Split.REPORT).all()
+    for part in split[:3]:
+        assert (np.diff(part) >= 0).all()
+        assert 10 < (part == Split.FIT).sum() < 25  # the motion is divided, not the rows
+
+
+def test_whole_logs_are_fitted_or_chosen_by_where_they_are_alike():
+    split = of(four_logs(1.0)).split.reshape(4, 75)
+    assert [set(part.tolist()) for part in split] == [{Split.FIT}, {Split.FIT}, {Split.SELECTION}, {Split.REPORT}]
+
+
 def test_time_is_read_and_otherwise_counted_in_control_steps():
     data = ted()
     assert of(data).time[10] == pytest.approx(0.2)

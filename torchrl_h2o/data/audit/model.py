@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
 
+from torchrl_h2o.data.audit.absolute import Change, absolute_angles
 from torchrl_h2o.data.audit.actions import friction_dominates, reversed_action
 from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.log import Pair
@@ -16,7 +18,6 @@ from torchrl_h2o.data.audit.unexplained import percent, unexplained
 from torchrl_h2o.data.audit.zeros import check_large_zeros, check_small_zeros
 
 CHECK = "model"
-Change = Callable[[np.ndarray], np.ndarray]
 
 
 def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
@@ -36,12 +37,33 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
         if left < best and misfit - left > 0.1:
             best, words = left, what
     if words is None:
-        return check_large_zeros(response, settings) or check_small_zeros(response, settings)
+        absolute = _absolute(few, settings)
+        return absolute or check_large_zeros(response, settings) or check_small_zeros(response, settings)
     # a reversed action of one joint can look like a reversed joint
     if any(few.misfit(actions=reversed_action(index)) <= best for index in range(len(few.log.actuators))):
         return []
     explained = f"the simulator leaves {percent(misfit)} of the accelerations unexplained, and {percent(best)} if "
     return [Finding(CHECK, "severe", explained + words, None, "correct units, signs or order of the columns")]
+
+
+def _absolute(response: Response, settings: AuditSettings) -> list[Finding]:
+    """Angles in the world instead of to the parent link, with which gains, friction and zeros explain the log.
+
+    If these leave much unexplained, the simulator lacks too much to tell: then wrong columns may fit better by chance.
+    """
+    plain, best, words = math.inf, settings.misfit, None
+    for change, what in absolute_angles(response.log.pairs, response.simulation.model):
+        plain = unexplained(response, settings) if plain == math.inf else plain
+        left = unexplained(response.changed(change), settings)
+        if left < min(best, settings.better * plain):
+            best, words = left, what
+    if words is None:
+        return []
+    explained = (
+        f"gains, friction and zeros leave {percent(plain)} of the accelerations unexplained, and {percent(best)} if "
+    )
+    remedy = "subtract the parent link's angle and velocity from these columns"
+    return [Finding(CHECK, "severe", explained + words, None, remedy)]
 
 
 def _hypotheses(pairs: tuple[Pair, ...]) -> Iterator[tuple[Change, str]]:
@@ -93,5 +115,8 @@ def check_belonging(response: Response, settings: AuditSettings) -> list[Finding
     if not left > settings.foreign or friction_dominates(response, settings):
         return []
     words = f"the simulator leaves {percent(left)} of the accelerations unexplained, with any "
-    words += "gains, friction and zeros: another robot's log, or noise as large as the motion"
+    words += (
+        "gains, friction and zeros: another robot's log, a model that lacks much (rotors, a load), or noise as large "
+    )
+    words += "as the motion"
     return [Finding(CHECK, "warning", words, None, "check that model and log belong together")]

@@ -85,6 +85,13 @@ class Response:
         most = self.settings.hypothesis_steps // (self.simulation.frame_skip * self.horizon)
         return self.thinned(int(np.clip(most, 30, self.settings.hypothesis_windows)))
 
+    def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Response:
+        """The same windows with changed observations (..., n)."""
+        observation, following = change(self.log.observation), change(self.log.following)
+        moved = observation[self.starts] - self.log.observation[self.starts]
+        states = self.states + moved @ self.simulation.state_map.restore.T
+        return replace(self, log=replace(self.log, observation=observation, following=following), states=states)
+
     @property
     def before(self) -> np.ndarray:
         """Measured velocities at the start of each window, (W, m)."""

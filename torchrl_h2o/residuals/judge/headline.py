@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
+from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, thinned
@@ -34,7 +35,7 @@ def headline_horizon(
         steps = max(1, round(seconds / simulation.control_step))
         if len(measured.reported_on(steps)) < settings.headline_windows:
             break
-        chosen, starts = steps, thinned(measured.fitted(steps), settings.noise_windows)
+        chosen, starts = steps, _fitted_in_motion(measured, steps, settings)
         if sensor_std is None or not len(starts):
             break
         if error_over_noise(simulation, measured, starts, steps, sensor_std, rng).max() > settings.headline_stands_out:
@@ -51,7 +52,8 @@ def headline_error(
 ) -> HeadlineError:
     """The median error some steps ahead of the quantity in which it is largest, in units of the quantity's spread.
 
-    A position is preferred to a velocity, because it is easier to picture. Quantities whose error is that of their
+    The median is over the windows in which something moves. A position is preferred to a velocity, because it is
+    easier to picture. Quantities whose error is that of their
     sensor, such as the angle of a body that does not turn, are left out if there are others.
 
     Args:
@@ -61,7 +63,7 @@ def headline_error(
         steps: control steps ahead.
         settings: what counts as more than noise.
     """
-    starts = measured.reported_on(steps)
+    starts = in_motion(measured, measured.reported_on(steps), steps, settings.headline_windows)
     before, after = (_median(which, measured, starts, steps) for which in (simulation, mended))
     names, units = simulation.state_map.names, simulation.state_map.units
     spread = np.maximum(measured.observation.std(0), 1e-12)
@@ -77,11 +79,17 @@ def headline_error(
 
 def _beyond_noise(simulation: Simulation, measured: Measured, steps: int, settings: JudgeSettings) -> np.ndarray:
     """Quantities whose error, on the part of the data for fits, clearly exceeds what sensor noise causes, (n,)."""
-    sensor_std, starts = sensor_noise(simulation, measured), thinned(measured.fitted(steps), settings.noise_windows)
+    sensor_std, starts = sensor_noise(simulation, measured), _fitted_in_motion(measured, steps, settings)
     if sensor_std is None or not len(starts):
         return np.ones(len(simulation.state_map.names), bool)
     ratio = error_over_noise(simulation, measured, starts, steps, sensor_std, np.random.default_rng(0))
     return ratio > settings.headline_least
+
+
+def _fitted_in_motion(measured: Measured, steps: int, settings: JudgeSettings) -> np.ndarray:
+    """First rows of windows for fits in which something moves, thinned to the settings' number."""
+    starts = in_motion(measured, measured.fitted(steps), steps, settings.headline_windows)
+    return thinned(starts, settings.noise_windows)
 
 
 def _median(simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.errors import HeadlineError
@@ -31,8 +32,9 @@ def made_worse(
     Returns:
         One clause, or nothing if no error rises by enough and significantly.
     """
-    starts = measured.reported_on(steps)
-    if len(starts) < settings.verdict.far_windows:
+    least = settings.verdict.far_windows
+    starts = in_motion(measured, measured.reported_on(steps), steps, least)
+    if len(starts) < least:
         return ()
     names, units = simulation.state_map.names, simulation.state_map.units
     worst = settings.residual.worst * np.maximum(measured.observation.std(0), 1e-12)

@@ -14,6 +14,7 @@ from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.judge.short_delays import short_delays
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
+from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.missing_force import MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -140,7 +141,8 @@ def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSetting
     sensor_std = sensor_noise(simulation, measured)
     if sensor_std is None:
         sensor_std = np.zeros(len(names))
-    starts, rng = measured.reported_on(steps), np.random.default_rng(0)
+    starts = in_motion(measured, measured.reported_on(steps), steps, rules.far_windows)
+    rng = np.random.default_rng(0)
     error, by_noise = errors_and_noise(simulation, measured, starts, steps, sensor_std, rng)
     if len(error) < rules.far_windows:
         return ()

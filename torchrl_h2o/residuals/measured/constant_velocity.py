@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import Effect, selection
+from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals, start_states, undelayed_following
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
@@ -42,6 +43,8 @@ def errors_ahead(
 ) -> list[ErrorsAhead]:
     """Errors of a simulator and of the guess at the times ahead of the report's sentence, in ascending order.
 
+    Windows in which nothing moves are left out, because no simulator beats the guess there.
+
     Args:
         simulation: the simulator.
         measured: the data.
@@ -52,7 +55,7 @@ def errors_ahead(
     states, following = start_states(simulation, measured), undelayed_following(simulation, measured)
     negligible = settings.verdict.worse_negligible * np.maximum(measured.observation.std(0), 1e-12)
     for steps in sorted({max(1, round(time / simulation.control_step)) for time in rules.headline_seconds}):
-        starts = measured.spread_windows(split, steps)
+        starts = in_motion(measured, measured.spread_windows(split, steps), steps, rules.headline_windows)
         if len(starts) < rules.headline_windows:
             continue
         missed = residuals(simulation, measured, starts, steps, states=states)[:, -1]

@@ -18,6 +18,14 @@ class MeasuredSettings:
     """Share of the transitions that are not reported on, by which effects are chosen; a fifth of all by default."""
     border_moves: float = 0.1
     """Share of the transitions by which a border between two parts of the data moves to the end of a run."""
+    alike: float = 0.5
+    """Ratio of a column's spreads in two parts of several logs below which the logs differ in kind."""
+    rest: float = 2.0
+    """Standard deviation of a reading in a window, in that of its noise, up to which it stands still there."""
+    least_rest: float = 1e-3
+    """The same in spreads, for sensors without noise."""
+    most_rest: float = 0.05
+    """The same in spreads, for sensors so noisy, or rows so far apart, that their noise cannot be told from motion."""
     max_windows: int = 3500
     """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
     max_diverged: float = 0.1

@@ -85,7 +85,8 @@ class Measured:
         """Converts a TED TensorDict, checks its widths against the simulation, and divides it into three parts.
 
         The parts are consecutive rows: those for fits, those for the selection of effects, those for the report. A
-        border moves to the nearest end of a run if there is one near it.
+        border moves to the nearest end of a run if there is one near it. Several logs that differ in kind, such as free
+        swings and driven ones, are each divided into rows for fits and rows for the selection; see :func:`divided`.
 
         Args:
             data: batch size (T,), as the readers of :mod:`torchrl_h2o.data` return it; with the entry ``"log"`` if the
@@ -118,7 +119,7 @@ class Measured:
             run,
             _float64(data["time"]).flatten() if "time" in data.keys() else step,
             ~clipped,
-            divided(run, logs, held_out, settings, source=str(source)),
+            divided(run, logs, held_out, np.hstack([observation, action]), settings, source=str(source)),
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
             settings,
@@ -245,17 +246,23 @@ def divided(
     run: np.ndarray,
     logs: np.ndarray,
     held_out: float | Collection[int],
+    columns: np.ndarray,
     settings: MeasuredSettings = DEFAULTS.measured,
     *,
     source: str = "transitions",
 ) -> np.ndarray:
     """Divides transitions into the parts for fits, for the selection of effects, and for the report.
 
+    Whole logs are fitted or selected on if they are alike. If they are of different kinds, one kind alone could neither
+    determine nor judge every effect: no motor shows its gain in logs of free swings. Each log is then divided at the
+    row at which the share of its motion for fits has passed.
+
     Args:
         run: (T), index of each transition's run, ascending.
         logs: (T), index of each transition's log.
         held_out: share of the transitions, from the end, on which errors are reported, or the indices of these logs.
-        settings: share of the selection, and how far a border moves to the end of a run.
+        columns: (T, c), observations and actions, by whose spreads logs differ in kind.
+        settings: share of the selection, how far a border moves to the end of a run, and which logs are alike.
         source: name of the data in errors.
 
     Returns:
@@ -265,7 +272,8 @@ def divided(
         DataError: if the logs of the report are all logs, or none.
 
     Examples:
-        >>> divided(np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2]), np.zeros(10, int), 0.3).tolist()
+        >>> run = np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2])
+        >>> divided(run, np.zeros(10, int), 0.3, np.zeros((10, 1))).tolist()
         [0, 0, 0, 0, 0, 1, 1, 2, 2, 2]
     """
     split = np.full(len(run), Split.FIT)
@@ -280,8 +288,29 @@ def divided(
                 source=source,
             )
     rest = np.flatnonzero(split == Split.FIT)
-    split[rest[_border(run[rest], 1.0 - settings.selection, settings) :]] = Split.SELECTION
+    border = _border(run[rest], 1.0 - settings.selection, settings)
+    if len(np.unique(logs[rest])) > 1 and not _alike(columns[rest[:border]], columns[rest[border:]], settings):
+        spread = np.maximum(columns[rest].std(0), 1e-12)
+        for log in np.unique(logs[rest]):
+            rows = rest[logs[rest] == log]
+            split[rows[_share_of_motion(columns[rows] / spread) > 1.0 - settings.selection]] = Split.SELECTION
+    else:
+        split[rest[border:]] = Split.SELECTION
     return split
+
+
+def _alike(some: np.ndarray, others: np.ndarray, settings: MeasuredSettings) -> bool:
+    """Whether each column spreads in some rows about as in the others."""
+    if not len(some) or not len(others):
+        return True
+    low, high = np.sort([some.std(0), others.std(0)], axis=0)
+    return bool((low >= settings.alike * high).all())
+
+
+def _share_of_motion(scaled: np.ndarray) -> np.ndarray:
+    """Share of a log's motion, (T), that has passed at the end of each row: of the sum of the squared deviations."""
+    passed = np.cumsum(((scaled - scaled.mean(0)) ** 2).sum(1))
+    return passed / passed[-1] if passed[-1] > 0.0 else np.arange(1, len(scaled) + 1) / len(scaled)
 
 
 def _border(run: np.ndarray, share: float, settings: MeasuredSettings) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
+from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, HorizonSettings, LoopSettings
@@ -38,7 +39,8 @@ def choose_horizon(
     rules = settings.horizon
     best, most = 1, 0.0
     for horizon in possible_horizons(simulation, measured, rules):
-        starts = thinned(measured.fitted(horizon), rules.windows)
+        moving = in_motion(measured, measured.fitted(horizon), horizon, rules.min_fitted)
+        starts = thinned(moving, rules.windows)
         ratio = float(error_over_noise(simulation, measured, starts, horizon, sensor_std, rng).max())
         if horizon == 1 or ratio > max(rules.longer_gain * most, rules.least_ratio):
             best, most = horizon, ratio

@@ -154,11 +154,19 @@ def _from_longer_windows(
     progress: LoopBar,
     found: Callable[[SearchState], object],
 ) -> SearchState:
-    """What a search in longer windows finds, if it finds other effects than the first one; else the first one's."""
+    """What a search in longer windows finds, if it finds other effects than the first one; else the first one's.
+
+    If the time ends before, a list that is significantly better than the first one's has been handed to ``found``.
+    """
     longer = begin_in_longer_windows(state, catalogue, rng, progress)
     if longer is None:
         return state
-    grown = replace(grow(longer, rng, progress), chosen_horizon=state.problem.horizon)
+
+    def so_far(grown: SearchState) -> None:
+        if is_beaten_by(longer, grown):
+            found(replace(grown, chosen_horizon=state.problem.horizon))
+
+    grown = replace(grow(longer, rng, progress, so_far), chosen_horizon=state.problem.horizon)
     same = {entry.name for entry in grown.entries} == {entry.name for entry in state.entries}
     if same or is_beaten_by(grown, longer):
         progress.show_found(state.entries)

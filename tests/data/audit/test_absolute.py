@@ -1,0 +1,57 @@
+"""Angles of links in the world, where the model counts from the parent link."""
+
+from dataclasses import replace
+
+import pytest
+
+from tests.data.audit.recorded import recording
+from torchrl_h2o.data.audit import audit
+from torchrl_h2o.data.audit.absolute import absolute_angles
+from torchrl_h2o.data.audit.log import Log
+from torchrl_h2o.effects import ActionGain, Armature, BodyMass, JointFrictionLoss
+
+
+def in_the_world(log):
+    """The same recording with the elbow's angle and velocity as sums with those of the shoulder."""
+    changed = [rows.copy() for rows in (log.observation, log.following)]
+    for rows in changed:
+        rows[:, [1, 3]] += rows[:, [0, 2]]
+    return replace(log, observation=changed[0], following=changed[1])
+
+
+def words_of(log, simulation):
+    return [finding.words for finding in audit(log, simulation).findings if "the link in the world" in finding.words]
+
+
+def test_an_elbow_whose_angle_is_counted_from_the_world_is_found(good, simulation):
+    (finding,) = [one for one in audit(in_the_world(good), simulation).severe if one.check == "model"]
+    assert "elbow and its velocity are counted from the parent link" in finding.words
+    assert "in the world, which also contains shoulder" in finding.words
+
+
+@pytest.mark.parametrize("effects", [(ActionGain(1.5), Armature(0.002)), (BodyMass(2.2), JointFrictionLoss(0.05))])
+def test_it_is_found_beside_effects_that_the_simulator_lacks(effects, simulation):
+    log = recording(*effects)
+    assert words_of(log, simulation) == []
+    assert len(words_of(in_the_world(log), simulation)) == 1
+
+
+def test_it_is_not_said_where_the_simulator_lacks_too_much_to_tell(simulation):
+    """Beside such a rotor, the world's angles fit 14 times better, though those of the log are relative."""
+    log = recording(Armature(0.051), JointFrictionLoss(0.31), BodyMass(2.5), ActionGain(0.6))
+    assert words_of(log, simulation) == []
+
+
+def test_only_joints_with_a_parallel_joint_above_are_concerned(good, simulation):
+    pairs = Log.of(good, simulation).pairs
+    ((change, words),) = absolute_angles(pairs, simulation.model)
+    assert words.startswith("elbow")
+    assert change(in_the_world(good).observation) == pytest.approx(good.observation)
+    crossed = replace(simulation, spec=lambda: _with_crossed_elbow(simulation))
+    assert list(absolute_angles(pairs, crossed.model)) == []
+
+
+def _with_crossed_elbow(simulation):
+    spec = simulation.spec()
+    spec.joint("elbow").axis = [1, 0, 0]
+    return spec

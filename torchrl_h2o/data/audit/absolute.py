@@ -1,0 +1,65 @@
+"""Angles that are counted from the world, or from the base, where the model counts them from the parent link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.data.audit.log import Pair
+
+Change = Callable[[np.ndarray], np.ndarray]
+_PARALLEL = 0.999  # cosine of the angle between two joints' axes
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+def absolute_angles(pairs: tuple[Pair, ...], model: Any) -> Iterator[tuple[Change, str]]:
+    """Changes of the observations (..., n) that make angles relative to the parent link, and what each would mean.
+
+    A belt from a motor at the base, or an inertial sensor on a link, gives the angle of a link in the world. Only
+    angles about parallel axes differ by a sum, so only joints with such an ancestor are concerned.
+
+    Args:
+        pairs: columns of the joints' angles and velocities.
+        model: the ``mujoco.MjModel``.
+    """
+    above = {pair: found for pair in pairs if (found := _nearest_parallel(pair, pairs, model)) is not None}
+    for pair, (parent, sign) in above.items():
+        words = f"{pair.name} and its velocity are counted from the parent link: they look like the angle of the link "
+        yield _relative({pair: (parent, sign)}), f"{words}in the world, which also contains {parent.name}"
+    if len(above) > 1:
+        names = ", ".join(pair.name for pair in above)
+        words = f"{names} and their velocities are counted from the parent links: they look like the links' angles in "
+        yield _relative(above), words + "the world"
+
+
+def _nearest_parallel(pair: Pair, pairs: tuple[Pair, ...], model: Any) -> tuple[Pair, float] | None:
+    """The nearest hinge above a hinge whose axis is parallel, and the sign by which their angles add up."""
+    by_joint = {int(model.dof_jntid[other.dof]): other for other in pairs if other.angle}
+    joint = int(model.dof_jntid[pair.dof])
+    if joint not in by_joint:
+        return None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    body = int(model.body_parentid[model.jnt_bodyid[joint]])
+    while body:
+        first = int(model.body_jntadr[body])
+        for other in range(first, first + int(model.body_jntnum[body])):
+            cosine = float(data.xaxis[joint] @ data.xaxis[other])
+            if other in by_joint and int(model.jnt_type[other]) == _HINGE and abs(cosine) > _PARALLEL:
+                return by_joint[other], float(np.sign(cosine))
+        body = int(model.body_parentid[body])
+    return None
+
+
+def _relative(above: dict[Pair, tuple[Pair, float]]) -> Change:
+    def change(observations: np.ndarray) -> np.ndarray:
+        changed = observations.copy()
+        for pair, (parent, sign) in above.items():
+            changed[..., pair.position] -= sign * observations[..., parent.position]
+            changed[..., pair.velocity] -= sign * observations[..., parent.velocity]
+        return changed
+
+    return change
