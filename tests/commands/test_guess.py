@@ -38,7 +38,7 @@ def test_a_first_layout_is_written_and_can_be_read(folder, capsys, monkeypatch):
     printed = capsys.readouterr().out
     assert "log.yaml describes the columns of log.csv; correct it, then run" in printed
     assert "close-the-loop simulator=robot.xml data=log.csv columns=log.yaml" in printed
-    chosen = "slider_pos: slider, slider_pos_velocity: slider_velocity, hip.angle [deg]: hip, hip.rate: hip_velocity"
+    chosen = r"slider_pos: slider, slider_pos_velocity: slider_velocity, hip.angle \[deg\]: hip, hip.rate: hip_velocity"
     for pair in chosen.split(", "):
         assert pair in printed
     layout = LogColumns.load("log.yaml")

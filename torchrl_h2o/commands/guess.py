@@ -8,6 +8,7 @@ from pathlib import Path
 
 import mujoco
 
+from torchrl_h2o.commands.column_names import as_key
 from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.layout_text import Coordinates, guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
@@ -78,6 +79,6 @@ def _pushes(model: mujoco.MjModel, actuator: int) -> bool:
 def _command(given: dict[str, str], path: Path, coordinates) -> str:
     words = [f"simulator={given.get('simulator', 'robot.xml')}", f"data={given['data']}", f"columns={path}"]
     if coordinates:
-        pairs = ", ".join(f"{name}: {other}" for name, other in coordinates.items())
+        pairs = ", ".join(f"{as_key(name)}: {other}" for name, other in coordinates.items())
         words.append(f"simulator.coordinates={{{pairs}}}")
     return shlex.join(["close-the-loop", *words])

@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDictBase
 
+from torchrl_h2o.commands.column_names import column_of
 from torchrl_h2o.data import LogColumns, load, sources_of
 from torchrl_h2o.data.audit.log import find_turning
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
@@ -104,11 +105,12 @@ class Recording:
                 f"{self.source} does not name its columns; list the model coordinate of each column, such as "
                 "simulator.coordinates=[hip,hip_velocity]"
             )
-        names, other = self.columns.observation, dict(chosen or {})
-        unknown = [column for column in other if column not in names]
-        if unknown:
-            raise ValueError(f"simulator.coordinates names {unknown[0]!r}, but the log observes {', '.join(names)}")
-        return {name: other.get(name, name) for name in names}
+        names, found = self.columns.observation, {name: name for name in self.columns.observation}
+        for key, coordinate in (chosen or {}).items():
+            if (column := column_of(key, names)) is None:
+                raise ValueError(f"simulator.coordinates names {key!r}, but the log observes {', '.join(names)}")
+            found[column] = coordinate
+        return found
 
     def control_step(self) -> float:
         """Time between two rows, in s, from the description of the columns or from the time stamps.

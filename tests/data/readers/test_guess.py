@@ -35,6 +35,7 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
         ("motor1_pos_deg", "position", "deg"),
         ("kneeTorque_Nm", "action", "Nm"),
         ("i_q current", "action", "A"),
+        ("iq_2", "action", "A"),
         ("motor_volts", "action", "V"),
         ("pwm", "action", "1"),
         ("tau_des", "action", "N·m"),
@@ -158,6 +159,13 @@ def test_of_several_columns_left_none_is_taken_for_the_action(tmp_path):
     model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
     text = guessed(tmp_path, "time,q,drive,other", [TIME, ANGLE, COMMAND, COMMAND], model)
     assert "role: action" not in text
+
+
+def test_a_numbered_column_that_keeps_its_sign_is_an_action_beside_one_that_does_not(tmp_path):
+    model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor1", "motor2"])
+    text = guessed(tmp_path, "time,q,i1,i2", [TIME, ANGLE, COMMAND, COMMAND + 2.0], model)
+    assert '"i1", role: action' in text
+    assert '"i2", role: action' in text
 
 
 @pytest.mark.parametrize(("name", "values"), [("temperature", COMMAND), ("ddq", COMMAND), ("drive", TIME)])

@@ -91,14 +91,15 @@ def sensitivities(response: Response) -> list[Sensitivity]:
         own = response.by_action[..., index]
         add("motor gain", label, own * actions[:, [index]])
         add("drive delay", label, own * np.where(known, late[:, index] - actions[:, index], 0.0)[:, None])
-    base = response.simulated + response.before
+    logged = response.limited[response.rows]  # the simulation of ``response.simulated`` may be one without actions
+    base = response.reached(response.states, logged)
     for effect, name in ((Gravity(1.1), "gravity"), (BodyMass(1.1), "mass")):
         try:
             other = response.simulation.with_effects(effect)
-            reached = response.reached(response.states, response.limited[response.rows], simulation=other)
+            reached = response.reached(response.states, logged, simulation=other)
         except ValueError:  # the model has no gravity or no such body
             continue
-        add(name, "", 10.0 * (reached[:, response.moving] - base))
+        add(name, "", 10.0 * (reached - base)[:, response.moving])
     return found
 
 

@@ -112,8 +112,7 @@ def _one_set(columns: Sequence[Guess]) -> list[Guess]:
     result = []
     for column in columns:
         digits = "".join(sign for sign in column.name if sign.isdigit())
-        rest = "".join(sign for sign in column.name if not sign.isdigit())
-        key = (column.kind, digits)
+        key, rest = (column.kind, digits), _family(column)
         if column.kind in ("action", "position", "velocity") and digits and kept.setdefault(key, rest) != rest:
             note = f"looks like another {column.kind}; swap the roles if this is the one to use"
             column = replace(column, kind="unknown", note=note)
@@ -160,11 +159,17 @@ def _actions_left(columns: Sequence[Guess], contents: Contents, number: int) -> 
     """The columns that nothing recognised as actions, if there are as many as actuators and no other actions."""
     values = contents.values
     left = [column for column in columns if column.kind == "unknown" and not column.note]
-    left = [column for column in left if may_be_command(column.name, np.asarray(values[column.name]))]
+    surely = {_family(column) for column in left if may_be_command(column.name, np.asarray(values[column.name]))}
+    left = [column for column in left if _family(column) in surely]
     if len(left) != number or any(column.kind == "action" for column in columns):
         return list(columns)
     note = "not recognised, but as many columns as the model has actuators are left: check role and unit"
     return [replace(column, kind="action", note=note) if column in left else column for column in columns]
+
+
+def _family(column: Guess) -> str:
+    """The name without digits: where i1 is a command, i2 is one too, also if it keeps its sign."""
+    return "".join(sign for sign in column.name if not sign.isdigit())
 
 
 def _pairs(columns: Sequence[Guess], of_body: Collection[str]) -> dict[str, str]:

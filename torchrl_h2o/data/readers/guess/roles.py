@@ -10,7 +10,16 @@ import numpy as np
 
 from torchrl_h2o.data.readers.units import UNITS, to_si
 
-_FORCES = ("tau", "torque", "torques", "effort", "force", "current", "moment")  # a commanded one is no desired position
+_CURRENTS = ("current", "cur", "curr", "iq", "amps")
+_FORCES = (
+    "tau",
+    "torque",
+    "torques",
+    "effort",
+    "force",
+    "moment",
+    *_CURRENTS,
+)  # a commanded one is no desired position
 _VOLTS = ("volt", "volts", "voltage", "vin", "vm")
 _DUTY = ("pwm", "duty")
 _WORDS = {
@@ -205,7 +214,7 @@ def _unit_of(kind: str, si: str | None, words: list[str], numbers: np.ndarray) -
             f"the largest value is {largest:.3g}; for an actuator that takes volts: unit V, scale: volts per count",
         )
     if kind == "action":
-        units = {"A": ("current",), "N": ("force",), "V": _VOLTS}
+        units = {"A": _CURRENTS, "N": ("force",), "V": _VOLTS}
         spelled = [*words, "".join(words)]
         unit = next((unit for unit, known in units.items() if any(word in known for word in spelled)), "N·m")
     elif kind not in _SI:
