@@ -5,7 +5,7 @@ import pytest
 
 from torchrl_h2o.data import LogColumns, load, read_robot_log
 from torchrl_h2o.data.readers.guess import guess_layout
-from torchrl_h2o.data.readers.guess.layout_text import Coordinates
+from torchrl_h2o.data.readers.guess.coordinates import Coordinates
 from torchrl_h2o.data.readers.guess.roles import guess_columns
 
 
@@ -31,6 +31,9 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
         ("Vin", "action", "V"),
         ("x", "position", "m"),
         ("dq1", "velocity", "rad/s"),
+        ("angleD", "velocity", "rad/s"),
+        ("angle_cos", "unknown", "rad"),
+        ("Q_squared", "unknown", "rad"),
         ("motor1_vel_rpm", "velocity", "rpm"),
         ("motor1_pos_deg", "position", "deg"),
         ("kneeTorque_Nm", "action", "Nm"),
@@ -303,3 +306,52 @@ def test_velocities_of_odometry_are_estimated_all_three(tmp_path):
 def test_velocities_of_a_body_whose_place_is_not_logged_are_not_those_of_other_joints(tmp_path):
     guessed = drone_log(tmp_path / "walk.csv", ("qw", "qx", "qy", "qz", "vx", "vy", "vz", "hip", "knee", "ankle"))
     assert guessed.coordinates["vx"] == "root_x_velocity"
+
+
+CART_POLE = Coordinates(
+    {"cart": "m", "pole": "rad", "cart_velocity": "m/s", "pole_velocity": "rad/s"}, ["Q"], forces=True
+)
+
+
+def of_cart_pole(tmp_path, names, columns):
+    np.savetxt(tmp_path / "log.csv", np.stack(columns, 1), delimiter=",", header=names, comments="")
+    return guess_layout(tmp_path / "log.csv", CART_POLE)
+
+
+def test_of_the_many_columns_of_a_cart_pole_s_log_the_state_and_the_action_are_found(tmp_path):
+    """The names are those of a public log; its order is not the model's, and one position never changes."""
+    values = {
+        "time": TIME,
+        "angle_raw": 1000.0 * ANGLE,
+        "angle": ANGLE,
+        "angleD": 4.0 * np.cos(TIME),
+        "angle_cos": np.cos(ANGLE),
+        "position": 0.1 * np.sin(3.0 * TIME),
+        "positionD": 0.3 * np.cos(3.0 * TIME),
+        "angleErr": ANGLE - 1.0,
+        "target_position": 0.1 * np.cos(TIME),
+        "Q": COMMAND,
+        "stickPos": 0.0 * TIME,
+        "Q_squared": COMMAND**2,
+    }
+    found = of_cart_pole(tmp_path, ",".join(values), [*values.values()])
+    assert found.coordinates == {
+        "angle": "pole",
+        "angleD": "pole_velocity",
+        "position": "cart",
+        "positionD": "cart_velocity",
+    }
+    kept = [name for name in values if f'"{name}", role: ignore' not in found.text]
+    assert kept == ["time", "angle", "angleD", "position", "positionD", "Q"]
+    assert '"position", role: observation, unit: "m"}' in found.text
+    assert "derivative_of" not in found.text
+
+
+def test_a_raw_column_alone_is_kept(tmp_path):
+    text = guessed(tmp_path, "time,q_raw,tau", [TIME, ANGLE, COMMAND])
+    assert '"q_raw", role: observation' in text
+
+
+def test_positions_whose_names_fit_no_joint_are_assigned_in_order(tmp_path):
+    found = of_cart_pole(tmp_path, "time,x,y,Q", [TIME, ANGLE, np.cos(TIME), COMMAND])
+    assert (found.coordinates["x"], found.coordinates["y"]) == ("cart", "pole")

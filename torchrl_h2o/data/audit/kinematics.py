@@ -27,6 +27,9 @@ _FACTORS = (
     (2.0 * np.pi, "the velocity looks like revolutions per second, the position like rad"),
     (np.pi / 30.0, "the velocity looks like rpm, the position like rad"),
 )
+_ESTIMATED = "derivative_of estimates it from the position"
+_BETTER_SENSOR = "use a better sensor, or filter positions and velocities alike before logging"
+_BETTER_VELOCITY = f"leave the column out: {_ESTIMATED}; or use a better sensor"
 
 
 def check_kinematics(
@@ -165,16 +168,13 @@ def _lag(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Find
     pair, lag = derivative.pair, derivative.lag
     if abs(lag) < 0.9:
         return []
-    late = f"{pair.velocity_name} is {'late' if lag > 0.0 else 'early'} by {abs(lag):.1f} rows "
-    return [
-        Finding(
-            CHECK,
-            "warning" if abs(lag) >= settings.lag_warning else "note",
-            f"{late}({1e3 * abs(lag) * log.dt:.3g} ms) against the derivative of {pair.name}, as a filtered velocity",
-            None,
-            "log the velocity without its filter, or leave it out: derivative_of estimates it from the position",
-        )
-    ]
+    by = f"by {abs(lag):.1f} rows ({1e3 * abs(lag) * log.dt:.3g} ms) against the derivative of {pair.name}"
+    if lag > 0.0:
+        words, remedy = f"is late {by}, as a filtered velocity", "log the velocity without its filter"
+    else:
+        words, remedy = f"is early {by}", "shift the column"
+    severity = "warning" if abs(lag) >= settings.lag_warning else "note"
+    return [Finding(CHECK, severity, f"{pair.velocity_name} {words}", None, f"{remedy}, or leave it out: {_ESTIMATED}")]
 
 
 def _bias(log: Log, derivative: Derivative, step: Response | None, settings: AuditSettings) -> list[Finding]:
@@ -218,7 +218,7 @@ def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding
                 f"{name} has noise of {noise[column]:.3g} {log.units[column]}, {noise[column] / spread:.0%} of its "
                 "standard deviation",
                 None,
-                "use a better sensor or filter positions and velocities alike before logging",
+                _BETTER_VELOCITY if column == pair.velocity else _BETTER_SENSOR,
             )
         )
     return found

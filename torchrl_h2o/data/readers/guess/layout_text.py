@@ -9,41 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
+from torchrl_h2o.data.readers.guess.coordinates import (
+    Coordinates,
+    coordinates_of,
+    estimated_velocity,
+    without_constants,
+)
 from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body, velocities_together
 from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
+from torchrl_h2o.data.readers.guess.slopes import is_wrapped, relation, time_of
 from torchrl_h2o.data.readers.units import to_si
 
 JUMP = 0.5  # share of the median step by which a step must differ for the run to end there
 UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the steps differ from the median by this share
 
-_SPANS = (1, 3, 10, 25, 60)  # rows over which displacements are compared with a velocity; the best span counts
-_MOVES = 3.0  # times by which displacements over some rows exceed those over one row where a joint moves
 _RELATED = 0.5  # correlation of both below which the column is not that velocity
-
-
-@dataclass(frozen=True)
-class Coordinates:
-    """The coordinates and actuators of a model, for their names and units.
-
-    Args:
-        units: the unit of each coordinate by its name, positions before velocities; velocities end in ``_velocity``.
-        actuators: the actuators' names.
-        servos: whether all actuators are position servos, whose commands are desired positions.
-        forces: whether all actuators push along an axis, as a propeller or a linear motor does.
-    """
-
-    units: Mapping[str, str]
-    actuators: Sequence[str]
-    servos: bool = False
-    forces: bool = False
-
-    @property
-    def quantities(self) -> dict[str, tuple[str, str | None]]:
-        """Kind and unit of each name, None for actuators; a name of a joint and an actuator is the joint's."""
-        actions: dict[str, tuple[str, str | None]] = dict.fromkeys(self.actuators, ("action", None))
-        return actions | {
-            name: ("velocity" if name.endswith("_velocity") else "position", unit) for name, unit in self.units.items()
-        }
 
 
 @dataclass(frozen=True)
@@ -84,6 +64,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     """
     contents = read_contents(path)
     columns = guess_columns(contents.values, None if model is None else model.quantities)
+    columns = columns if model is None else without_constants(columns, contents, model)
     body = FreeBody(columns, {}) if model is None else free_body(columns, contents.values, list(model.units))
     columns = body.columns
     columns = _one_set(_servo_commands(columns) if model is not None and model.servos else columns)
@@ -98,7 +79,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     pairs = {
         column.name: pairs[column.name] for column in columns if column.kind == "velocity" and column.name in pairs
     }
-    found = {} if model is None else _coordinates(columns, pairs, model, body.coordinates)
+    found = {} if model is None else coordinates_of(columns, pairs, model, body.coordinates)
     units = {column.name: column.unit for column in columns}
     columns = [_checked(column, contents, pairs, found, model, units) for column in columns]
     return GuessedLayout(
@@ -186,32 +167,6 @@ def _pairs(columns: Sequence[Guess], of_body: Collection[str]) -> dict[str, str]
     return pairs | (dict(zip(alone, rest, strict=True)) if len(alone) == len(rest) else {})
 
 
-def _coordinates(
-    columns: Sequence[Guess], pairs: Mapping[str, str], model: Coordinates, of_body: Mapping[str, str]
-) -> dict[str, str]:
-    """Return the coordinate of each position and velocity, also of the velocities that are to be estimated."""
-    taken = set(of_body.values())
-    joints = [name for name in model.units if not name.endswith("_velocity") and name not in taken]
-    positions = [column.name for column in columns if column.kind == "position" and column.name not in of_body]
-    found: dict[str, str] = {}
-    for joint in sorted(joints, key=len, reverse=True):
-        like = [name for name in positions if joint.lower() in name.lower() and name not in found]
-        if like:
-            found[min(like, key=len)] = joint
-    if not found and len(positions) == len(joints):
-        found = dict(zip(positions, joints, strict=True))
-    observed = ("position", "velocity", ORIENTATION, RATE)
-    found |= {
-        column.name: of_body[column.name] for column in columns if column.name in of_body and column.kind in observed
-    }
-    velocity_of = {position: velocity for velocity, position in pairs.items()}
-    for position, joint in list(found.items()):
-        if f"{joint}_velocity" in model.units:
-            estimated = _estimated(position, [column.name for column in columns])
-            found[velocity_of.get(position, estimated)] = f"{joint}_velocity"
-    return found
-
-
 def _checked(
     column: Guess,
     contents: Contents,
@@ -229,9 +184,8 @@ def _checked(
         if to_si(unit)[0] != to_si(model.units[coordinate])[0]:
             unit = model.units[coordinate]
         note = f"{coordinate} of the model; {note}".rstrip("; ")
-    relation = _relation(column, contents, pairs, units)
-    if relation is not None:
-        note = f"slope of {pairs[column.name]}: {relation[1]:.3g} times this; {note}"
+    if (slope := relation(column, contents, pairs, units)) is not None:
+        note = f"slope of {pairs[column.name]}: {slope[1]:.3g} times this; {note}"
     return replace(column, unit=unit, note=note)
 
 
@@ -242,65 +196,13 @@ def _without_strangers(
     units = {column.name: column.unit for column in columns}
     found, kept = [], dict(pairs)
     for column in columns:
-        relation = _relation(column, contents, pairs, units)
-        if relation is not None and abs(relation[0]) < _RELATED:
+        slope = relation(column, contents, pairs, units)
+        if slope is not None and abs(slope[0]) < _RELATED:
             del kept[column.name]
-            note = f"not the slope of {pairs[column.name]} (correlation {relation[0]:.2f}), which is estimated instead"
+            note = f"not the slope of {pairs[column.name]} (correlation {slope[0]:.2f}), which is estimated instead"
             column = replace(column, kind="unknown", note=note)
         found.append(column)
     return found, kept
-
-
-def _relation(
-    velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
-) -> tuple[float, float] | None:
-    """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
-    name = pairs.get(velocity.name, "")
-    position, values, time = contents.values.get(name), contents.values.get(velocity.name), _time(contents)
-    if position is None or values is None or time is None or len(time) < 3:
-        return None
-    if _is_wrapped(position, units[name]):
-        position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
-    steps, moved = np.diff(time), np.diff(position)
-    expected = 0.5 * (values[1:] + values[:-1]) * steps
-    usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved), 0.95)
-    good = (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
-    spans = [rows for rows in _SPANS if rows < len(time)]
-    if max(np.std(position[rows:] - position[:-rows]) for rows in spans) < _MOVES * np.std(moved):
-        return None  # noise of a joint at rest does not grow with the span
-    found = [_correlation(moved, expected, good, rows) for rows in spans]
-    return max((one for one in found if one is not None), key=lambda one: abs(one[0]), default=None)
-
-
-def _correlation(moved: np.ndarray, expected: np.ndarray, good: np.ndarray, rows: int) -> tuple[float, float] | None:
-    """Correlation of displacements over some rows with those expected, and their ratio; None where nothing moves."""
-    bad = np.concatenate([[0], np.cumsum(~good)])
-    whole = bad[rows:] == bad[:-rows]
-    sums = (np.concatenate([[0.0], np.cumsum(each)]) for each in (moved, expected))
-    moved, expected = ((each[rows:] - each[:-rows])[whole] for each in sums)
-    if len(moved) < 3:
-        return None
-    level = max(np.abs(moved).max(), 1e-300), max(np.abs(expected).max(), 1e-300)
-    moved, expected = moved - moved.mean(), expected - expected.mean()
-    if np.abs(moved).max() < 1e-6 * level[0] or np.abs(expected).max() < 1e-6 * level[1]:
-        return None  # a constant velocity has no correlation
-    size = np.sqrt((moved @ moved) * (expected @ expected))
-    return (float(moved @ expected / size), float(moved @ expected / (expected @ expected))) if size > 0.0 else None
-
-
-def _time(contents: Contents) -> np.ndarray | None:
-    """The time column in s."""
-    for guess in guess_columns(contents.values):  # a model has no name for the time
-        values = contents.values[guess.name]
-        if guess.kind == "time" and values is not None:
-            return values * to_si(guess.unit)[1]
-    return None
-
-
-def _estimated(position: str, taken: Collection[str]) -> str:
-    """Name of the estimated velocity of a position, that no column of the file has."""
-    name = f"{position}_velocity"
-    return f"{name}_estimated" if name in taken else name
 
 
 def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs: Mapping[str, str]) -> str:
@@ -314,7 +216,7 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
         lines.append("dt: 0.01  # no column of time was found: give the time between two rows in s")
     if "action" not in kinds:
         lines.append("free_motion: true  # no column of actions was found: remove this line if there is one")
-    lines += _clock(_time(contents))
+    lines += _clock(time_of(contents))
     lines.append("columns:")
     for column in columns:
         role = "observation" if column.kind in ("position", "velocity", ORIENTATION, RATE) else column.kind
@@ -324,28 +226,17 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
         elif role == "unknown":
             role, note = "ignore", note or "not recognised: observation, action or ignore?"
         unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""
-        if role in ("observation", "action") and _is_wrapped(contents.values.get(column.name), column.unit):
+        if role in ("observation", "action") and is_wrapped(contents.values.get(column.name), column.unit):
             unit += ", unwrap: true"
             note = f"jumps by a turn; {'check that it begins in the turn of its position; ' * (role == 'action')}{note}"
         comment = f"  # {note}" if note else ""
         lines.append(f'  - {{name: "{column.name}", role: {role}{unit}}}{comment}')
     for column in columns:
         if column.kind == "position" and column.name not in pairs.values():
-            entry = (
-                f'name: "{_estimated(column.name, contents.values)}", role: observation, derivative_of: "{column.name}"'
-            )
-            lines.append(f"  - {{{entry}}}  # no such column was found: it is estimated")
+            name = estimated_velocity(column.name, contents.values)
+            entry = f'{{name: "{name}", role: observation, derivative_of: "{column.name}"}}'
+            lines.append(f"  - {entry}  # no such column was found: it is estimated")
     return "\n".join(lines) + "\n"
-
-
-def _is_wrapped(values: np.ndarray | None, unit: str) -> bool:
-    """Whether an angle jumps at the end of its range: its large steps all are turns."""
-    si, factor = to_si(unit)
-    if values is None or si != "rad":
-        return False
-    steps = np.abs(np.diff(values)) * factor
-    large = steps[steps > 0.5 * np.pi]
-    return bool(len(large) and (np.abs(large - 2.0 * np.pi) < 0.2 * np.pi).all())
 
 
 def _clock(time: np.ndarray | None) -> list[str]:

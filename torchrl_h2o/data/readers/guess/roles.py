@@ -56,6 +56,7 @@ _NO_COMMANDS = (
     *("dt", "temp", "temperature", "battery", "humidity", "id", "seq", "index", "count", "error", "err", "mode"),
     *("state", "status", "acc", "acceleration", "accel", "imu", "mag"),
 )
+_COMPUTED = ("cos", "sin", "squared", "square", "sq", "err", "error", "errors")  # of another column
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 _LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 
@@ -103,11 +104,24 @@ def guess_columns(
     if len(supplies) < len(actions):
         note = "hardly changes, as the voltage of a supply"
         found = [replace(guess, kind="unknown", note=note) if guess in supplies else guess for guess in found]
+    found = [_of_another(guess, values) if _letters(guess.name) not in known else guess for guess in found]
     for kind in ("time", "done", "reward"):
         same = [i for i, guess in enumerate(found) if guess.kind == kind]
         for i in same[1:]:
             found[i] = replace(found[i], kind="unknown", note=f"another column of {kind}")
     return found
+
+
+def _of_another(guess: Guess, values: Mapping[str, np.ndarray | None]) -> Guess:
+    """The guess, or an unknown column if it holds what follows from another one, or its raw value."""
+    words, note = words_of(guess.name), ""
+    if any(word in _COMPUTED for word in words):
+        note = "follows from other columns"
+    elif "raw" in words and len(words) > 1:
+        plain = [word for word in words if word != "raw"]
+        of = next((name for name in values if words_of(name) == plain), None)
+        note = f"the raw value of {of}" if of else ""
+    return replace(guess, kind="unknown", note=note) if note else guess
 
 
 def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str, str | None]]) -> Guess:
@@ -144,6 +158,15 @@ def may_be_command(name: str, values: np.ndarray) -> bool:
     return not known and bool((steps > 0).any() and (steps < 0).any() and np.ptp(np.sign(values)) > 0)
 
 
+def kind_of_joint(name: str) -> str | None:
+    """``"m"`` or ``"rad"`` if a position's name tells that it is a length or an angle; else None."""
+    words = words_of(name)
+    if any(word in _LENGTHS for word in words):
+        return "m"
+    named = set(_WORDS["position"]).difference(_WHERE, ("joint",)) | {"angle", "angles", "pole", "deg", "rad"}
+    return "rad" if any(word in named for word in words) else None
+
+
 def is_force(name: str) -> bool:
     """Whether a column's name is that of a force, a torque or a current."""
     return any(word in _FORCES for word in words_of(name))
@@ -160,8 +183,10 @@ def _is_supply(guess: Guess, values: Mapping[str, np.ndarray | None]) -> bool:
 
 
 def words_of(name: str) -> list[str]:
-    """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2."""
+    """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2, ``angleD`` angle, dot."""
     words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+    before = ["", *words]
+    words = ["dot" if word == "d" and before[i] in _WORDS["position"] else word for i, word in enumerate(words)]
     return [part for word in words for part in _derivative(word)]
 
 

@@ -1,0 +1,70 @@
+"""Compare a column of velocities with the slope of its position."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from torchrl_h2o.data.readers.guess.contents import Contents
+from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns
+from torchrl_h2o.data.readers.units import to_si
+
+_SPANS = (1, 3, 10, 25, 60)  # rows over which displacements are compared with a velocity; the best span counts
+_MOVES = 3.0  # times by which displacements over some rows exceed those over one row where a joint moves
+
+
+def relation(
+    velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
+) -> tuple[float, float] | None:
+    """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
+    name = pairs.get(velocity.name, "")
+    position, values, time = contents.values.get(name), contents.values.get(velocity.name), time_of(contents)
+    if position is None or values is None or time is None or len(time) < 3:
+        return None
+    if is_wrapped(position, units[name]):
+        position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
+    steps, moved = np.diff(time), np.diff(position)
+    expected = 0.5 * (values[1:] + values[:-1]) * steps
+    usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved), 0.95)
+    good = (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
+    spans = [rows for rows in _SPANS if rows < len(time)]
+    if max(np.std(position[rows:] - position[:-rows]) for rows in spans) < _MOVES * np.std(moved):
+        return None  # noise of a joint at rest does not grow with the span
+    found = [_correlation(moved, expected, good, rows) for rows in spans]
+    return max((one for one in found if one is not None), key=lambda one: abs(one[0]), default=None)
+
+
+def _correlation(moved: np.ndarray, expected: np.ndarray, good: np.ndarray, rows: int) -> tuple[float, float] | None:
+    """Correlation of displacements over some rows with those expected, and their ratio; None where nothing moves."""
+    bad = np.concatenate([[0], np.cumsum(~good)])
+    whole = bad[rows:] == bad[:-rows]
+    sums = (np.concatenate([[0.0], np.cumsum(each)]) for each in (moved, expected))
+    moved, expected = ((each[rows:] - each[:-rows])[whole] for each in sums)
+    if len(moved) < 3:
+        return None
+    level = max(np.abs(moved).max(), 1e-300), max(np.abs(expected).max(), 1e-300)
+    moved, expected = moved - moved.mean(), expected - expected.mean()
+    if np.abs(moved).max() < 1e-6 * level[0] or np.abs(expected).max() < 1e-6 * level[1]:
+        return None  # a constant velocity has no correlation
+    size = np.sqrt((moved @ moved) * (expected @ expected))
+    return (float(moved @ expected / size), float(moved @ expected / (expected @ expected))) if size > 0.0 else None
+
+
+def time_of(contents: Contents) -> np.ndarray | None:
+    """The time column in s."""
+    for guess in guess_columns(contents.values):  # a model has no name for the time
+        values = contents.values[guess.name]
+        if guess.kind == "time" and values is not None:
+            return values * to_si(guess.unit)[1]
+    return None
+
+
+def is_wrapped(values: np.ndarray | None, unit: str) -> bool:
+    """Whether an angle jumps at the end of its range: its large steps all are turns."""
+    si, factor = to_si(unit)
+    if values is None or si != "rad":
+        return False
+    steps = np.abs(np.diff(values)) * factor
+    large = steps[steps > 0.5 * np.pi]
+    return bool(len(large) and (np.abs(large - 2.0 * np.pi) < 0.2 * np.pi).all())
