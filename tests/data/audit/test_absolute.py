@@ -1,14 +1,19 @@
-"""Angles of links in the world, where the model counts from the parent link."""
+"""Angles of links in the world, where the model counts from the parent link, and reversed angles."""
 
 from dataclasses import replace
 
+import mujoco
+import numpy as np
 import pytest
 
 from tests.data.audit.recorded import recording
 from torchrl_h2o.data.audit import audit
 from torchrl_h2o.data.audit.absolute import absolute_angles
-from torchrl_h2o.data.audit.log import Log
+from torchrl_h2o.data.audit.log import Log, Pair
 from torchrl_h2o.effects import ActionGain, Armature, BodyMass, JointFrictionLoss
+
+JOINT = '<joint axis="0 1 0"/><geom size="0.02"/>'
+CHAIN = f"<mujoco><worldbody><body>{JOINT}<body>{JOINT}<body>{JOINT}</body></body></body></worldbody></mujoco>"
 
 
 def in_the_world(log):
@@ -55,3 +60,23 @@ def _with_crossed_elbow(simulation):
     spec = simulation.spec()
     spec.joint("elbow").axis = [1, 0, 0]
     return spec
+
+
+def test_a_reversed_joint_is_found_where_the_simulator_lacks_friction_and_gain(simulation):
+    """The simulator's error alone does not tell it."""
+    log = recording(BodyMass(2.2), JointFrictionLoss(0.05), ActionGain(1.3))
+    changed = [rows * np.array([1.0, -1.0, 1.0, -1.0]) for rows in (log.observation, log.following)]
+    found = audit(replace(log, observation=changed[0], following=changed[1]), simulation)
+    assert "elbow and its velocity are reversed" in found.severe[0].words
+    assert audit(log, simulation).severe == ()
+
+
+def test_of_three_links_the_last_angle_in_the_world_contains_both_others():
+    model = mujoco.MjModel.from_xml_string(CHAIN)
+    pairs = tuple(Pair(f"j{i}", f"v{i}", i, 3 + i, i, i, angle=True) for i in range(3))
+    found = {words: change for change, words in absolute_angles(pairs, model)}
+    last = next(change for words, change in found.items() if words.startswith("j2"))
+    relative = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
+    assert last(np.array([0.1, 0.2, 0.6, 1.0, 2.0, 6.0])) == pytest.approx(relative)
+    every = next(change for words, change in found.items() if words.startswith("j1, j2"))
+    assert every(np.array([0.1, 0.3, 0.6, 1.0, 3.0, 6.0])) == pytest.approx(relative)

@@ -33,6 +33,11 @@ def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_pat
         ("dq1", "velocity", "rad/s"),
         ("angleD", "velocity", "rad/s"),
         ("angle_cos", "unknown", "rad"),
+        ("cur_pos", "position", "rad"),
+        ("current_position", "position", "rad"),
+        ("encD", "position", "rad"),
+        ("pitch_d", "position", "rad"),
+        ("torque_sin", "action", "N·m"),
         ("Q_squared", "unknown", "rad"),
         ("motor1_vel_rpm", "velocity", "rpm"),
         ("motor1_pos_deg", "position", "deg"),
@@ -347,9 +352,35 @@ def test_of_the_many_columns_of_a_cart_pole_s_log_the_state_and_the_action_are_f
     assert "derivative_of" not in found.text
 
 
-def test_a_raw_column_alone_is_kept(tmp_path):
+def test_a_joint_that_does_not_move_in_this_log_is_kept(tmp_path):
+    still = 0.0 * TIME
+    found = of_cart_pole(tmp_path, "time,angle,position,Q,stickPos", [TIME, ANGLE, still, COMMAND, still])
+    assert (found.coordinates["angle"], found.coordinates["position"]) == ("pole", "cart")
+    assert '"stickPos", role: ignore}  # does not change' in found.text
+
+
+def test_a_gap_far_behind_the_beginning_is_seen(tmp_path):
+    time = np.arange(9000) * 0.01
+    time[8000:] += 1.0
+    text = guessed(tmp_path, "time,q,tau", [time, np.sin(time), np.cos(7.0 * time)])
+    assert "on_time_jump: split" in text
+
+
+def test_a_raw_column_is_kept_where_no_other_one_moves(tmp_path):
     text = guessed(tmp_path, "time,q_raw,tau", [TIME, ANGLE, COMMAND])
     assert '"q_raw", role: observation' in text
+
+
+def test_a_raw_column_is_kept_beside_a_constant_one(tmp_path):
+    text = guessed(tmp_path, "time,q_raw,q,tau", [TIME, ANGLE, 0.0 * TIME, COMMAND])
+    assert '"q_raw", role: observation' in text
+
+
+def test_a_length_is_not_assigned_to_the_hinge_that_is_left(tmp_path):
+    model = Coordinates({"hip": "rad", "knee": "rad", "hip_velocity": "rad/s", "knee_velocity": "rad/s"}, ["motor"])
+    columns = np.stack([TIME, ANGLE, ANGLE, COMMAND], 1)
+    np.savetxt(tmp_path / "log.csv", columns, delimiter=",", header="t,hip_pos,height,tau", comments="")
+    assert "height" not in guess_layout(tmp_path / "log.csv", model).coordinates
 
 
 def test_positions_whose_names_fit_no_joint_are_assigned_in_order(tmp_path):

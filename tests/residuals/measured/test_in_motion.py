@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from tests.residuals.pendulum import pendulum, recorded, three_parts
 from torchrl_h2o.effects import JointDamping
 from torchrl_h2o.residuals import Split
 from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
 from torchrl_h2o.residuals.measured.in_motion import in_motion
+from torchrl_h2o.residuals.measured.moving_rows import moving_rows
 
 DAMPED = pendulum().with_effects(JointDamping(0.5))
 
@@ -39,13 +41,34 @@ def test_windows_at_rest_are_left_out_with_and_without_noise():
         assert len(moving) > 0.9 * (~still[starts]).sum()
 
 
+@pytest.mark.parametrize("steps", [1, 2, 10])
+def test_noise_alone_does_not_choose_windows(steps):
+    """In short windows, a threshold on each would keep those with the largest noise."""
+    log = recorded(DAMPED, 1500, noise=0.05)
+    assert len(in_motion(log, log.fitted(steps), steps, least=1)) > 0.95 * len(log.fitted(steps))
+
+
+def test_a_reading_that_changes_between_two_neighbouring_values_stands_still():
+    readings = np.sin(0.1 * np.arange(400.0))[:, None]
+    readings[200:] = readings[200]
+    readings = np.round(readings / 0.01) * 0.01
+    readings[250::10] += 0.01
+    moves = moving_rows(readings, np.zeros(400, int))
+    assert moves[:195].all()
+    assert not moves[210:].any()
+
+
 def test_all_windows_are_kept_if_too_few_move():
     log, _ = resting_for(0.7)
     starts = log.reported_on(10)
+    assert len(in_motion(log, starts, 10, least=1)) < len(starts)
     assert in_motion(log, starts, 10, least=len(starts)).tolist() == starts.tolist()
 
 
 def test_a_right_effect_explains_the_motion_of_a_log_that_mostly_rests():
     """At rest the guess that velocities stay as they are is exact; so most windows would speak against any effect."""
-    log, _ = resting_for(0.7, rows=3000)
-    assert explains_motion(errors_ahead(DAMPED, log, Split.REPORT), 0.8)
+    log, still = resting_for(0.7, rows=3000)
+    errors = errors_ahead(DAMPED, log, Split.REPORT)
+    moving = errors_ahead(DAMPED, replace(log, usable=~still), Split.REPORT)
+    assert explains_motion(errors, 0.8)
+    assert errors[0].guessed == pytest.approx(moving[0].guessed, rel=0.2)

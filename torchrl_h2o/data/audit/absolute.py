@@ -25,22 +25,23 @@ def absolute_angles(pairs: tuple[Pair, ...], model: Any) -> Iterator[tuple[Chang
         pairs: columns of the joints' angles and velocities.
         model: the ``mujoco.MjModel``.
     """
-    above = {pair: found for pair in pairs if (found := _nearest_parallel(pair, pairs, model)) is not None}
-    for pair, (parent, sign) in above.items():
+    above = {pair: found for pair in pairs if (found := _parallel_above(pair, pairs, model))}
+    for pair, parents in above.items():
         words = f"{pair.name} and its velocity are counted from the parent link: they look like the angle of the link "
-        yield _relative({pair: (parent, sign)}), f"{words}in the world, which also contains {parent.name}"
+        others = " and ".join(parent.name for parent, _ in parents)
+        yield _relative({pair: parents}), f"{words}in the world, which also contains {others}"
     if len(above) > 1:
         names = ", ".join(pair.name for pair in above)
         words = f"{names} and their velocities are counted from the parent links: they look like the links' angles in "
-        yield _relative(above), words + "the world"
+        yield _relative({pair: parents[:1] for pair, parents in above.items()}), words + "the world"
 
 
-def _nearest_parallel(pair: Pair, pairs: tuple[Pair, ...], model: Any) -> tuple[Pair, float] | None:
-    """The nearest hinge above a hinge whose axis is parallel, and the sign by which their angles add up."""
+def _parallel_above(pair: Pair, pairs: tuple[Pair, ...], model: Any) -> list[tuple[Pair, float]]:
+    """The hinges above a hinge whose axes are parallel, the nearest first, with the signs by which angles add up."""
     by_joint = {int(model.dof_jntid[other.dof]): other for other in pairs if other.angle}
-    joint = int(model.dof_jntid[pair.dof])
+    joint, found = int(model.dof_jntid[pair.dof]), []
     if joint not in by_joint:
-        return None
+        return found
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     body = int(model.body_parentid[model.jnt_bodyid[joint]])
@@ -49,17 +50,18 @@ def _nearest_parallel(pair: Pair, pairs: tuple[Pair, ...], model: Any) -> tuple[
         for other in range(first, first + int(model.body_jntnum[body])):
             cosine = float(data.xaxis[joint] @ data.xaxis[other])
             if other in by_joint and int(model.jnt_type[other]) == _HINGE and abs(cosine) > _PARALLEL:
-                return by_joint[other], float(np.sign(cosine))
+                found.append((by_joint[other], float(np.sign(cosine))))
         body = int(model.body_parentid[body])
-    return None
+    return found
 
 
-def _relative(above: dict[Pair, tuple[Pair, float]]) -> Change:
+def _relative(above: dict[Pair, list[tuple[Pair, float]]]) -> Change:
     def change(observations: np.ndarray) -> np.ndarray:
         changed = observations.copy()
-        for pair, (parent, sign) in above.items():
-            changed[..., pair.position] -= sign * observations[..., parent.position]
-            changed[..., pair.velocity] -= sign * observations[..., parent.velocity]
+        for pair, parents in above.items():
+            for parent, sign in parents:
+                changed[..., pair.position] -= sign * observations[..., parent.position]
+                changed[..., pair.velocity] -= sign * observations[..., parent.velocity]
         return changed
 
     return change

@@ -172,7 +172,7 @@ def _lag(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Find
     if lag > 0.0:
         words, remedy = f"is late {by}, as a filtered velocity", "log the velocity without its filter"
     else:
-        words, remedy = f"is early {by}", "shift the column"
+        words, remedy = f"is early {by}", "shift the column by as many rows towards later ones"
     severity = "warning" if abs(lag) >= settings.lag_warning else "note"
     return [Finding(CHECK, severity, f"{pair.velocity_name} {words}", None, f"{remedy}, or leave it out: {_ESTIMATED}")]
 
@@ -203,7 +203,7 @@ def _wrapped(log: Log, pair: Pair, settings: AuditSettings) -> list[Finding]:
 
 
 def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding]:
-    found = []
+    found, estimated = [], np.zeros(len(log.names)) if log.estimated_std is None else log.estimated_std
     # for other columns there is no estimate that fast motion does not enter
     for pair, column in [(p, column) for p in log.pairs for column in (p.position, p.velocity)]:
         name = log.names[column]
@@ -218,7 +218,7 @@ def _noisy(log: Log, noise: np.ndarray, settings: AuditSettings) -> list[Finding
                 f"{name} has noise of {noise[column]:.3g} {log.units[column]}, {noise[column] / spread:.0%} of its "
                 "standard deviation",
                 None,
-                _BETTER_VELOCITY if column == pair.velocity else _BETTER_SENSOR,
+                _BETTER_VELOCITY if column == pair.velocity and not estimated[column] else _BETTER_SENSOR,
             )
         )
     return found

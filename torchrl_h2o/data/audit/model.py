@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from itertools import combinations
+from operator import itemgetter
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
-from torchrl_h2o.data.audit.unexplained import percent, unexplained
+from torchrl_h2o.data.audit.unexplained import percent, unexplained, unexplained_and_reversed
 from torchrl_h2o.data.audit.zeros import check_large_zeros, check_small_zeros
 
 CHECK = "model"
@@ -37,8 +37,8 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
         if left < best and misfit - left > 0.1:
             best, words = left, what
     if words is None:
-        absolute = _absolute(few, settings)
-        return absolute or check_large_zeros(response, settings) or check_small_zeros(response, settings)
+        wrong_columns = _by_regression(response, settings)
+        return wrong_columns or check_large_zeros(response, settings) or check_small_zeros(response, settings)
     # a reversed action of one joint can look like a reversed joint
     if any(few.misfit(actions=reversed_action(index)) <= best for index in range(len(few.log.actuators))):
         return []
@@ -46,24 +46,30 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
     return [Finding(CHECK, "severe", explained + words, None, "correct units, signs or order of the columns")]
 
 
-def _absolute(response: Response, settings: AuditSettings) -> list[Finding]:
-    """Angles in the world instead of to the parent link, with which gains, friction and zeros explain the log.
+def _by_regression(response: Response, settings: AuditSettings) -> list[Finding]:
+    """Reversed angles, or angles in the world, with which gains, friction and zeros explain the log.
 
-    If these leave much unexplained, the simulator lacks too much to tell: then wrong columns may fit better by chance.
+    Where the simulator lacks friction or a motor has another gain, its error may not tell the signs of its joints. If
+    much stays unexplained in any case, it lacks too much to tell: then wrong columns may fit better by chance.
+    Reversing one joint is like reversing all others and the actions, so of two explanations, that with positive gains
+    is meant.
     """
-    plain, best, words = math.inf, settings.misfit, None
-    for change, what in absolute_angles(response.log.pairs, response.simulation.model):
-        plain = unexplained(response, settings) if plain == math.inf else plain
-        left = unexplained(response.changed(change), settings)
-        if left < min(best, settings.better * plain):
-            best, words = left, what
-    if words is None:
+    few, found = response.for_hypotheses(), []
+    changes = [*_reversals(few.log.pairs), *absolute_angles(few.log.pairs, few.simulation.model)]
+    plain = unexplained(few, settings) if changes else 0.0
+    for change, what in changes:
+        left, negative = unexplained_and_reversed(few.changed(change), settings)
+        if left < settings.better * plain:
+            found.append((negative, left, what, change))
+    if not found:
         return []
-    explained = (
-        f"gains, friction and zeros leave {percent(plain)} of the accelerations unexplained, and {percent(best)} if "
-    )
-    remedy = "subtract the parent link's angle and velocity from these columns"
-    return [Finding(CHECK, "severe", explained + words, None, remedy)]
+    _, _, words, change = min(found, key=itemgetter(0, 1))
+    plain, left = unexplained(response, settings), unexplained(response.changed(change), settings)
+    if left >= min(settings.misfit, settings.better * plain):
+        return []
+    shares = f"leave {percent(plain)} of the accelerations unexplained, and {percent(left)}"
+    remedy = "correct their sign (scale: -1), or subtract the angles and velocities that it also contains"
+    return [Finding(CHECK, "severe", f"gains, friction and zeros {shares} if {words}", None, remedy)]
 
 
 def _hypotheses(pairs: tuple[Pair, ...]) -> Iterator[tuple[Change, str]]:
@@ -76,13 +82,17 @@ def _hypotheses(pairs: tuple[Pair, ...]) -> Iterator[tuple[Change, str]]:
     for pair in angles:
         if len(angles) > 1:
             yield _scaled([pair], degree), f"{pair.name} and its velocity are taken as degrees: they look like degrees"
-    for pair in pairs:
-        yield _scaled([pair], -1.0), f"{pair.name} and its velocity are reversed: their sign is wrong"
+    yield from _reversals(pairs)
     for kind in (True, False):
         alike = [pair for pair in pairs if pair.angle == kind]
         for one, other in combinations(alike, 2):
             words = f"{one.name} and {other.name} are exchanged, with their velocities"
             yield _exchanged(one, other), words
+
+
+def _reversals(pairs: tuple[Pair, ...]) -> Iterator[tuple[Change, str]]:
+    for pair in pairs:
+        yield _scaled([pair], -1.0), f"{pair.name} and its velocity are reversed: their sign is wrong"
 
 
 def _scaled(pairs: list[Pair], factor: float) -> Change:

@@ -18,10 +18,20 @@ def unexplained(response: Response, settings: AuditSettings, windows: np.ndarray
         settings: thresholds.
         windows: mask (W,) of those whose usual share is meant; None for all.
     """
+    return _left(response, settings, windows)[0]
+
+
+def unexplained_and_reversed(response: Response, settings: AuditSettings) -> tuple[float, int]:
+    """The same share in all windows, and the number of actions whose fitted gain is negative."""
+    return _left(response, settings, None)
+
+
+def _left(response: Response, settings: AuditSettings, windows: np.ndarray | None) -> tuple[float, int]:
     responses = np.concatenate([response.by_gain, friction_responses(response), response.by_zero], -1)
     found = robust_fit(response.target, responses, response.scale, settings.robust)
     left = np.abs(response.target - responses @ found.values)
-    return float(np.mean(np.nanmedian(left if windows is None else left[windows], axis=0) / response.scale))
+    share = np.nanmedian(left if windows is None else left[windows], axis=0) / response.scale
+    return float(np.mean(share)), int((found.values[: response.by_gain.shape[-1]] < 0.0).sum())
 
 
 def percent(share: float) -> str:

@@ -18,10 +18,13 @@ class MeasuredSettings:
     """Share of the transitions that are not reported on, by which effects are chosen; a fifth of all by default."""
     border_moves: float = 0.1
     """Share of the transitions by which a border between two parts of the data moves to the end of a run."""
-    alike: float = 0.5
-    """Ratio of a column's spreads in two parts of several logs below which the logs differ in kind."""
+    alike: float = 0.3
+    """Ratio of an action's ranges (5th to 95th percentile) in two parts of several logs below which the logs differ in
+    kind, such as free and driven motion."""
+    rest_rows: int = 10
+    """Rows by which it is judged whether something moves."""
     rest: float = 2.0
-    """Standard deviation of a reading in a window, in that of its noise, up to which it stands still there."""
+    """Standard deviation of a reading over these rows, in that of its noise, up to which it stands still."""
     least_rest: float = 1e-3
     """The same in spreads, for sensors without noise."""
     most_rest: float = 0.05

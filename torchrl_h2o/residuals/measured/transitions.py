@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 
 from torchrl_h2o.data import DataError
 from torchrl_h2o.data.readers.ted import require_ted
+from torchrl_h2o.residuals.measured.moving_rows import moving_rows
 from torchrl_h2o.residuals.settings import DEFAULTS, MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -70,7 +71,9 @@ class Measured:
     settings: MeasuredSettings = DEFAULTS.measured
     estimated_std: np.ndarray | None = None
     block: int = 1
-    _results: OrderedDict[tuple[Hashable, Simulation], Any] = field(default_factory=OrderedDict, init=False, repr=False)
+    _results: OrderedDict[tuple[Hashable, Simulation | None], Any] = field(
+        default_factory=OrderedDict, init=False, repr=False
+    )
 
     @classmethod
     def from_ted(
@@ -119,7 +122,7 @@ class Measured:
             run,
             _float64(data["time"]).flatten() if "time" in data.keys() else step,
             ~clipped,
-            divided(run, logs, held_out, np.hstack([observation, action]), settings, source=str(source)),
+            divided(run, logs, held_out, observation, action, settings, source=str(source)),
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
             settings,
@@ -208,12 +211,12 @@ class Measured:
         left_out[reason] = left_out.get(reason, 0) + int((rows & self.usable).sum())
         return replace(self, usable=self.usable & ~rows, left_out=left_out)
 
-    def remembered(self, what: Hashable, simulation: Simulation, compute: Callable[[], Result]) -> Result:
+    def remembered(self, what: Hashable, simulation: Simulation | None, compute: Callable[[], Result]) -> Result:
         """The result of a computation on these data with a simulation, which is kept for later calls.
 
         Args:
             what: name of the computation, and what else it depends on.
-            simulation: the simulation.
+            simulation: the simulation; None if the result does not depend on it.
             compute: computes the result. Nobody may change the result afterwards.
         """
         key = (what, simulation)
@@ -246,7 +249,8 @@ def divided(
     run: np.ndarray,
     logs: np.ndarray,
     held_out: float | Collection[int],
-    columns: np.ndarray,
+    observation: np.ndarray,
+    action: np.ndarray,
     settings: MeasuredSettings = DEFAULTS.measured,
     *,
     source: str = "transitions",
@@ -255,13 +259,14 @@ def divided(
 
     Whole logs are fitted or selected on if they are alike. If they are of different kinds, one kind alone could neither
     determine nor judge every effect: no motor shows its gain in logs of free swings. Each log is then divided at the
-    row at which the share of its motion for fits has passed.
+    row at which the share for fits of its rows in motion has passed. Rows at rest at its end are for fits.
 
     Args:
         run: (T), index of each transition's run, ascending.
         logs: (T), index of each transition's log.
         held_out: share of the transitions, from the end, on which errors are reported, or the indices of these logs.
-        columns: (T, c), observations and actions, by whose spreads logs differ in kind.
+        observation: (T, n), by which it is judged whether something moves.
+        action: (T, nu), by whose ranges logs differ in kind.
         settings: share of the selection, how far a border moves to the end of a run, and which logs are alike.
         source: name of the data in errors.
 
@@ -273,7 +278,7 @@ def divided(
 
     Examples:
         >>> run = np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2])
-        >>> divided(run, np.zeros(10, int), 0.3, np.zeros((10, 1))).tolist()
+        >>> divided(run, np.zeros(10, int), 0.3, np.zeros((10, 1)), np.zeros((10, 1))).tolist()
         [0, 0, 0, 0, 0, 1, 1, 2, 2, 2]
     """
     split = np.full(len(run), Split.FIT)
@@ -289,28 +294,25 @@ def divided(
             )
     rest = np.flatnonzero(split == Split.FIT)
     border = _border(run[rest], 1.0 - settings.selection, settings)
-    if len(np.unique(logs[rest])) > 1 and not _alike(columns[rest[:border]], columns[rest[border:]], settings):
-        spread = np.maximum(columns[rest].std(0), 1e-12)
+    if len(np.unique(logs[rest])) > 1 and not _alike(action[rest[:border]], action[rest[border:]], settings):
+        moves = moving_rows(observation, run, settings)
         for log in np.unique(logs[rest]):
             rows = rest[logs[rest] == log]
-            split[rows[_share_of_motion(columns[rows] / spread) > 1.0 - settings.selection]] = Split.SELECTION
+            passed = np.cumsum(moves[rows]) / max(1, moves[rows].sum())
+            selected = (passed > 1.0 - settings.selection) & ((passed < 1.0) | moves[rows])
+            split[rows[selected]] = Split.SELECTION
     else:
         split[rest[border:]] = Split.SELECTION
     return split
 
 
 def _alike(some: np.ndarray, others: np.ndarray, settings: MeasuredSettings) -> bool:
-    """Whether each column spreads in some rows about as in the others."""
+    """Whether each action has in some rows about the range that it has in the others."""
     if not len(some) or not len(others):
         return True
-    low, high = np.sort([some.std(0), others.std(0)], axis=0)
+    ranges = [np.diff(np.quantile(rows, (0.05, 0.95), axis=0), axis=0)[0] for rows in (some, others)]
+    low, high = np.sort(ranges, axis=0)
     return bool((low >= settings.alike * high).all())
-
-
-def _share_of_motion(scaled: np.ndarray) -> np.ndarray:
-    """Share of a log's motion, (T), that has passed at the end of each row: of the sum of the squared deviations."""
-    passed = np.cumsum(((scaled - scaled.mean(0)) ** 2).sum(1))
-    return passed / passed[-1] if passed[-1] > 0.0 else np.arange(1, len(scaled) + 1) / len(scaled)
 
 
 def _border(run: np.ndarray, share: float, settings: MeasuredSettings) -> int:

@@ -12,7 +12,7 @@ from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats import FORMATS, read_raw
 from torchrl_h2o.data.readers.formats.text import number_of, read_text
 
-_LINES = 2000  # lines of a text file that are looked at
+_LINES = 50_000  # lines of a text file that are looked at, to find gaps and jumps behind its beginning
 
 
 @dataclass(frozen=True)

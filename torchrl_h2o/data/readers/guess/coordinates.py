@@ -53,6 +53,7 @@ def coordinates_of(
         [name for name in positions if name not in found],
         [joint for joint in joints if joint not in found.values()],
         model,
+        in_order=not found,
     )
     observed = ("position", "velocity", ORIENTATION, RATE)
     found |= {
@@ -66,13 +67,16 @@ def coordinates_of(
     return found
 
 
-def _by_kind(positions: Sequence[str], joints: Sequence[str], model: Coordinates) -> dict[str, str]:
-    """Return the joint of each position if there are as many: lengths slide, angles turn, the others are in order."""
+def _by_kind(positions: Sequence[str], joints: Sequence[str], model: Coordinates, in_order: bool) -> dict[str, str]:
+    """Return the joint of each position if there are as many: lengths slide, angles turn, the others are in order.
+
+    If the names contradict that, the order decides, or nothing is returned without ``in_order``.
+    """
     if len(positions) != len(joints):
         return {}
     units = [kind_of_joint(name) for name in positions]
     if any(units.count(unit) > [model.units[joint] for joint in joints].count(unit) for unit in ("rad", "m")):
-        return dict(zip(positions, joints, strict=True))
+        return dict(zip(positions, joints, strict=True)) if in_order else {}
     found: dict[str, str] = {}
     for known in (True, False):  # first those whose name tells their unit
         for name, unit in zip(positions, units, strict=True):
@@ -83,16 +87,15 @@ def _by_kind(positions: Sequence[str], joints: Sequence[str], model: Coordinates
 
 
 def without_constants(columns: Sequence[Guess], contents: Contents, model: Coordinates) -> list[Guess]:
-    """Positions and velocities that never change as columns to ignore, if there are more positions than joints."""
-    joints = sum(not name.endswith("_velocity") for name in model.units)
-    if sum(column.kind == "position" for column in columns) <= joints:
-        return list(columns)
-
-    def still(column: Guess) -> bool:
-        values = contents.values.get(column.name)
-        return column.kind in ("position", "velocity") and values is not None and bool(np.ptp(values) == 0.0)
-
-    return [replace(one, kind="unknown", note="never changes") if still(one) else one for one in columns]
+    """Positions and velocities that never change as columns to ignore, the last ones first, if there are too many."""
+    kept, joints = list(columns), sum(not name.endswith("_velocity") for name in model.units)
+    for kind in ("position", "velocity"):
+        own = [index for index, column in enumerate(kept) if column.kind == kind]
+        for index in reversed(own):
+            values = contents.values.get(kept[index].name)
+            if sum(column.kind == kind for column in kept) > joints and values is not None and np.ptp(values) == 0.0:
+                kept[index] = replace(kept[index], kind="unknown", note="does not change")
+    return kept
 
 
 def estimated_velocity(position: str, taken: Collection[str]) -> str:

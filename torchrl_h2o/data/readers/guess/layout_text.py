@@ -44,7 +44,8 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
 
     Args:
         path: the log, in any format.
-        model: the coordinates to which the observed columns are matched by name, or by order if there are as many.
+        model: the coordinates to which the observed columns are matched: by name; or if there are as many, lengths to
+            sliding joints, angles to hinges, and the others in order.
 
     Raises:
         DataError: for a file that cannot be read as a table.

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchrl_h2o.data.readers.units import UNITS, to_si
 
-_CURRENTS = ("current", "cur", "curr", "iq", "amps")
+_CURRENTS = ("current", "iq", "amps")
 _FORCES = (
     "tau",
     "torque",
@@ -49,7 +49,8 @@ _WORDS = {
         *("x", "y", "z", "height", "encoder", "enc", "joint", "hip", "knee", "ankle", "elbow", "shoulder", "wrist"),
     ),
 }
-_WHERE = ("pos", "position", "positions", "angle", "q", "enc", "encoder")  # a position, but not of what
+_PLACES = ("pos", "position", "positions", "angle")
+_WHERE = (*_PLACES, "q", "enc", "encoder")  # a position, but not of what
 _LENGTHS = ("x", "y", "z", "height", "slide", "cart", "rail")
 _SI = {"position": "rad", "velocity": "rad/s", "desired position": "rad", "desired velocity": "rad/s"}
 _NO_COMMANDS = (
@@ -57,6 +58,7 @@ _NO_COMMANDS = (
     *("state", "status", "acc", "acceleration", "accel", "imu", "mag"),
 )
 _COMPUTED = ("cos", "sin", "squared", "square", "sq", "err", "error", "errors")  # of another column
+_NEVER_COMMANDS = ("squared", "square", "err", "error", "errors")
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 _LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 
@@ -104,7 +106,7 @@ def guess_columns(
     if len(supplies) < len(actions):
         note = "hardly changes, as the voltage of a supply"
         found = [replace(guess, kind="unknown", note=note) if guess in supplies else guess for guess in found]
-    found = [_of_another(guess, values) if _letters(guess.name) not in known else guess for guess in found]
+    found = [one if _letters(without_unit(one.name)[0]) in known else _of_another(one, values) for one in found]
     for kind in ("time", "done", "reward"):
         same = [i for i, guess in enumerate(found) if guess.kind == kind]
         for i in same[1:]:
@@ -115,11 +117,15 @@ def guess_columns(
 def _of_another(guess: Guess, values: Mapping[str, np.ndarray | None]) -> Guess:
     """The guess, or an unknown column if it holds what follows from another one, or its raw value."""
     words, note = words_of(guess.name), ""
-    if any(word in _COMPUTED for word in words):
+    computed = [word for word in words if word in _COMPUTED]
+    if guess.kind == "action":  # a torque may be a sine
+        computed = [word for word in computed if word in _NEVER_COMMANDS]
+    if computed:
         note = "follows from other columns"
     elif "raw" in words and len(words) > 1:
         plain = [word for word in words if word != "raw"]
-        of = next((name for name in values if words_of(name) == plain), None)
+        alike = [name for name, numbers in values.items() if numbers is not None and np.ptp(numbers) > 0.0]
+        of = next((name for name in alike if words_of(name) == plain), None)
         note = f"the raw value of {of}" if of else ""
     return replace(guess, kind="unknown", note=note) if note else guess
 
@@ -143,6 +149,8 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
     fits = {kind for kind, known in _WORDS.items() if any(word in known for word in words)}
     if "".join(words) in _VOLTS:  # V_in
         return "action"
+    if "current" in words and any(word in _PLACES for word in words):
+        fits.discard("action")  # the current position
     if "time" in fits and not ((np.diff(numbers) >= 0).mean() > 0.9 and np.ptp(numbers) > 0):
         fits.remove("time")
     if fits & {"desired", "command"}:
@@ -184,10 +192,16 @@ def _is_supply(guess: Guess, values: Mapping[str, np.ndarray | None]) -> bool:
 
 def words_of(name: str) -> list[str]:
     """The words of a name: at signs, digits and changes of case; ``hipVel2`` is hip, vel, 2, ``angleD`` angle, dot."""
+    name = re.sub(r"([A-Za-z]*[a-z])D(?![A-Za-z])", _slope, name)
     words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
-    before = ["", *words]
-    words = ["dot" if word == "d" and before[i] in _WORDS["position"] else word for i, word in enumerate(words)]
     return [part for word in words for part in _derivative(word)]
+
+
+def _slope(match: re.Match[str]) -> str:
+    """``angleD`` as ``angle_dot``; but the joint or encoder D stays what it is."""
+    word = match.group(1)
+    position = word.lower() in _WORDS["position"] and word.lower() not in ("enc", "encoder", "joint")
+    return f"{word}_dot" if position else match.group(0)
 
 
 def _derivative(word: str) -> list[str]:
