@@ -139,9 +139,7 @@ def test_each_of_several_logs_is_divided_where_they_differ_in_kind():
     assert (split[3] == Split.REPORT).all()
     for part in split[:3]:
         (selected,) = np.nonzero(part == Split.SELECTION)
-        assert (
-            15 < selected[0] < selected[-1] < 32
-        )  # the motion is divided; the rest at the end is fitted
+        assert 15 < selected[0] < selected[-1] < 32  # the motion is divided; the rest at the end is fitted
         assert (np.diff(selected) == 1).all()
 
 

@@ -54,9 +54,13 @@ def _by_regression(response: Response, settings: AuditSettings) -> list[Finding]
     Reversing one joint is like reversing all others and the actions, so of two explanations, that with positive gains
     is meant.
     """
-    few, found = response.for_hypotheses(), []
+    few, found = response.for_hypotheses().thinned(settings.min_windows), []
     changes = [*_reversals(few.log.pairs), *absolute_angles(few.log.pairs, few.simulation.model)]
-    plain = unexplained(few, settings) if changes else 0.0
+    regressors = len(few.log.actuators) + 2 * len(few.log.pairs)
+    steps = few.simulation.frame_skip * few.horizon * len(few.starts)
+    if not changes or len(changes) * regressors * steps > settings.regression_steps:
+        return []
+    plain = unexplained(few, settings)
     for change, what in changes:
         left, negative = unexplained_and_reversed(few.changed(change), settings)
         if left < settings.better * plain:

@@ -114,6 +114,9 @@ class AuditSettings:
     # model and actions
     windows: int = 300
     """Windows that are simulated."""
+    regression_steps: int = 300_000
+    """Largest number of physics steps of all regressions for reversed joints and angles in the world; robots with too
+    many joints are not checked for them."""
     hypothesis_windows: int = 200
     """Windows on which a hypothesis such as exchanged joints is simulated."""
     hypothesis_steps: int = 1_000
