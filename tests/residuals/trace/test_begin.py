@@ -8,7 +8,7 @@ import pytest
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, ObservationGain
 from torchrl_h2o.residuals import trace_effects
-from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.trace.begin import begin_in_longer_windows, begin_noise_free, begin_with
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import grow
@@ -88,19 +88,38 @@ def test_a_search_without_noise_counts_if_it_explains_everything():
 def test_where_it_does_not_longer_windows_show_the_gain_beside_damping_that_the_catalogue_lacks():
     state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
     after, seen = from_another_beginning(state, [GRAVITY, GAIN])
-    assert seen == [after]
+    assert seen[-1] == after
     assert not after.exact
-    assert after.problem.horizon == 10
-    assert after.chosen_horizon == state.problem.horizon == 5
+    assert {one.problem.horizon for one in seen} == {10}
+    assert {one.chosen_horizon for one in seen} == {state.problem.horizon} == {5}
     assert {type(effect) for effect in after.fit.effects} == {Gravity, ObservationGain}
 
 
 def test_the_first_search_stays_where_the_one_in_longer_windows_explains_less(monkeypatch):
-    monkeypatch.setattr("torchrl_h2o.residuals.trace.search.is_beaten_by", lambda grown, longer: True)
     state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
+    first = {entry.name for entry in state.entries}
+
+    def beaten(one, other):
+        return {entry.name for entry in one.entries} != first
+
+    monkeypatch.setattr("torchrl_h2o.residuals.trace.search.is_beaten_by", beaten)
     after, seen = from_another_beginning(state, [GRAVITY, GAIN])
     assert after is state
     assert not seen
+
+
+def test_a_better_list_in_longer_windows_is_kept_if_the_time_ends_before_the_search_does():
+    state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
+    kept = []
+
+    def keep(better):
+        kept.append(better)
+        raise OutOfTimeError("looking for effects")
+
+    with LoopBar(disable=True) as bar, pytest.raises(OutOfTimeError):
+        _from_another_beginning(state, [GRAVITY, GAIN], np.random.default_rng(0), bar, keep)
+    assert {type(effect) for effect in kept[0].fit.effects} == {Gravity, ObservationGain}
+    assert kept[0].chosen_horizon == state.problem.horizon
 
 
 def test_a_search_in_longer_windows_that_finds_the_same_effects_does_not_count():
