@@ -25,7 +25,9 @@ def absolute_angles(pairs: tuple[Pair, ...], model: Any) -> Iterator[tuple[Chang
         pairs: columns of the joints' angles and velocities.
         model: the ``mujoco.MjModel``.
     """
-    above = {pair: found for pair in pairs if (found := _parallel_above(pair, pairs, model))}
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    above = {pair: found for pair in pairs if (found := _parallel_above(pair, pairs, model, data.xaxis))}
     for pair, parents in above.items():
         words = f"{pair.name} and its velocity are counted from the parent link: they look like the angle of the link "
         others = " and ".join(parent.name for parent, _ in parents)
@@ -36,19 +38,17 @@ def absolute_angles(pairs: tuple[Pair, ...], model: Any) -> Iterator[tuple[Chang
         yield _relative({pair: parents[:1] for pair, parents in above.items()}), words + "the world"
 
 
-def _parallel_above(pair: Pair, pairs: tuple[Pair, ...], model: Any) -> list[tuple[Pair, float]]:
+def _parallel_above(pair: Pair, pairs: tuple[Pair, ...], model: Any, axes: np.ndarray) -> list[tuple[Pair, float]]:
     """The hinges above a hinge whose axes are parallel, the nearest first, with the signs by which angles add up."""
     by_joint = {int(model.dof_jntid[other.dof]): other for other in pairs if other.angle}
     joint, found = int(model.dof_jntid[pair.dof]), []
     if joint not in by_joint:
         return found
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     body = int(model.body_parentid[model.jnt_bodyid[joint]])
     while body:
         first = int(model.body_jntadr[body])
         for other in range(first, first + int(model.body_jntnum[body])):
-            cosine = float(data.xaxis[joint] @ data.xaxis[other])
+            cosine = float(axes[joint] @ axes[other])
             if other in by_joint and int(model.jnt_type[other]) == _HINGE and abs(cosine) > _PARALLEL:
                 found.append((by_joint[other], float(np.sign(cosine))))
         body = int(model.body_parentid[body])

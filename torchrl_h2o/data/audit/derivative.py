@@ -123,8 +123,12 @@ def _lateness(
 
 def roughness(log: Log, column: int) -> float:
     """Noise of a column from its third differences: an upper estimate, because fast motion adds to it."""
-    values = log.observation[:, column]
-    third = np.diff(values, 3)[log.run[3:] == log.run[:-3]]
+    return roughness_of(log.observation[:, column], log.run)
+
+
+def roughness_of(values: np.ndarray, run: np.ndarray) -> float:
+    """:func:`roughness` of values (T,) in runs (T,)."""
+    third = np.diff(values, 3)[run[3:] == run[:-3]]
     return float(deviation(third) / np.sqrt(20.0)) if len(third) > 20 else float(np.std(values))
 
 

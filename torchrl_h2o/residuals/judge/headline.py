@@ -53,8 +53,8 @@ def headline_error(
     """The median error some steps ahead of the quantity in which it is largest, in units of the quantity's spread.
 
     The median is over the windows in which something moves. A position is preferred to a velocity, because it is
-    easier to picture. Quantities whose error is that of their
-    sensor, such as the angle of a body that does not turn, are left out if there are others.
+    easier to picture. Quantities whose error is that of their sensor, such as the angle of a body that does not turn,
+    are left out if there are others.
 
     Args:
         simulation: the simulator before effects are put in.

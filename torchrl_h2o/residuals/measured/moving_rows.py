@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.data.audit.derivative import deviation
+from torchrl_h2o.data.audit.derivative import roughness_of
 from torchrl_h2o.residuals.settings import DEFAULTS, MeasuredSettings
-
-_THIRD_DIFFERENCES = np.sqrt(20.0)  # standard deviation of the third differences of white noise with deviation 1
 
 
 def moving_rows(observation: np.ndarray, run: np.ndarray, settings: MeasuredSettings = DEFAULTS.measured) -> np.ndarray:
@@ -44,9 +42,8 @@ def _spread_at_rest(observation: np.ndarray, run: np.ndarray, settings: Measured
 
     It is a multiple of its noise, at least that of a reading that changes between two neighbouring values.
     """
-    spread, unbroken = observation.std(0), run[3:] == run[:-3]
-    rough, steps = np.diff(observation, 3, axis=0)[unbroken], np.abs(np.diff(observation, axis=0))
-    noise = np.array([deviation(column) for column in rough.T]) / _THIRD_DIFFERENCES if len(rough) else 0.0 * spread
+    spread, steps = observation.std(0), np.abs(np.diff(observation, axis=0))
+    noise = np.array([roughness_of(column, run) for column in observation.T])
     resolution = np.array([column[column > 0.0].min(initial=np.inf) for column in steps.T])
     least = np.maximum(settings.least_rest * spread, np.where(np.isfinite(resolution), resolution, 0.0))
     return np.clip(np.maximum(settings.rest * noise, least), 0.0, settings.most_rest * spread)

@@ -11,15 +11,8 @@ import numpy as np
 from torchrl_h2o.data.readers.units import UNITS, to_si
 
 _CURRENTS = ("current", "iq", "amps")
-_FORCES = (
-    "tau",
-    "torque",
-    "torques",
-    "effort",
-    "force",
-    "moment",
-    *_CURRENTS,
-)  # a commanded one is no desired position
+# a commanded force is no desired position
+_FORCES = ("tau", "torque", "torques", "effort", "force", "moment", *_CURRENTS)
 _VOLTS = ("volt", "volts", "voltage", "vin", "vm")
 _DUTY = ("pwm", "duty")
 _WORDS = {

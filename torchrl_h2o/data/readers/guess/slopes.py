@@ -19,8 +19,8 @@ def relation(
 ) -> tuple[float, float] | None:
     """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
     name = pairs.get(velocity.name, "")
-    position, values, time = contents.values.get(name), contents.values.get(velocity.name), time_of(contents)
-    if position is None or values is None or time is None or len(time) < 3:
+    position, values = contents.values.get(name), contents.values.get(velocity.name)
+    if position is None or values is None or (time := time_of(contents)) is None or len(time) < 3:
         return None
     if is_wrapped(position, units[name]):
         position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
