@@ -28,8 +28,6 @@ def _is_clearly_needed(state: SearchState, index: int) -> bool:
 
 def _without_one(state: SearchState) -> SearchState | None:
     """The state without the first effect that is not needed; None if all are needed."""
-    before = state.selection_losses(state.fit.effects)
-    most = before.mean() / (1.0 - state.settings.trace.min_gain)
     for index in range(len(state.entries)):
         entries = (*state.entries[:index], *state.entries[index + 1 :])
         kept = (*state.fit.effects[:index], *state.fit.effects[index + 1 :])
@@ -38,12 +36,21 @@ def _without_one(state: SearchState) -> SearchState | None:
         # the joint fit without the effect is a candidate as well: it is the better one if the effect has become neutral
         # and the new fit ends in a worse minimum
         fits = (state.refitted(entries, kept), state.fit.without(index))
-        after, fitted = min(((state.selection_losses(one.effects), one) for one in fits), key=lambda one: one[0].mean())
-        level = state.settings.significance.level
-        worse = after.mean() > most and state.p_value(after, before) < level and _is_beyond_rounding(state, fitted)
-        if not worse:
+        fitted = min(fits, key=lambda one: state.selection_losses(one.effects).mean())
+        if not is_worse_without(state, fitted):
             return state.with_found(entries, fitted)
     return None
+
+
+def is_worse_without(state: SearchState, smaller: Fit) -> bool:
+    """Whether fewer effects have a held-out loss that is significantly higher than that of the effects found.
+
+    The difference must also exceed a minimum share of the loss, and what rounding explains.
+    """
+    before, after = (state.selection_losses(which.effects) for which in (state.fit, smaller))
+    most = before.mean() / (1.0 - state.settings.trace.min_gain)
+    level = state.settings.significance.level
+    return bool(after.mean() > most and state.p_value(after, before) < level and _is_beyond_rounding(state, smaller))
 
 
 def _is_beyond_rounding(state: SearchState, smaller: Fit) -> bool:

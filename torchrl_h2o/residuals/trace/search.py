@@ -31,6 +31,7 @@ from torchrl_h2o.residuals.trace.per_joint import divide_by_element
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.rival_sets import with_most_usual_set
 from torchrl_h2o.residuals.trace.simplify import simplify
+from torchrl_h2o.residuals.trace.spare import spare
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SET_FITTED = 0.04  # share by which the fit of another set of effects brings the bar closer to the end of its stage
@@ -111,7 +112,7 @@ def _searched(
         found(state)
         progress.stage(OTHERS)
         grown, simpler = state, simplify(state, lambda: progress.closer(ENTRY_TRIED))
-        state = eliminate(simpler)
+        state = spare(eliminate(simpler))
         progress.show_found(state.entries)
         found(state)
         if state is not simpler or (state.exact and not grown.exact):

@@ -69,7 +69,7 @@ def simplify_one(
     # otherwise two equivalent delays would replace each other for ever
     simplest = min(group, key=lambda a: (len(free_parameters(a.entry)), surprise(a.effect)))
     rest = tuple(attempt for attempt in group if attempt is not simplest)
-    return _replaced(state, index, simplest), rest
+    return replaced(state, index, simplest), rest
 
 
 def _with_better_alternative(
@@ -86,7 +86,7 @@ def _with_better_alternative(
         state, as_good, better = _compared_closely(state, index, as_good)
         if not better or better[0].entry.name in seen:
             return state, as_good
-        state = _replaced(state, index, better[0])
+        state = replaced(state, index, better[0])
         if state.problem.sensor_std is None and (rescaled := rescale(state)).exact:
             return rescaled, ()
 
@@ -110,7 +110,7 @@ def _compared_closely(
     if better:
         return state, tuple(as_good), better
     state = state.with_found(state.entries, refined(state, state.entries, state.fit))
-    near = [replace(a, fit=refined(state, _replaced(state, index, a).entries, a.fit)) for a in differing]
+    near = [replace(a, fit=refined(state, replaced(state, index, a).entries, a.fit)) for a in differing]
     worse = [worse_of(state, state.fit, a.fit) for a in near]
     better = [a for a, which in zip(near, worse, strict=True) if which is state.fit]
     return state, (*equal, *(a for a, which in zip(near, worse, strict=True) if which is not a.fit)), better
@@ -129,7 +129,7 @@ def _divided_by_rounding(
     return equal, [attempt for attempt in attempts if attempt not in equal]
 
 
-def _replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:
+def replaced(state: SearchState, index: int, attempt: Attempt) -> SearchState:
     """The state with an attempt in an effect's place; the new entry takes over the effect's rivals."""
     entries = tuple(attempt.entry if i == index else entry for i, entry in enumerate(state.entries))
     rivals = {**state.rivals, attempt.entry.name: state.rivals[state.entries[index].name]}
