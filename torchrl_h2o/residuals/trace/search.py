@@ -126,6 +126,8 @@ def _searched(
         if state.entries == grown.entries:
             break
         found(state)
+    if state.entries and not state.groups:  # the last round has changed the effects, whose alternatives are now others
+        state = simplify(state, lambda: progress.closer(ENTRY_TRIED))
     return state
 
 
