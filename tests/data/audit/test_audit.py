@@ -10,6 +10,7 @@ import torch
 
 from tests.data.audit.recorded import (
     NAMES,
+    arm,
     changed,
     holding,
     measured,
@@ -376,3 +377,17 @@ def _audited_horizon(data, simulation) -> int:
         patch.setattr(module, "check_model", lambda response, _: found.append(response) or [])
         audit(data, simulation)
     return found[0].horizon
+
+
+def test_actions_of_an_arm_with_heavy_rotors_are_not_exchanged(simulation):
+    """Without the rotors, a gain of every action on every joint fits best, and the shoulder's own one is small."""
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(2000)
+    action = np.zeros((2000, 2))
+    for harmonic in range(1, 6):
+        for motor, size in enumerate((8.0, 3.0)):
+            wave = np.sin(0.2 * np.pi * harmonic * time + rng.uniform(0.0, 6.28))
+            action[:, motor] += size * wave * rng.uniform(0.3, 1.0)
+    reality = arm(Armature(6.0, "shoulder"), Armature(0.2, "elbow"))
+    rows = np.vstack([np.zeros(4), reality.rollout(np.zeros((1, 4)), action[None])[0]])
+    rows += 0.001 * rows.std(0) * rng.standard_normal(rows.shape)
+    assert audit(measured(rows, action), simulation).severe == ()

@@ -235,3 +235,19 @@ def test_a_search_ends_with_the_forces_where_its_effects_contradict_them(monkeyp
     assert replaced.entries == ()
     assert in_time.ended_in == "looking for effects"
     assert in_time.fit.effects == asked[1]
+
+
+def test_friction_of_a_light_link_is_dry_beside_its_rotor():
+    """The solver softens friction of 0.1 N·m on a link of 0.5 g to a viscous one; with its rotor it is dry."""
+    xml = DOUBLE.replace(
+        'fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"', 'fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.0005"'
+    )
+    xml = xml.replace('mass="0.0005"', 'mass="0.5"', 1)
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(xml))
+    true = (Armature(0.05, "elbow"), JointDamping(0.02, "elbow"), JointFrictionLoss(0.1, "elbow"))
+    measured = recorded(simulation.with_effects(*true), 3000, noise=0.001)
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, KINDS)]
+    proposed = {type(effect): effect for effect in propose_effects(simulation, measured, catalogue).effects}
+    for effect in true:
+        (name,) = effect.parameters
+        assert getattr(proposed[type(effect)], name) == pytest.approx(getattr(effect, name), rel=0.05)

@@ -41,6 +41,8 @@ from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 #: zero and masses of zero no force would be missing
 PROPOSED = (JointFrictionLoss, JointDamping, JointSpring, JointForce, Armature, BodyMass, Payload)
 
+_HEAVY = 1e3  # inertia of a rotor beside which friction is dry, in inertias of its joint
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -133,13 +135,27 @@ def _acts_on_one(effect: Effect, simulation: Simulation) -> bool:
 
 
 def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: CatalogueEntry) -> np.ndarray | None:
-    """Change of the missing force, (W, nv), by an entry's first trial, NaN as the force; None if there is none."""
+    """Change of the missing force, (W, nv), by an entry's first trial, NaN as the force; None if there is none.
+
+    The solver softens dry friction by the joint's mobility: a light link without its rotor meets viscous friction
+    instead, so that a trial of friction alone would say nothing of friction and rotor together. The change by friction
+    is therefore that beside a heavy rotor.
+    """
     try:
+        if isinstance(entry.effect, JointFrictionLoss):
+            simulation = simulation.with_effects(_heavy_rotor(simulation.model, entry.effect.joints))
+            missing = missing_force(simulation, motion)
         change = missing_force(simulation.with_effects(entry.starts[0]), motion) - missing
     except ValueError:  # a value that the model rejects
         return None
     known = change[motion.moving]
     return change if np.isfinite(known).all() and np.abs(known).max() > 0.0 else None
+
+
+def _heavy_rotor(model: mujoco.MjModel, joints: str | Sequence[str]) -> Armature:
+    """A rotor with which the joints have a thousand times their inertia."""
+    inertia = 1.0 / max(model.dof_invweight0[selection.joint_dofs(model, joints)].min(), 1e-9)
+    return Armature(_HEAVY * inertia, joints)
 
 
 def _needed(
