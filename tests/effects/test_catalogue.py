@@ -22,6 +22,7 @@ from torchrl_h2o.effects import (
     ModelEffect,
     ObservationDelay,
     ObservationGain,
+    Payload,
     ServoStiffness,
     catalogue,
     compile_model,
@@ -243,3 +244,21 @@ def test_a_family_shares_a_word():
     assert families(["left_wheel", "right_wheel"]) == {"wheel": (0, 1)}
     assert families(["lhip", "rhip", "lknee", "rknee"]) == {"hip": (0, 1), "knee": (2, 3)}
     assert families(["", "", "12"]) == {}
+
+
+def test_a_limb_ends_before_its_frames_without_mass():
+    """A model from a URDF has frames such as tool0 behind the last link."""
+    xml = """
+    <mujoco>
+      <worldbody>
+        <body name="base"><joint type="slide"/><geom size="0.1" mass="1"/>
+          <body name="upper"><joint name="a" type="hinge"/><geom size="0.1" mass="1"/>
+            <body name="lower" pos="0 0 -1"><joint name="b" type="hinge"/><geom size="0.1" mass="1"/>
+              <body name="flange" pos="0 0 -1"><body name="tool0"/></body>
+            </body>
+          </body>
+        </body>
+      </worldbody>
+    </mujoco>"""
+    entries = catalogue(mujoco.MjSpec.from_string(xml), num_observations=3, dt=0.02)
+    assert {entry.effect.bodies for entry in entries if isinstance(entry.effect, Payload)} == {"base", "lower"}
