@@ -119,7 +119,7 @@ def _against_accelerations(response: Response, settings: AuditSettings, lateness
         found += _late(response, lag, settings, lateness)
     else:
         best = int(-lags[0])
-    order = _exchanged(response, target, nuisance, int(lags[best]), settings)
+    order = _exchanged(response, target, nuisance, int(lags[best]), fits[best], settings)
     if order or not gains or friction_dominates(response, settings):
         return [*found, *order]
     return [*found, *_gains(response, fits[best], settings)]
@@ -302,11 +302,12 @@ def _sizes(response: Response) -> np.ndarray:
 
 
 def _exchanged(
-    response: Response, target: np.ndarray, nuisance: np.ndarray, lag: int, settings: AuditSettings
+    response: Response, target: np.ndarray, nuisance: np.ndarray, lag: int, own: Fit, settings: AuditSettings
 ) -> list[Finding]:
     """Actuators whose joint follows the action of another column and not its own.
 
-    The actions in the other order must also leave much less of the accelerations unexplained, with any gains. Where the
+    The actions in the other order must also leave much less of the accelerations unexplained than in their own, whose
+    fit is ``own``, with any gains. Where the
     simulator lacks rotors and much friction, a gain of every action on every joint imitates these.
     """
     actions, known = response.mean_action(lag)
@@ -332,9 +333,8 @@ def _exchanged(
             words = f"{where} follows the action of {names[other]} instead of {names[index]}: the columns are exchanged"
             findings.append(Finding(CHECK, "severe", words, None, "correct the order of the actions, or of the joints"))
             order[index] = other
-
-    def left(actions: np.ndarray) -> float:
-        responses = np.concatenate([response.by_action * actions[:, None], nuisance], -1)
-        return robust_fit(target[known], responses[known], response.scale, settings.robust).unexplained
-
-    return findings if findings and left(actions[:, order]) < settings.better * left(actions) else []
+    if not findings:
+        return []
+    responses = np.concatenate([response.by_action * actions[:, None, order], nuisance], -1)
+    other_order = robust_fit(target[known], responses[known], response.scale, settings.robust)
+    return findings if other_order.unexplained < settings.better * own.unexplained else []

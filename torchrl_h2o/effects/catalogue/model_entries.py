@@ -35,20 +35,13 @@ def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     yield from _factors(mechanism, BodyInertia, "bodies", singles)
     yield from entries_of(BodyCentreOfMass, "bodies", singles, lambda chosen: _shifts(mechanism, chosen[0] + 1))
     # a payload sits on a trunk or at the end of a limb, behind which only frames without mass may follow
-    within = {body for one in heavy for body in _ancestors(model, one)}
+    alone = set(np.flatnonzero(model.body_subtreemass == model.body_mass))
     carrying = {
         name: (index,)
         for name, (index,) in singles.items()
-        if model.body_parentid[index + 1] == 0 or index + 1 not in within
+        if model.body_parentid[index + 1] == 0 or index + 1 in alone
     }
     yield from entries_of(Payload, "bodies", carrying, lambda chosen: _loads(mechanism, chosen[0] + 1))
-
-
-def _ancestors(model: mujoco.MjModel, body: int) -> Iterator[int]:
-    """Yields the bodies to which a body is attached, from its parent to the world."""
-    while body:
-        body = int(model.body_parentid[body])
-        yield body
 
 
 def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:

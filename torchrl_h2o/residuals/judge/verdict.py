@@ -114,11 +114,12 @@ def _leaves_little(
         return False
     if auc is None or auc <= rules.auc:
         return True
+    if error.after >= rules.small_rest * error.before:
+        return False
     steps, index = max(1, round(head.seconds / mended.control_step)), mended.state_map.names.index(head.name)
     ahead = [one for one in errors_ahead(mended, measured, Split.REPORT, settings) if one.steps == steps]
     by_guess = [one.guessed[index] for one in ahead if np.isfinite(one.guessed[index])]
-    small = not by_guess or head.after < rules.small_rest * by_guess[0]
-    return bool(small and error.after < rules.small_rest * error.before)
+    return not by_guess or bool(head.after < rules.small_rest * by_guess[0])
 
 
 def signs_of_something_missing(

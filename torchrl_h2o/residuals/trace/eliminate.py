@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
@@ -28,6 +30,7 @@ def _is_clearly_needed(state: SearchState, index: int) -> bool:
 
 def _without_one(state: SearchState) -> SearchState | None:
     """The state without the first effect that is not needed; None if all are needed."""
+    before = state.selection_losses(state.fit.effects)
     for index in range(len(state.entries)):
         entries = (*state.entries[:index], *state.entries[index + 1 :])
         kept = (*state.fit.effects[:index], *state.fit.effects[index + 1 :])
@@ -36,18 +39,23 @@ def _without_one(state: SearchState) -> SearchState | None:
         # the joint fit without the effect is a candidate as well: it is the better one if the effect has become neutral
         # and the new fit ends in a worse minimum
         fits = (state.refitted(entries, kept), state.fit.without(index))
-        fitted = min(fits, key=lambda one: state.selection_losses(one.effects).mean())
-        if not is_worse_without(state, fitted):
+        after, fitted = min(((state.selection_losses(one.effects), one) for one in fits), key=lambda one: one[0].mean())
+        if not is_worse(state, fitted, before, after):
             return state.with_found(entries, fitted)
     return None
 
 
-def is_worse_without(state: SearchState, smaller: Fit) -> bool:
+def is_worse(state: SearchState, smaller: Fit, before: np.ndarray, after: np.ndarray) -> bool:
     """Whether fewer effects have a held-out loss that is significantly higher than that of the effects found.
 
     The difference must also exceed a minimum share of the loss, and what rounding explains.
+
+    Args:
+        state: effects found.
+        smaller: fit of fewer effects.
+        before: losses of the selection windows with the effects found, (W).
+        after: those with fewer effects, (W).
     """
-    before, after = (state.selection_losses(which.effects) for which in (state.fit, smaller))
     most = before.mean() / (1.0 - state.settings.trace.min_gain)
     level = state.settings.significance.level
     return bool(after.mean() > most and state.p_value(after, before) < level and _is_beyond_rounding(state, smaller))

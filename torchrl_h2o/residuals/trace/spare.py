@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchrl_h2o.residuals.trace.close_comparison import worse_of
-from torchrl_h2o.residuals.trace.eliminate import eliminate, is_worse_without
+from torchrl_h2o.residuals.trace.eliminate import eliminate, is_worse
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.simplify import replaced
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -22,7 +22,7 @@ def spare(state: SearchState) -> SearchState:
     for index, group in enumerate(state.groups):
         for attempt in group:
             other = replaced(state, index, attempt)
-            if not any(_seems_spare(other, i) for i in range(len(other.entries)) if i != index):
+            if not _has_spare(other, index):
                 continue
             smaller = eliminate(other)
             if _parameters(smaller) < _parameters(state) and worse_of(state, smaller.fit, state.fit) is not smaller.fit:
@@ -30,9 +30,11 @@ def spare(state: SearchState) -> SearchState:
     return state
 
 
-def _seems_spare(state: SearchState, index: int) -> bool:
-    """Whether the joint fit without one effect, its other values unchanged, is as good; spares most of the fits."""
-    return not is_worse_without(state, state.fit.without(index))
+def _has_spare(state: SearchState, kept: int) -> bool:
+    """Whether the joint fit without one of the other effects, its values unchanged, is as good; saves most fits."""
+    before = state.selection_losses(state.fit.effects)
+    fewer = (state.fit.without(index) for index in range(len(state.entries)) if index != kept)
+    return any(not is_worse(state, fit, before, state.selection_losses(fit.effects)) for fit in fewer)
 
 
 def _parameters(state: SearchState) -> int:
