@@ -127,6 +127,12 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
     assert traced(Gravity(1.3)).groups == ((),)
 
 
+def test_effects_that_the_last_round_has_changed_get_their_alternatives(monkeypatch):
+    monkeypatch.setattr("torchrl_h2o.residuals.trace.search.spare", lambda state: replace(state, groups=()))
+    trace = traced(Armature(0.01), catalogue=[GRAVITY, INERTIA, ARMATURE, GAIN])
+    assert [len(group) for group in trace.groups] == [1]
+
+
 def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_reality():
     """Delay and backlash do not commute; alone, backlash explains more of the residual than the delay."""
     play, late = ActionBacklash(0.4), ActionDelay(0.013)
