@@ -152,7 +152,7 @@ def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: 
     return change if np.isfinite(known).all() and np.abs(known).max() > 0.0 else None
 
 
-def _heavy_rotor(model: mujoco.MjModel, joints: str | Sequence[str]) -> Armature:
+def _heavy_rotor(model: mujoco.MjModel, joints: selection.Names) -> Armature:
     """A rotor with which the joints have a thousand times their inertia."""
     inertia = 1.0 / max(model.dof_invweight0[selection.joint_dofs(model, joints)].min(), 1e-9)
     return Armature(_HEAVY * inertia, joints)
