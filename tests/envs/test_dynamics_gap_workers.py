@@ -36,6 +36,7 @@ def test_each_worker_of_a_serial_env_has_its_own_gap():
     np.testing.assert_allclose(gravity, [2 * -9.81, 0.5 * -9.81])
 
 
+@pytest.mark.slow
 def test_parallel_workers_step_as_serial_ones_do():
     gap = DynamicsGap(Gravity(2.0), JointForce(1.0), ActionDelay(0.02))
     parallel = rollout(ParallelEnv(2, partial(make, gap)))

@@ -71,6 +71,7 @@ def refuse_with_a_lambda(observation):
     raise error
 
 
+@pytest.mark.slow
 def test_an_error_that_cannot_be_sent_arrives_with_its_text_and_its_traceback(evaluators):
     _, beside, _ = evaluators
     beside.start(TensorDictModule(refuse_with_a_lambda, in_keys=["observation"], out_keys=["action"]))
@@ -79,6 +80,7 @@ def test_an_error_that_cannot_be_sent_arrives_with_its_text_and_its_traceback(ev
     assert "in refuse_with_a_lambda" in caught.value.__notes__[0]
 
 
+@pytest.mark.slow
 def test_a_second_process_whose_result_nobody_reads_ends_without_an_error(evaluators, capfd):
     _, beside, actor = evaluators
     (process,) = multiprocessing.active_children()

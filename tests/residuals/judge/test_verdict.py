@@ -29,15 +29,17 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
     Verdict,
 )
+from torchrl_h2o.residuals.settings import DEFAULTS
 
 SIMULATION = pendulum()
+SHORT = replace(DEFAULTS.judge, classifier_updates=200)  # enough for the gaps of these tests
 
 
 def verdict(truth, found=(), noise=0.01, rows=3000):
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     mended = SIMULATION.with_effects(*found)
     error = error_summary(SIMULATION, mended, measured)
-    auc = two_sample_auc(mended, measured, sensor_std=sensor_noise(mended, measured))
+    auc = two_sample_auc(mended, measured, sensor_std=sensor_noise(mended, measured), settings=SHORT)
     return reach_verdict(SIMULATION, mended, measured, found, error, TwoSample(None, auc))
 
 

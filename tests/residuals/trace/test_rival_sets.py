@@ -33,6 +33,7 @@ def test_a_weak_motor_and_a_heavier_arm_with_more_damping_are_both_named():
     assert {BodyMass, JointDamping} in named
 
 
+@pytest.mark.slow
 def test_others_are_ordered_by_how_usual_they_are():
     surprises = [other.surprise for other in traced(ActionGain(0.55), catalogue=[GAIN, MASS, DAMPING]).others]
     assert surprises

@@ -104,7 +104,9 @@ def test_effects_are_found_under_noise():
     [
         (Gravity(0.7), JointDamping(0.1)),  # each alone increases the loss as long as the other one is missing
         (BodyMass(1.3), JointFrictionLoss(0.05)),  # equals a weaker motor, less friction, and negative damping
-        (Gravity(1.2), JointSpring(0.5, joints="elbow"), ActionGain(0.8)),  # a spring of 0.74 hides most of gravity
+        pytest.param(  # a spring of 0.74 hides most of gravity
+            (Gravity(1.2), JointSpring(0.5, joints="elbow"), ActionGain(0.8)), marks=pytest.mark.slow
+        ),
     ],
     ids=lambda truth: "-".join(type(effect).__name__ for effect in truth),
 )

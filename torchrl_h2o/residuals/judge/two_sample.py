@@ -55,7 +55,7 @@ def two_sample_auc(
             clamp=None,
         )
         loss = DynamicsRatioLoss(estimator)
-        optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2)
+        optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2, fused=True)
         for _ in range(settings.classifier_updates):
             losses = loss(train[torch.randint(len(train), (settings.classifier_batch,))])
             optimiser.zero_grad()
