@@ -50,6 +50,14 @@ def test_friction_of_each_joint_is_proposed():
         assert getattr(proposed[type(true), true.joints], name) == pytest.approx(getattr(true, name), rel=0.02)
 
 
+def test_friction_that_one_joint_alone_needs_is_kept():
+    """Among many joints, one without its friction hardly raises the mean of what is left."""
+    alone = replace(DEFAULTS.inverse_dynamics, more_left=np.inf)
+    found = propose_effects(SIMULATION, MEASURED, CATALOGUE, settings=alone)
+    proposed = {(type(effect), effect.joints) for effect in found.effects}
+    assert proposed == {(type(effect), effect.joints) for effect in FRICTION}
+
+
 def test_a_payload_is_proposed_with_its_mass():
     damped = SIMULATION.with_effects(JointDamping(1.0))
     measured = recorded(damped.with_effects(Payload(0.2, z=-0.15, bodies="lower")), 3000, noise=0.002)

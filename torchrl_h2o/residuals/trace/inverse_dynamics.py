@@ -163,6 +163,8 @@ def _needed(
 ) -> np.ndarray:
     """Share of each trial, (P), in the smallest set that explains the force nearly as well as all of them; else 0.
 
+    The force at each coordinate counts for itself as well, so that one joint among many keeps its friction.
+
     Args:
         missing: (W, nv), NaN where unknown.
         changes: (W, nv, P), of the trials.
@@ -171,10 +173,13 @@ def _needed(
     """
     kept = np.arange(changes.shape[-1])
     whole = found = _Regression.fit(missing, changes, bounds)
+    least = whole.losses(whole.scale)
     while len(kept):
         fewer = np.delete(kept, found.least_needed)
         smaller = _Regression.fit(missing, changes[..., fewer], bounds[:, fewer])
-        if smaller.loss(whole.scale) > settings.more_left * whole.loss(whole.scale):
+        losses = smaller.losses(whole.scale)
+        one_is_worse = (losses > settings.more_left_of_one * least).any()
+        if one_is_worse or np.nanmean(losses) > settings.more_left * np.nanmean(least):
             break
         kept, found = fewer, smaller
     shares = np.zeros(changes.shape[-1])
@@ -211,9 +216,9 @@ class _Regression:
             left = missing + changes @ shares
         return cls(shares, left, _usual(left), int(cost.argmin()))
 
-    def loss(self, scale: np.ndarray) -> float:
-        """Mean robust loss of what is left, in units of ``scale``."""
-        return float(np.nanmean(np.log1p((self.left / scale) ** 2)))
+    def losses(self, scale: np.ndarray) -> np.ndarray:
+        """Mean robust loss of what is left of each force, (nv), in units of ``scale``."""
+        return np.nanmean(np.log1p((self.left / scale) ** 2), axis=0)
 
 
 def _least_squares(y: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -176,6 +176,8 @@ class InverseDynamicsSettings:
     least_rows: int = 200
     """Smallest number of rows."""
     more_left: float = 1.2
-    """Multiple of the loss with all entries up to which entries are left out."""
+    """Multiple of the mean loss with all entries up to which entries are left out."""
+    more_left_of_one: float = 1.5
+    """The same for the force at each coordinate alone."""
     window: float = 0.1
     """Length of the windows with which the search begins anew, in s, if the data hold enough of them."""
