@@ -18,6 +18,7 @@ from torchrl_h2o.data.readers.guess.coordinates import (
 from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body, velocities_together
 from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
 from torchrl_h2o.data.readers.guess.slopes import is_wrapped, relation, time_of
+from torchrl_h2o.data.readers.guess.unnamed import recognise
 from torchrl_h2o.data.readers.units import to_si
 
 JUMP = 0.5  # share of the median step by which a step must differ for the run to end there
@@ -70,7 +71,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     columns = body.columns
     columns = _one_set(_servo_commands(columns) if model is not None and model.servos else columns)
     if model is not None and not contents.named:
-        columns = _by_order(columns, model)
+        columns, contents = recognise(columns, contents, model)
     elif model is not None:
         columns = _actions_left(columns, contents, len(model.actuators))
     if model is not None and model.forces:
@@ -121,20 +122,6 @@ def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
             column = replace(column, kind="unknown", note="the model's actuators are servos, which take positions")
         result.append(column)
     return result
-
-
-def _by_order(columns: Sequence[Guess], model: Coordinates) -> list[Guess]:
-    """Without names: positions, velocities and actions in the model's order, after a time if there is one more."""
-    kinds = ["velocity" if name.endswith("_velocity") else "position" for name in model.units]
-    kinds += ["action"] * len(model.actuators)
-    units = [*model.units.values(), *["1"] * len(model.actuators)]
-    names = [*model.units, *model.actuators]
-    if len(columns) == len(kinds) + 1:
-        kinds, units, names = ["time", *kinds], ["s", *units], ["time", *names]
-    if len(columns) != len(kinds):
-        return list(columns)
-    note = "guessed from the model's order; check"
-    return [Guess(*parts, note=note) for parts in zip(names, kinds, units, names, strict=True)]
 
 
 def _actions_left(columns: Sequence[Guess], contents: Contents, number: int) -> list[Guess]:
