@@ -75,6 +75,14 @@ def test_the_command_of_a_servo_follows_its_position(tmp_path):
     assert found == expected(0, (1, 2), (3, 4), (8, 9))
 
 
+def test_a_motor_with_the_name_of_its_joint_has_another_one_in_the_log(tmp_path):
+    alike = Coordinates(UNITS, ["hip", "knee"])
+    for others in ([], [OTHER]):
+        found = roles(tmp_path, TIME, Q, V, TORQUE, *others, model=alike)
+        assert [found[5], found[6]] == [("hip_command", "action"), ("knee_command", "action")]
+        assert found[1] == ("hip", "observation")
+
+
 @pytest.mark.parametrize("factor", [180.0 / np.pi, 1.0])
 def test_degrees_are_recognised_as_well(tmp_path, factor):
     assert roles(tmp_path, TIME, factor * Q, factor * V, TORQUE, OTHER) == expected(0, (1, 2), (3, 4), (5, 6))

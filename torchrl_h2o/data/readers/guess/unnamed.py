@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 
 import numpy as np
 
@@ -33,27 +32,23 @@ def recognise(columns: Sequence[Guess], contents: Contents, model: Coordinates) 
         contents: the log.
         model: the coordinates and actuators.
     """
-    kinds = {name: "velocity" if name.endswith("_velocity") else "position" for name in model.units}
-    names = [*model.units, *model.actuators]
-    if len(columns) == len(names) + 1:
-        names = ["time", *names]
-    if len(columns) == len(names):
-        found, notes = dict(zip(names, count(), strict=False)), {}
+    states = [
+        Guess(name, "velocity" if name.endswith("_velocity") else "position", unit, name)
+        for name, unit in model.units.items()
+    ]
+    actions = [Guess(f"{name}_command" if name in model.units else name, "action") for name in model.actuators]
+    in_order = [*([Guess("time", "time", "s")] if len(columns) > len(states + actions) else []), *states, *actions]
+    if len(columns) == len(in_order):
+        found, notes = dict(enumerate(in_order)), {}
     else:
-        found, notes = _by_slopes(contents, model)
+        found, notes = _by_slopes(contents, model, states, actions)
     if not found:
         return list(columns), contents
-    named = {index: name for name, index in found.items()}
-    units = {"time": "s", **model.units}
-
-    def guess(index: int, column: Guess) -> Guess:
-        if index not in named:
-            return replace(column, kind="unknown", note="")
-        name = named[index]
-        kind = "time" if name == "time" else kinds.get(name, "action")
-        return Guess(name, kind, units.get(name, "1"), name, notes.get(kind, "guessed from the model's order; check"))
-
-    result = [guess(index, column) for index, column in enumerate(columns)]
+    result = []
+    for index, column in enumerate(columns):
+        new = found.get(index, Guess(column.name, "unknown"))
+        note = "" if new.kind == "unknown" else notes.get(new.kind, "guessed from the model's order; check")
+        result.append(replace(new, note=note))
     values = {one.name: series for one, series in zip(result, contents.values.values(), strict=True)}
     return result, replace(contents, values=values)
 
@@ -71,22 +66,23 @@ class _States:
     moving: int
 
 
-def _by_slopes(contents: Contents, model: Coordinates) -> tuple[dict[str, int], dict[str, str]]:
-    """Index of the column of each name, empty if none was found, and what to say of each kind of column."""
-    positions = [name for name in model.units if not name.endswith("_velocity")]
-    velocities = [f"{name}_velocity" for name in positions]
+def _by_slopes(
+    contents: Contents, model: Coordinates, states: Sequence[Guess], actions: Sequence[Guess]
+) -> tuple[dict[int, Guess], dict[str, str]]:
+    """The columns that were found, by index, and what to say of each kind of column."""
+    positions = [state for state in states if state.kind == "position"]
+    velocities = {state.name: state for state in states if state.kind == "velocity"}
     table = [None if series is None else series[:_ROWS] for series in contents.values.values()]
     time = next((index for index, series in enumerate(table) if _is_clock(series)), None)
-    if time is None or {*positions, *velocities} != set(model.units):  # a free body has a quaternion
+    if time is None or {f"{one.name}_velocity" for one in positions} != set(velocities):  # a free body has a quaternion
         return {}, {}
-    found, notes = {"time": time}, {"time": "grows in equal steps; check"}
-    states = _states(table, time, len(positions), [model.units[name] for name in positions])
-    if not states:
+    found, notes = {time: Guess("time", "time", "s")}, {"time": "grows in equal steps; check"}
+    sets = _states(table, time, [one.unit for one in positions])
+    if not sets:
         return found, notes
-    most = max(one.moving for one in states)
-    states = [one for one in states if one.moving == most]
-    best = max(one.correlation for one in states)
-    alike = [one for one in states if one.correlation > best - _AS_GOOD]
+    most = max(one.moving for one in sets)
+    best = max(one.correlation for one in sets if one.moving == most)
+    alike = [one for one in sets if one.moving == most and one.correlation > best - _AS_GOOD]
     chosen = min(alike, key=lambda one: (one.positions, one.velocities))
     also = "; other columns may be too, such as commanded and measured ones" if len(alike) > 1 else ""
     notes |= {
@@ -94,8 +90,9 @@ def _by_slopes(contents: Contents, model: Coordinates) -> tuple[dict[str, int], 
         "velocity": "recognised by its position; check",
         "action": "the first columns that may be commands; check role and unit",
     }
-    found |= dict(zip([*positions, *velocities], [*chosen.positions, *chosen.velocities], strict=True))
-    return found | dict(zip(model.actuators, _actions(table, set(found.values()), chosen, model), strict=False)), notes
+    found |= dict(zip(chosen.positions, positions, strict=True))
+    found |= {v: velocities[f"{one.name}_velocity"] for v, one in zip(chosen.velocities, positions, strict=True)}
+    return found | dict(zip(_actions(table, set(found), chosen, model), actions, strict=False)), notes
 
 
 def _is_clock(series: np.ndarray | None) -> bool:
@@ -107,9 +104,9 @@ def _is_clock(series: np.ndarray | None) -> bool:
     return usual > 0.0 and (steps > 0.0).mean() >= _MOSTLY and np.median(np.abs(steps - usual)) <= _EVEN * usual
 
 
-def _states(table: Sequence[np.ndarray | None], time: int, number: int, units: Sequence[str]) -> list[_States]:
-    """All sets of columns, block by block or in pairs, that are positions and their slopes."""
-    found, known = [], {}
+def _states(table: Sequence[np.ndarray | None], time: int, units: Sequence[str]) -> list[_States]:
+    """All sets of columns, block by block or in pairs, that are positions, of these units, and their slopes."""
+    found, known, number = [], {}, len(units)
 
     def slope(position: int, velocity: int, unit: str) -> float | None:
         """Correlation of a column with the slope of another one; None if nothing moves."""
