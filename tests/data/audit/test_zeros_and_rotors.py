@@ -8,7 +8,7 @@ import pytest
 
 from tests.data.audit.recorded import XML, arm, changed, measured, recording
 from torchrl_h2o.data import audit
-from torchrl_h2o.effects import Armature
+from torchrl_h2o.effects import Armature, JointFrictionLoss
 from torchrl_h2o.residuals import Simulation, StateMap
 
 
@@ -32,6 +32,20 @@ def test_rotors_that_a_model_lacks_are_no_fault_of_the_actions(simulation):
     """Without them the simulator moves several times too much, as if the actions acted 320 ms late."""
     found = audit(recording(Armature(0.05)), simulation)
     assert found.severe == found.warnings == ()
+    assert any("far better with rotors on its joints" in finding.words for finding in found.findings)
+
+
+@pytest.mark.parametrize("friction", [(), (JointFrictionLoss(1.0, "shoulder"), JointFrictionLoss(0.3, "elbow"))])
+def test_rotors_of_sixty_times_the_inertia_of_their_links_are_no_other_run_either(simulation, friction):
+    """As in the wrist of a robot arm, behind a gear of 100 : 1."""
+    rng, time = np.random.default_rng(1), 0.01 * np.arange(2000)
+    rates = 0.2 * np.pi * np.arange(1, 6)
+    waves = np.sin(rates[:, None, None] * time[:, None] + rng.uniform(0.0, 2.0 * np.pi, (5, 1, 2)))
+    action = (rng.uniform(0.3, 1.0, (5, 1, 2)) * waves).sum(0) * [40.0, 15.0]
+    real = simulation.with_effects(Armature(4.7, "shoulder"), Armature(0.35, "elbow"), *friction)
+    rows = np.vstack([np.zeros(4), real.rollout(np.zeros((1, 4)), action[None])[0]])
+    found = audit(measured(rows, action), simulation)
+    assert found.severe == ()
     assert any("far better with rotors on its joints" in finding.words for finding in found.findings)
 
 

@@ -141,7 +141,7 @@ class AuditSettings:
     """Step of derivatives by the zero of a position, in rad or m."""
     robust: float = 3.0
     """Usual deviations beyond which a window loses weight in fits."""
-    rotors: tuple[float, ...] = (1.0, 3.0, 10.0)
+    rotors: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0, 100.0)
     """Inertias of rotors that are tried, in inertias of their joint in the model."""
     rotors_leave: float = 0.65
     """Share of the accelerations that may stay unexplained with rotors, any gains and friction; above it, these are not
