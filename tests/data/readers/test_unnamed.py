@@ -18,6 +18,7 @@ V = RATES * np.cos(TIME[:, None] * RATES)
 TORQUE = 3.0 * np.sin(TIME[:, None] * [0.7, 3.9])
 OTHER = RNG.standard_normal((2000, 3))
 ZERO = np.zeros((2000, 2))
+ACCELERATION = -(RATES**2) * Q
 
 
 def roles(tmp_path, *columns, model=MOTORS) -> dict[int, tuple[str, str]]:
@@ -54,11 +55,56 @@ def test_the_time_need_not_be_regular(tmp_path):
 
 
 def test_accelerations_constants_and_copies_are_no_commands(tmp_path):
-    """The accelerations are the slopes of the velocities, but positions come first."""
     found = roles(tmp_path, TIME, TORQUE, Q, V, ZERO, Q + 1e-3 * OTHER[:, :2])
     assert found == expected(0, (3, 4), (5, 6), (1, 2))
-    accelerations = -(RATES**2) * Q
-    assert roles(tmp_path, TIME, Q, V, accelerations, OTHER[:, :1]) == expected(0, (1, 2), (3, 4), (5, 6))
+    assert roles(tmp_path, TIME, Q, V, ACCELERATION, TORQUE) == expected(0, (1, 2), (3, 4), (7, 8))
+
+
+def test_velocities_and_accelerations_are_not_taken_for_positions_and_velocities(tmp_path):
+    assert roles(tmp_path, TIME, V, Q, ACCELERATION, TORQUE) == expected(0, (3, 4), (1, 2), (7, 8))
+
+
+def test_of_two_commands_one_may_rest_or_follow_a_state(tmp_path):
+    for quiet in (0.0 * TIME, 2.0 * Q[:, 0]):
+        found = roles(tmp_path, TIME, Q, V, np.column_stack([quiet, TORQUE[:, 1]]), OTHER)
+        assert found == expected(0, (1, 2), (3, 4), (5, 6))
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("ns", 1e9)])
+def test_the_time_has_the_unit_that_its_step_suggests(tmp_path, unit, factor):
+    counter = np.arange(len(TIME))
+    columns = [counter, np.round(factor * TIME), Q, V, TORQUE]
+    assert roles(tmp_path, *columns) == expected(1, (2, 3), (4, 5), (6, 7))
+    assert f'role: time, unit: "{unit}"' in guess_layout(tmp_path / "log.csv", MOTORS).text
+
+
+def test_columns_that_drift_are_no_clocks_and_repeated_rows_are_no_fault_of_a_clock(tmp_path):
+    drift = np.cumsum(RNG.exponential(1.0, len(TIME)) ** 3)
+    repeated = TIME.copy()
+    repeated[::20] = repeated[1::20]
+    q, v = np.sin(repeated[:, None] * RATES), RATES * np.cos(repeated[:, None] * RATES)
+    assert roles(tmp_path, drift, repeated, q, v, TORQUE) == expected(1, (2, 3), (4, 5), (6, 7))
+
+
+def test_a_joint_at_rest_is_recognised_by_its_place_and_the_note_says_so(tmp_path):
+    rest = Q * [1.0, 0.0] + 1e-5 * RNG.standard_normal(Q.shape)
+    found = roles(tmp_path, TIME, rest, V * [1.0, 0.0], TORQUE, OTHER)
+    assert found == expected(0, (1, 2), (3, 4), (5, 6))
+    text = guess_layout(tmp_path / "log.csv", MOTORS).text
+    assert text.count("does not move, so only its place speaks for it") == 2
+
+
+def test_a_log_may_begin_at_rest(tmp_path):
+    still = np.zeros((6000, 2))
+    time = TIME[0] + 0.01 * np.arange(8000)
+    later = [np.vstack([still + part[0], part]) for part in (Q, V * [[0.0], *[[1.0]] * 1999], TORQUE)]
+    assert roles(tmp_path, time, *later, RNG.standard_normal(8000)) == expected(0, (1, 2), (3, 4), (5, 6))
+
+
+def test_a_free_swing_of_as_many_columns_as_coordinates_and_actuators_has_a_time(tmp_path):
+    one = Coordinates({"hip": "rad", "hip_velocity": "rad/s"}, ["motor"])
+    found = roles(tmp_path, TIME, Q[:, 0], V[:, 0], model=one)
+    assert found == {0: ("time", "time"), 1: ("hip", "observation"), 2: ("hip_velocity", "observation")}
 
 
 def test_another_set_that_may_be_meant_is_spoken_of(tmp_path):
@@ -83,9 +129,11 @@ def test_a_motor_with_the_name_of_its_joint_has_another_one_in_the_log(tmp_path)
         assert found[1] == ("hip", "observation")
 
 
-@pytest.mark.parametrize("factor", [180.0 / np.pi, 1.0])
-def test_degrees_are_recognised_as_well(tmp_path, factor):
+@pytest.mark.parametrize(("unit", "factor"), [("deg", 180.0 / np.pi), ("rad", 1.0)])
+def test_degrees_are_recognised_as_well(tmp_path, unit, factor):
     assert roles(tmp_path, TIME, factor * Q, factor * V, TORQUE, OTHER) == expected(0, (1, 2), (3, 4), (5, 6))
+    text = guess_layout(tmp_path / "log.csv", MOTORS).text
+    assert text.count(f'unit: "{unit}"') == text.count(f'unit: "{unit}/s"') == 2
 
 
 def test_where_nothing_is_the_slope_of_another_column_only_the_time_is_named(tmp_path):
