@@ -163,8 +163,8 @@ def _needed(
 ) -> np.ndarray:
     """Share of each trial, (P), in the smallest set that explains the force nearly as well as all of them; else 0.
 
-    The force at each coordinate counts for itself as well, so that one joint among many keeps its friction. In the mean,
-    all coordinates count alike, however many of their forces are known.
+    The force at each coordinate counts for itself as well, so that one joint among many keeps its friction. In the
+    mean, all coordinates count alike, however many of their forces are known.
 
     Args:
         missing: (W, nv), NaN where unknown.
