@@ -53,7 +53,7 @@ _NO_COMMANDS = (
 _COMPUTED = ("cos", "sin", "squared", "square", "sq", "err", "error", "errors")  # of another column
 _NEVER_COMMANDS = ("squared", "square", "err", "error", "errors")
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
-_LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
+LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 
 
 @dataclass(frozen=True)
@@ -253,6 +253,6 @@ def _unit_of(kind: str, si: str | None, words: list[str], numbers: np.ndarray) -
         return unit, ""
     elif si is None and any(word in _LENGTHS for word in words):
         unit = unit.replace("rad", "m")
-    elif kind.endswith("position") and largest > _LARGEST_ANGLE:
+    elif kind.endswith("position") and largest > LARGEST_ANGLE:
         return "deg", f"check the unit: the largest value is {largest:.3g}, which is much for rad"
     return unit, f"check the unit: the largest value is {largest:.3g}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
-from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns
+from torchrl_h2o.data.readers.guess.roles import LARGEST_ANGLE, Guess, guess_columns
 from torchrl_h2o.data.readers.guess.slopes import is_wrapped, relation
 
 _EVEN = 0.5  # share of the median by which a clock's usual step may differ from it
@@ -18,7 +18,7 @@ _ROWS = 5_000  # rows by which slopes are compared, those with the most motion
 _SLOPE, _EACH = 0.8, 0.5  # mean and smallest correlation of velocities with the slopes of their positions
 _AS_GOOD = 0.05  # difference of these means up to which two sets are alike
 _COPY, _SIZE = 0.98, 0.1  # correlation, and share by which its size may differ, of a copy of a state
-_LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
+_AT_REST = "does not move, so only its place speaks for it"
 _SERVO = 0.8  # correlation of a servo's command with its position
 
 
@@ -75,11 +75,12 @@ def _by_slopes(
     """The columns that were found, by index, and what to say of each kind of column."""
     positions = [state for state in states if state.kind == "position"]
     velocities = {state.name: state for state in states if state.kind == "velocity"}
-    table = _liveliest(list(contents.values.values()))
+    whole = list(contents.values.values())
+    table = _liveliest(whole)
     time = _time_of(table)
     if time is None or {f"{one.name}_velocity" for one in positions} != set(velocities):  # a free body has a quaternion
         return {}, {}
-    found, notes = {time: _clock(contents.values[list(contents.values)[time]])}, {"time": "grows in equal steps"}
+    found, notes = {time: _clock(whole[time])}, {"time": "grows in equal steps"}
     slopes = _Slopes(table, time)
     sets = _states(slopes, [one.unit for one in positions])
     if not sets:
@@ -99,9 +100,7 @@ def _by_slopes(
     degrees = any(_in_degrees(table[p], one.unit) for p, one in zip(chosen.positions, positions, strict=True))
     for position, velocity, one in zip(chosen.positions, chosen.velocities, positions, strict=True):
         unit = "deg" if degrees and one.unit == "rad" else one.unit
-        rest = (
-            "does not move, so only its place speaks for it" if slopes.of(position, velocity, one.unit) is None else ""
-        )
+        rest = _AT_REST if slopes.of(position, velocity, one.unit) is None else ""
         found[position] = replace(one, unit=unit, note=rest or f"the largest value is {_largest(table[position]):.3g}")
         found[velocity] = replace(velocities[f"{one.name}_velocity"], unit=f"{unit}/s", note=rest)
     return found | dict(zip(_actions(slopes, set(found), chosen, model), actions, strict=False)), notes
@@ -115,9 +114,8 @@ def _clock(series: np.ndarray | None) -> Guess:
 def _time_of(table: Sequence[np.ndarray | None]) -> int | None:
     """Index of the time: a clock that does not count rows, or else the first counter; None if there is none."""
     clocks = [index for index, series in enumerate(table) if _is_clock(series)]
-    counters = [index for index in clocks if np.ptp(np.diff(_known(table[index]))) == 0.0]
-    exact = [index for index in counters if np.diff(_known(table[index]))[0] == 1.0]
-    return next((index for index in clocks if index not in exact), next(iter(clocks), None))
+    counters = [index for index in clocks if (np.diff(_known(table[index])) == 1.0).all()]
+    return next((index for index in clocks if index not in counters), next(iter(clocks), None))
 
 
 def _known(series: np.ndarray | None) -> np.ndarray:
@@ -129,7 +127,7 @@ def _largest(series: np.ndarray | None) -> float:
 
 
 def _in_degrees(series: np.ndarray | None, unit: str) -> bool:
-    return unit == "rad" and (_largest(series) > _LARGEST_ANGLE or is_wrapped(series, "deg"))
+    return unit == "rad" and (_largest(series) > LARGEST_ANGLE or is_wrapped(series, "deg"))
 
 
 def _liveliest(table: Sequence[np.ndarray | None]) -> list[np.ndarray | None]:
