@@ -194,7 +194,9 @@ def test_nothing_replaces_a_wrong_effect_if_no_force_is_missing():
 
 
 def test_intervals_cover_the_true_friction():
-    found = propose_effects(SIMULATION, with_noisy_torques(MEASURED), CATALOGUE)
+    strong = DOUBLE.replace("0.6 0.6", "2 2").replace("0.3 0.3", "2 2")  # noise beyond a motor's limit would be cut
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(strong))
+    found = propose_effects(simulation, with_noisy_torques(MEASURED), CATALOGUE)
     index = next(i for i, effect in enumerate(found.effects) if getattr(effect, "joints", "") == "elbow")
     assert isinstance(found.effects[index], JointFrictionLoss)
     assert abs(found.effects[index].torque - 0.08) < 2.0 * found.half_widths[index]["torque"]

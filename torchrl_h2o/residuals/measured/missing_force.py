@@ -1,8 +1,8 @@
-"""The force that a simulator lacks along the measured motion, by inverse dynamics.
+"""The force that a simulator lacks along the measured motion.
 
 A simulation over several steps says little where a torque moves a light link: noise of the torque, or a small error of
-the friction, is enough to make it run away. The force that the motion needs shows the same error in N or N·m, whatever
-the inertia is.
+the friction, is enough to make it run away. The force that is missing in the motion shows the same error in N or N·m,
+whatever the inertia is.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ _WITHOUT_CONTACTS = (mujoco.mjtConstraint.mjCNSTR_EQUALITY, mujoco.mjtConstraint
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Measured motion over short windows.
+    """Measured motion over short windows, each of them in K parts.
 
     Args:
-        position: (W, K, nq), at K rows of each window.
-        velocity: (W, K, nv), at these rows.
+        position: (W, K, nq), in the middle of each part.
+        velocity: (W, K, nv), in the middle of each part.
         acceleration: (W, nv), mean over the window.
-        control: (W, nu), executed actions, mean over the window.
-        time: (W, K), in s.
+        control: (W, K, nu), executed actions, mean over each part.
+        time: (W, K), in the middle of each part, in s.
+        share: (K), of the window, of each part.
         moving: (W, nv), whether a degree of freedom moves in one direction throughout the window, and faster than a
             share of its usual speed; all windows of one that hardly ever does.
     """
@@ -42,6 +43,7 @@ class Motion:
     acceleration: np.ndarray
     control: np.ndarray
     time: np.ndarray
+    share: np.ndarray
     moving: np.ndarray
 
 
@@ -71,22 +73,36 @@ def measured_motion(
     half = max(1, round(settings.half_width / simulation.control_step))
     starts = thinned(measured.windows(2 * half + 1, split=split), settings.rows)
     states, model = start_states(simulation, measured), simulation.model
-    rows = starts[:, None] + np.linspace(0, 2 * half, min(2 * half + 1, settings.rows_in_window)).round().astype(int)
+    ends = np.linspace(0, 2 * half, min(2 * half, settings.parts_of_window) + 1).round().astype(int)
+    rows = starts[:, None] + ends
     rows = rows[np.isfinite(states[rows]).all((1, 2))]
     rows = rows[_free_of_contacts(simulation, states[rows, : model.nq])]
     if len(rows) < settings.least_rows:
         return None
-    actions, velocity = executed_actions(simulation, measured), states[rows, model.nq :]
+    velocity, steps = states[rows, model.nq :], np.diff(ends)
     slowest = settings.resting * velocity.std((0, 1))
     moving = (velocity > slowest).all(1) | (velocity < -slowest).all(1)
+    middle = (velocity[:, 1:] + velocity[:, :-1]) / 2.0
+    later = steps / 2.0 * simulation.control_step
+    total = np.insert(executed_actions(simulation, measured).cumsum(0), 0, 0.0, axis=0)
     return Motion(
-        states[rows, : model.nq],
-        velocity,
-        (states[rows[:, -1]] - states[rows[:, 0]])[:, model.nq :] / (2.0 * half * simulation.control_step),
-        actions[rows[:, :1] + np.arange(2 * half)].mean(1),
-        measured.time[rows],
+        _moved(model, states[rows[:, :-1], : model.nq], middle, later),
+        middle,
+        (velocity[:, -1] - velocity[:, 0]) / (2.0 * half * simulation.control_step),
+        np.diff(total[rows], axis=1) / steps[:, None],
+        measured.time[rows[:, :-1]] + later,
+        steps / steps.sum(),
         moving | (moving.sum(0) < settings.least_moving),
     )
+
+
+def _moved(model: mujoco.MjModel, position: np.ndarray, velocity: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Positions, (W, K, nq), after so many seconds, (K), at a velocity, (W, K, nv)."""
+    moved = position.copy()
+    for window in range(len(position)):
+        for part, time in enumerate(seconds):
+            mujoco.mj_integratePos(model, moved[window, part], velocity[window, part], time)
+    return moved
 
 
 def _free_of_contacts(simulation: Simulation, position: np.ndarray) -> np.ndarray:
@@ -103,27 +119,29 @@ def _free_of_contacts(simulation: Simulation, position: np.ndarray) -> np.ndarra
 def missing_force(simulation: Simulation, motion: Motion) -> np.ndarray:
     """Generalised force that the measured motion needs beyond what the simulator has, mean over each window.
 
+    It is the inertia times the difference between the measured and the simulated acceleration. Inverse dynamics with
+    the measured acceleration would give another force where friction holds a light link: MuJoCo's dry friction then
+    depends on the acceleration within the control step, which the mean over a window is not.
+
     Returns:
         (W, nv) in N or N·m; NaN for joints that rest or turn around in the window, where dry friction may have any size
         up to its largest one.
     """
     model = simulation.model
-    data, (windows, rows) = mujoco.MjData(model), motion.time.shape
-    needed = np.empty((windows, rows, model.nv))
-    for window in range(windows):
-        data.qacc[:], data.ctrl[:] = motion.acceleration[window], motion.control[window]
-        for row in range(rows):
-            data.qpos[:], data.qvel[:] = motion.position[window, row], motion.velocity[window, row]
-            mujoco.mj_inverse(model, data)
-            mujoco.mj_fwdActuation(model, data)
-            needed[window, row] = data.qfrc_inverse - data.qfrc_actuator
-    position, velocity = (each.reshape(windows * rows, -1) for each in (motion.position, motion.velocity))
-    control = np.repeat(motion.control, rows, axis=0)
+    data, (windows, parts) = mujoco.MjData(model), motion.time.shape
+    needed, acceleration = np.empty((windows, parts, model.nv)), np.repeat(motion.acceleration, parts, axis=0)
+    position, velocity, control = (
+        each.reshape(windows * parts, -1) for each in (motion.position, motion.velocity, motion.control)
+    )
+    applied = np.zeros_like(velocity)
     for force in simulation.pipeline.batched_forces(model):
-        needed -= force(position, velocity, control, motion.time.ravel()).reshape(needed.shape)
-    weights = np.ones(rows)
-    weights[[0, -1]] = 0.5  # trapezoidal rule
-    return np.where(motion.moving, np.average(needed, axis=1, weights=weights), np.nan)
+        applied += force(position, velocity, control, motion.time.ravel())
+    for row, force in enumerate(needed.reshape(windows * parts, -1)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = position[row], velocity[row], control[row]
+        data.qfrc_applied[:] = applied[row]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_mulM(model, data, force, acceleration[row] - data.qacc)
+    return np.where(motion.moving, np.average(needed, axis=1, weights=motion.share), np.nan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,15 +102,41 @@ def propose_effects(
     kept = np.flatnonzero(shares)
     if not len(kept):
         return Proposal()
-    half = _half_widths(missing, changes[..., kept], bounds[:, kept], settings.blocks)
     chosen = [entries[index] for index in kept]
+    at = _linearised(simulation, motion, chosen, shares[kept])
+    for _ in range(settings.rounds):
+        closer = _Regression.fit(at.missing, at.changes, bounds[:, kept] - at.shares)
+        at = _linearised(simulation, motion, chosen, at.shares + closer.shares)
+    half = _half_widths(at.missing, at.changes, bounds[:, kept] - at.shares, settings.blocks)
     return Proposal(
         tuple(chosen),
-        tuple(_at(entry, share, simulation.model) for entry, share in zip(chosen, shares[kept], strict=True)),
+        tuple(_at(entry, share, simulation.model) for entry, share in zip(chosen, at.shares, strict=True)),
         tuple(
             {name: float(width * abs(_step(entry, name))) for name in _scaled(entry)}
             for entry, width in zip(chosen, half, strict=True)
         ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """The missing force beside effects at ``shares``, (P), of their trials: (W, nv), and its change with each share."""
+
+    shares: np.ndarray
+    missing: np.ndarray
+    changes: np.ndarray
+
+
+def _linearised(
+    simulation: Simulation, motion: Motion, entries: Sequence[CatalogueEntry], shares: np.ndarray
+) -> _Linearised:
+    def missing(at: np.ndarray) -> np.ndarray:
+        effects = (_at(entry, share, simulation.model) for entry, share in zip(entries, at, strict=True))
+        return missing_force(simulation.with_effects(*effects), motion)
+
+    here, steps = missing(shares), np.diag(0.05 * shares)
+    return _Linearised(
+        shares, here, np.stack([(missing(shares + step) - here) / step.sum() for step in steps], axis=-1)
     )
 
 

@@ -165,12 +165,14 @@ class InverseDynamicsSettings:
     """Half the length, in s, of the windows over which accelerations and forces are averaged."""
     rows: int = 1500
     """Largest number of rows in the regression."""
-    rows_in_window: int = 7
-    """Rows, evenly spread over a window, over which the simulator's forces are averaged."""
+    parts_of_window: int = 10
+    """Parts of a window, in the middle of each of which the simulator's force is computed; their mean counts."""
     resting: float = 0.1
     """Share of a joint's usual speed below which it counts as resting."""
     least_moving: int = 50
     """Smallest number of windows in which a joint moves in one direction for the others to be left out."""
+    rounds: int = 3
+    """Repetitions of the regression around the values found, because dry friction is soft in MuJoCo."""
     blocks: int = 20
     """Blocks of neighbouring windows by which intervals are computed."""
     least_rows: int = 200
