@@ -168,6 +168,11 @@ class MissingForces:
         before = np.maximum(self.before, np.minimum(2.0 * self.by_noise, self.after))
         return (self.after + floor) / (before + floor)
 
+    @property
+    def within_noise(self) -> bool:
+        """Whether noise explains about what is missing with the effects."""
+        return bool((self.after <= 2.0 * self.by_noise).all())
+
     def rise_by(self, factor: float) -> bool:
         """Whether the effects raise one force by more than a factor, and do not lower the others as much.
 

@@ -1,7 +1,8 @@
 """Begins a search with known effects, or another search after the first one.
 
-Another search has windows and effects of its own if the first one explains no motion; it has no sensor noise if one
-more effect explains most of what was taken for noise; or it has longer windows where sensors are noisy.
+Another search has windows and effects of its own if the first one explains no motion, or less than the effects that a
+regression of the missing forces proposes; it has no sensor noise if one more effect explains most of what was taken for
+noise; or it has longer windows where sensors are noisy.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
 from torchrl_h2o.residuals.trace.fit import Fit
+from torchrl_h2o.residuals.trace.grow import comparable_losses
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -94,6 +96,41 @@ def begin_anew(
     return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / tried))
 
 
+def begin_with_forces(
+    state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
+) -> SearchState | None:
+    """Begins another search with the effects that a regression of the missing forces proposes, if they explain more.
+
+    Effects that are put in one by one must each explain something alone. Where a mass, friction and a constant force
+    are missing together, none of them may, or a wrong mass may take the place of two of them.
+
+    Args:
+        state: what the first search has found.
+        catalogue: effects that the simulator may lack.
+        rng: generator for screened windows.
+        progress: bar that shows how far the search is.
+
+    Returns:
+        The state with the proposed effects, fitted to the motion; None if the sensors' noise explains the forces that
+        are still missing, or if the proposed effects do not leave far smaller forces and significantly smaller errors
+        of the motion.
+    """
+    found = _missing_forces(state)
+    if state.exact or found is None or found.within_noise:
+        return None
+    proposed = _with_proposed(state, catalogue, rng, progress)
+    if proposed is None or (forces := _missing_forces(proposed)) is None:
+        return None
+    if not MissingForces(found.after, forces.after).fall_by(state.settings.verdict.less_force):
+        return None
+    same_windows = _refitted_at(state, SearchState.begin(proposed.problem, catalogue, rng, state.settings))
+    mine, its = comparable_losses([same_windows, proposed])
+    if its.mean() > mine.mean() or proposed.p_value(mine, its) > state.settings.significance.level:
+        return None
+    tried = len(proposed.entries) * len(proposed.catalogue)
+    return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / tried))
+
+
 def replaced_by_forces(
     state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
 ) -> SearchState | None:
@@ -111,12 +148,13 @@ def replaced_by_forces(
     Returns:
         The state with the proposed effects, at the values of the regression because noisy torques would distort a fit
         to the motion as well. Effects found that no regression proposes, such as a delay, stay beside them unless far
-        less force is missing without them. None if the effects found predict the motion of their joints and do not
-        raise the missing forces; or if the proposed ones raise the error of the motion, or do not leave smaller forces
-        missing.
+        less force is missing without them. None if the sensors' noise explains the forces that are missing with the
+        effects found; or if the proposed ones raise the error of the motion, or do not leave smaller forces missing, by
+        twice the usual factor if the effects found predict the motion of their joints and do not raise the missing
+        forces.
     """
     found = _missing_forces(state)
-    if not state.entries or found is None or _stands(state, found):
+    if not state.entries or found is None or found.within_noise:
         return None
     others = [index for index, effect in enumerate(state.fit.effects) if not isinstance(effect, PROPOSED)]
     proposed = [
@@ -130,7 +168,8 @@ def replaced_by_forces(
         best, forces = possible[-1]
     without, with_them = (best.first.selection_loss(which) for which in ((), best.fit.effects))
     explains = forces.fall_by(rules.less_force) and with_them < without
-    return best if explains and MissingForces(forces.after, found.after).rise_by(rules.more_force) else None
+    factor = rules.more_force * (2.0 if _stands(state, found) else 1.0)
+    return best if explains and MissingForces(forces.after, found.after).rise_by(factor) else None
 
 
 def _stands(state: SearchState, forces: MissingForces) -> bool:

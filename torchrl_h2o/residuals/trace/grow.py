@@ -128,7 +128,7 @@ def _closest(states: Sequence[SearchState]) -> list[SearchState]:
     with the fewest parameters is kept: one friction for both joints, not the same friction for each.
     """
     rules = states[0].settings.trace
-    means = [float(losses.mean()) for losses in _comparable_losses(states)]
+    means = [float(losses.mean()) for losses in comparable_losses(states)]
     near = [pair for pair in zip(means, states, strict=True) if pair[0] <= rules.beam_loss * min(means)]
     near.sort(key=lambda pair: (_size(pair[1])[0], pair[0]))
     kept = sorted(distinct(near, itemgetter(0), rules.same_fit), key=itemgetter(0))
@@ -139,7 +139,7 @@ def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
     """Of the states that are as good as the one with the lowest loss, the one with the fewest parameters."""
     if len(states) == 1:
         return states[0]
-    losses = _comparable_losses(states)
+    losses = comparable_losses(states)
     lowest, best = min(zip(losses, states, strict=True), key=lambda pair: pair[0].mean())
     as_good = [one for one, loss in zip(states, losses, strict=True) if not _is_beaten(one, loss, best, lowest)]
     return min(as_good, key=_size)
@@ -147,7 +147,7 @@ def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
 
 def is_beaten_by(state: SearchState, other: SearchState) -> bool:
     """Whether another list of effects, in the same windows, explains the selection part significantly better."""
-    mine, its = _comparable_losses([state, other])
+    mine, its = comparable_losses([state, other])
     return bool(its.mean() < mine.mean()) and _is_beaten(state, mine, other, its)
 
 
@@ -164,7 +164,7 @@ def _is_beaten(state: SearchState, loss: np.ndarray, best: SearchState, lowest: 
     return more <= 0 or matters(state.first_loss, without, with_them, more * state.min_share)
 
 
-def _comparable_losses(states: Sequence[SearchState]) -> list[np.ndarray]:
+def comparable_losses(states: Sequence[SearchState]) -> list[np.ndarray]:
     """Losses of the selection windows, (W) for each state, with residuals scaled by what the best state leaves."""
     best = min(states, key=lambda one: one.first.selection_loss(one.fit.effects))
     return [best.selection_losses(one.fit.effects) for one in states]

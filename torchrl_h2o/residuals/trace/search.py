@@ -18,6 +18,7 @@ from torchrl_h2o.residuals.trace.begin import (
     begin_in_longer_windows,
     begin_noise_free,
     begin_with,
+    begin_with_forces,
     in_longer_windows,
     replaced_by_forces,
 )
@@ -144,9 +145,10 @@ def _from_another_beginning(
         found(grown)
         return grown
     progress.show_found(state.entries)
-    if (other := begin_anew(state, catalogue, rng, progress)) is not None:
-        found(other)
-        return grow(other, rng, progress, found)
+    for begin in (begin_anew, begin_with_forces):
+        if (other := begin(state, catalogue, rng, progress)) is not None:
+            found(other)
+            return grow(other, rng, progress, found)
     return _from_longer_windows(state, catalogue, rng, progress, found)
 
 
