@@ -69,8 +69,8 @@ def propose_effects(
 ) -> Proposal:
     """The properties of single links and joints that together explain the missing force.
 
-    All are fitted together, and then left out one by one, the one that is needed least first. Accelerations are means
-    over windows of twice ``half_width``.
+    All are fitted together, and then left out one by one, the one that is needed least first; at the end also those
+    whose 95 % interval contains no effect. Accelerations are means over windows of twice ``half_width``.
 
     Args:
         simulation: the simulator.
@@ -81,7 +81,7 @@ def propose_effects(
 
     Returns:
         The effects; none if coordinates are unobserved, if actuators have a state of their own, which is not measured,
-        or if the rows are too few.
+        if the rows are too few, or if the model rejects them together.
     """
     motion = measured_motion(simulation, measured, Split.FIT, settings)
     if motion is None:
@@ -100,20 +100,30 @@ def propose_effects(
     bounds, changes = np.array([_bounds(entry, simulation.model) for entry in entries]).T, np.stack(columns, axis=-1)
     shares = _needed(missing, changes, bounds, settings)
     kept = np.flatnonzero(shares)
-    if not len(kept):
-        return Proposal()
-    chosen = [entries[index] for index in kept]
-    at = _linearised(simulation, motion, chosen, shares[kept])
-    for _ in range(settings.rounds):
-        closer = _Regression.fit(at.missing, at.changes, bounds[:, kept] - at.shares)
-        at = _linearised(simulation, motion, chosen, at.shares + closer.shares)
-    half = _half_widths(at.missing, at.changes, bounds[:, kept] - at.shares, settings.blocks)
+    while len(kept):
+        chosen = [entries[index] for index in kept]
+        try:
+            at = _repeated(simulation, motion, chosen, shares[kept], bounds[:, kept], settings)
+        except ValueError:  # values that the model rejects together
+            break
+        shares[kept] = at.shares
+        sure, half_widths = _sure(at, bounds[:, kept], settings.blocks)
+        if len(sure) == len(kept):
+            return _proposal(chosen, at.shares, half_widths, simulation.model)
+        kept = kept[sure]
+    return Proposal()
+
+
+def _proposal(
+    entries: Sequence[CatalogueEntry], shares: np.ndarray, half_widths: np.ndarray, model: mujoco.MjModel
+) -> Proposal:
+    """The effects at shares of their trials, with the half-widths of these shares."""
     return Proposal(
-        tuple(chosen),
-        tuple(_at(entry, share, simulation.model) for entry, share in zip(chosen, at.shares, strict=True)),
+        tuple(entries),
+        tuple(_at(entry, share, model) for entry, share in zip(entries, shares, strict=True)),
         tuple(
             {name: float(width * abs(_step(entry, name))) for name in _scaled(entry)}
-            for entry, width in zip(chosen, half, strict=True)
+            for entry, width in zip(entries, half_widths, strict=True)
         ),
     )
 
@@ -134,10 +144,48 @@ def _linearised(
         effects = (_at(entry, share, simulation.model) for entry, share in zip(entries, at, strict=True))
         return missing_force(simulation.with_effects(*effects), motion)
 
-    here, steps = missing(shares), np.diag(0.05 * shares)
+    here, steps = missing(shares), np.diag(0.05 * np.where(shares == 0.0, 1.0, shares))
     return _Linearised(
         shares, here, np.stack([(missing(shares + step) - here) / step.sum() for step in steps], axis=-1)
     )
+
+
+def _repeated(
+    simulation: Simulation,
+    motion: Motion,
+    entries: Sequence[CatalogueEntry],
+    shares: np.ndarray,
+    bounds: np.ndarray,
+    settings: InverseDynamicsSettings,
+) -> _Linearised:
+    """Regressions, each around the values of the one before."""
+    at = _linearised(simulation, motion, entries, shares)
+    for _ in range(settings.rounds):
+        change = _Regression.fit(at.missing, at.changes, bounds - at.shares).shares
+        at = _linearised(simulation, motion, entries, at.shares + change)
+        if (np.abs(change) <= settings.same_value * np.abs(at.shares)).all():
+            break
+    return at
+
+
+def _sure(at: _Linearised, bounds: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the effects that stay if those whose 95 % interval contains no effect are left out, one by one.
+
+    Also returns the half-widths of their shares' intervals.
+    """
+    kept, shares, missing = np.arange(len(at.shares)), at.shares.copy(), at.missing
+    while len(kept):
+        half_widths = _half_widths(missing, at.changes[..., kept], bounds[:, kept] - shares[kept], blocks)
+        doubt = half_widths / np.maximum(np.abs(shares[kept]), 1e-300)
+        if doubt.max() <= 1.0:
+            return kept, half_widths
+        out = kept[doubt.argmax()]
+        kept, missing = np.delete(kept, doubt.argmax()), missing - shares[out] * at.changes[..., out]
+        if len(kept):
+            change = _Regression.fit(missing, at.changes[..., kept], bounds[:, kept] - shares[kept]).shares
+            shares[kept] += change
+            missing = missing + at.changes[..., kept] @ change
+    return kept, np.zeros(0)
 
 
 def _half_widths(missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, blocks: int) -> np.ndarray:

@@ -173,6 +173,8 @@ class InverseDynamicsSettings:
     """Smallest number of windows in which a joint moves in one direction for the others to be left out."""
     rounds: int = 3
     """Repetitions of the regression around the values found, because dry friction is soft in MuJoCo."""
+    same_value: float = 0.01
+    """Change of all values, as a share, up to which the regression is not repeated any more."""
     blocks: int = 20
     """Blocks of neighbouring windows by which intervals are computed."""
     least_rows: int = 200
