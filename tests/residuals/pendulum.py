@@ -76,13 +76,18 @@ def double_pendulum() -> Simulation:
     return Simulation(lambda: mujoco.MjSpec.from_string(DOUBLE), 2, state_map, name="double pendulum")
 
 
-def recorded(real: Simulation, transitions: int = 1500, noise: float = 0.0, seed: int = 0) -> Measured:
-    """One run under smooth random torques, after the action effects; noise is a share of each dimension's spread."""
+def recorded(
+    real: Simulation, transitions: int = 1500, noise: float = 0.0, seed: int = 0, *, smooth: float = 0.9
+) -> Measured:
+    """One run under random torques, after the action effects; noise is a share of each dimension's spread.
+
+    Each torque keeps the share ``smooth`` of the one before.
+    """
     rng = np.random.default_rng(seed)
     motors, states = real.model.nu, real.model.nq + real.model.nv
     action = np.zeros((transitions, motors))
     for t in range(1, transitions):
-        action[t] = 0.9 * action[t - 1] + 0.4 * rng.standard_normal(motors)
+        action[t] = smooth * action[t - 1] + 0.4 * rng.standard_normal(motors)
     low, high = real.model.actuator_ctrlrange.T
     bounds = (low, high) if (high > low).all() else (-1.0, 1.0)
     action = np.clip(0.8 * action, *bounds)

@@ -36,6 +36,13 @@ def test_a_heavy_rotor_needs_torques_that_no_motor_gave():
     assert found.factors[0] == pytest.approx(1.0, abs=0.1)
 
 
+def test_the_right_friction_leaves_nothing_missing_where_torques_jump():
+    """MuJoCo's dry friction depends on the torque of each control step, which the mean over a window hides."""
+    truth = (JointFrictionLoss(0.15, "elbow"),)
+    found = forces(truth, truth, noise=0.001, smooth=0.0)
+    assert found.factors[1] < 0.05
+
+
 def test_the_missing_force_has_the_size_of_the_friction():
     found = forces(FRICTION, ())
     assert found.before == pytest.approx([0.15, 0.08], rel=0.15)
