@@ -147,6 +147,7 @@ def _from_another_beginning(
     progress.show_found(state.entries)
     for begin in (begin_anew, begin_with_forces):
         if (other := begin(state, catalogue, rng, progress)) is not None:
+            progress.show_found(other.entries)
             found(other)
             return grow(other, rng, progress, found)
     return _from_longer_windows(state, catalogue, rng, progress, found)
