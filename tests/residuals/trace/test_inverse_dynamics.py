@@ -241,6 +241,23 @@ def test_effects_that_stand_the_test_are_kept():
     assert by_forces(MEASURED, ()) is None
 
 
+def test_effects_that_leave_only_the_error_of_means_over_windows_are_kept():
+    """Without noise, small effects of the kinds that a regression knows would make up for that error."""
+    truth = (Gravity(0.8), JointDamping(0.3, "*"))
+    measured = recorded(SIMULATION.with_effects(*truth), 3000)
+    assert by_forces(measured, truth) is None
+
+
+def test_friction_that_the_data_do_not_have_is_taken_away_and_no_more():
+    smooth = SIMULATION.with_effects(JointDamping(0.3, "*"))
+    rough = smooth.with_effects(JointFrictionLoss(0.05, "*"))
+    catalogue = [entry for entry in rough.catalogue() if isinstance(entry.effect, (*KINDS, BodyMass))]
+    found = propose_effects(rough, recorded(smooth, 3000, noise=0.002), catalogue)
+    mended = rough.with_effects(*found.effects).model
+    assert mended.dof_frictionloss == pytest.approx([0.0, 0.0], abs=0.005)
+    assert mended.body_mass[1:] == pytest.approx(SIMULATION.model.body_mass[1:], rel=0.1)
+
+
 def test_nothing_replaces_a_wrong_effect_if_no_force_is_missing():
     """Noisy torques alone must not make an effect."""
     assert by_forces(with_noisy_torques(recorded(SIMULATION, 3000, noise=0.002)), (Armature(0.5, "*"),)) is None

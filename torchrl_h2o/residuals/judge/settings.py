@@ -90,6 +90,8 @@ class VerdictSettings:
     """Median error ahead up to which effects explain the motion, in errors of the guess of constant velocities."""
     more_force: float = 1.5
     """Factor by which effects may raise the force that a joint's measured motion needs beyond the simulator's."""
+    more_force_if_stands: float = 3.0
+    """The same for effects that predict the motion, beyond a regression's proposal that takes their place."""
     own_force: float = 1.2
     """Factor by which effects on a joint may raise its missing force and still count as explaining the forces."""
     less_force: float = 0.5

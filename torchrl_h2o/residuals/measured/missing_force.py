@@ -18,6 +18,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+SMALL = 0.02  # share of a missing force that the means over windows may make up
 LOWER = 0.95  # factor on a missing force below which it falls; chance alone changes it less
 _MEDIAN_OF_NORMAL = 0.6745  # median size of a normal number, in its standard deviation
 _WITHOUT_CONTACTS = (mujoco.mjtConstraint.mjCNSTR_EQUALITY, mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
@@ -169,9 +170,9 @@ class MissingForces:
         return (self.after + floor) / (before + floor)
 
     @property
-    def within_noise(self) -> bool:
-        """Whether noise explains about what is missing with the effects."""
-        return bool((self.after <= 2.0 * self.by_noise).all())
+    def hardly_any(self) -> bool:
+        """Whether noise explains about what is missing with the effects, or it is a small share of that without."""
+        return bool((self.after <= np.maximum(2.0 * self.by_noise, SMALL * self.before)).all())
 
     def rise_by(self, factor: float) -> bool:
         """Whether the effects raise one force by more than a factor, and do not lower the others as much.

@@ -111,12 +111,11 @@ def begin_with_forces(
         progress: bar that shows how far the search is.
 
     Returns:
-        The state with the proposed effects, fitted to the motion; None if the sensors' noise explains the forces that
-        are still missing, or if the proposed effects do not leave far smaller forces and significantly smaller errors
-        of the motion.
+        The state with the proposed effects, fitted to the motion; None if hardly any force is still missing, or if the
+        proposed effects do not leave far smaller forces and significantly smaller errors of the motion.
     """
-    found = _missing_forces(state)
-    if state.exact or found is None or found.within_noise:
+    found = None if state.exact else _missing_forces(state)
+    if found is None or found.hardly_any:
         return None
     proposed = _with_proposed(state, catalogue, rng, progress)
     if proposed is None or (forces := _missing_forces(proposed)) is None:
@@ -124,6 +123,7 @@ def begin_with_forces(
     if not MissingForces(found.after, forces.after).fall_by(state.settings.verdict.less_force):
         return None
     same_windows = _refitted_at(state, SearchState.begin(proposed.problem, catalogue, rng, state.settings))
+    proposed = proposed.rescaled(proposed.posed_at(proposed.fit.effects))
     mine, its = comparable_losses([same_windows, proposed])
     if its.mean() > mine.mean() or proposed.p_value(mine, its) > state.settings.significance.level:
         return None
@@ -148,13 +148,12 @@ def replaced_by_forces(
     Returns:
         The state with the proposed effects, at the values of the regression because noisy torques would distort a fit
         to the motion as well. Effects found that no regression proposes, such as a delay, stay beside them unless far
-        less force is missing without them. None if the sensors' noise explains the forces that are missing with the
-        effects found; or if the proposed ones raise the error of the motion, or do not leave smaller forces missing, by
-        twice the usual factor if the effects found predict the motion of their joints and do not raise the missing
-        forces.
+        less force is missing without them. None if hardly any force is missing with the effects found; or if the
+        proposed ones raise the error of the motion, or do not leave smaller forces missing: far smaller ones if the
+        effects found predict the motion of their joints and do not raise the missing forces.
     """
-    found = _missing_forces(state)
-    if not state.entries or found is None or found.within_noise:
+    found = None if state.exact or not state.entries else _missing_forces(state)
+    if found is None or found.hardly_any:
         return None
     others = [index for index, effect in enumerate(state.fit.effects) if not isinstance(effect, PROPOSED)]
     proposed = [
@@ -168,7 +167,7 @@ def replaced_by_forces(
         best, forces = possible[-1]
     without, with_them = (best.first.selection_loss(which) for which in ((), best.fit.effects))
     explains = forces.fall_by(rules.less_force) and with_them < without
-    factor = rules.more_force * (2.0 if _stands(state, found) else 1.0)
+    factor = rules.more_force_if_stands if _stands(state, found) else rules.more_force
     return best if explains and MissingForces(forces.after, found.after).rise_by(factor) else None
 
 

@@ -42,6 +42,7 @@ from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 PROPOSED = (JointFrictionLoss, JointDamping, JointSpring, JointForce, Armature, BodyMass, Payload)
 
 _HEAVY = 1e3  # inertia of a rotor beside which friction is dry, in inertias of its joint
+_NO_SHARE = 1e-6  # share of a trial below which an effect is none
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def propose_effects(
     """The properties of single links and joints that together explain the missing force.
 
     All are fitted together, and then left out one by one, the one that is needed least first; at the end also those
-    whose 95 % interval contains no effect. Accelerations are means over windows of twice ``half_width``.
+    whose 95 % interval contains the value without effect. Accelerations are means over windows of twice ``half_width``.
 
     Args:
         simulation: the simulator.
@@ -103,11 +104,11 @@ def propose_effects(
     while len(kept):
         chosen = [entries[index] for index in kept]
         try:
-            at = _repeated(simulation, motion, chosen, shares[kept], bounds[:, kept], settings)
-        except ValueError:  # values that the model rejects together
+            at = _repeated(simulation, motion, chosen, shares[kept], bounds[:, kept], settings, advance)
+            sure, half_widths = _sure(at, bounds[:, kept], settings.blocks, advance)
+        except ValueError:  # the model rejects the values together, or they leave no finite force
             break
         shares[kept] = at.shares
-        sure, half_widths = _sure(at, bounds[:, kept], settings.blocks)
         if len(sure) == len(kept):
             return _proposal(chosen, at.shares, half_widths, simulation.model)
         kept = kept[sure]
@@ -138,16 +139,31 @@ class _Linearised:
 
 
 def _linearised(
-    simulation: Simulation, motion: Motion, entries: Sequence[CatalogueEntry], shares: np.ndarray
+    simulation: Simulation,
+    motion: Motion,
+    entries: Sequence[CatalogueEntry],
+    shares: np.ndarray,
+    bounds: np.ndarray,
 ) -> _Linearised:
-    def missing(at: np.ndarray) -> np.ndarray:
-        effects = (_at(entry, share, simulation.model) for entry, share in zip(entries, at, strict=True))
-        return missing_force(simulation.with_effects(*effects), motion)
+    """The force beside effects at shares, and its change by steps of 5 % of each share, within the bounds.
 
-    here, steps = missing(shares), np.diag(0.05 * np.where(shares == 0.0, 1.0, shares))
-    return _Linearised(
-        shares, here, np.stack([(missing(shares + step) - here) / step.sum() for step in steps], axis=-1)
-    )
+    Raises:
+        ValueError: if the model rejects the effects together, or a force that is known without them is not finite.
+    """
+
+    def force(at: np.ndarray) -> np.ndarray:
+        effects = (_at(entry, share, simulation.model) for entry, share in zip(entries, at, strict=True))
+        left = missing_force(simulation.with_effects(*effects), motion)
+        if not np.isfinite(left[motion.moving]).all():
+            raise ValueError("the missing force is not finite")
+        return left
+
+    lengths = 0.05 * np.where(np.abs(shares) < _NO_SHARE, 1.0, shares)
+    outside = (shares + lengths < bounds[0]) | (shares + lengths > bounds[1])
+    lengths = np.where(outside, -lengths, lengths)
+    here = force(shares)
+    changes = [(force(shares + step) - here) / length for step, length in zip(np.diag(lengths), lengths, strict=True)]
+    return _Linearised(shares, here, np.stack(changes, axis=-1))
 
 
 def _repeated(
@@ -157,34 +173,44 @@ def _repeated(
     shares: np.ndarray,
     bounds: np.ndarray,
     settings: InverseDynamicsSettings,
+    advance: Callable[[], object],
 ) -> _Linearised:
-    """Regressions, each around the values of the one before."""
-    at = _linearised(simulation, motion, entries, shares)
+    """Regressions, each around the values of the one before, until no less force is missing or no value changes."""
+    at = _linearised(simulation, motion, entries, shares, bounds)
+    scale = _usual(at.missing)
     for _ in range(settings.rounds):
-        change = _Regression.fit(at.missing, at.changes, bounds - at.shares).shares
-        at = _linearised(simulation, motion, entries, at.shares + change)
-        if (np.abs(change) <= settings.same_value * np.abs(at.shares)).all():
+        advance()
+        moved_by = _Regression.fit(at.missing, at.changes, bounds - at.shares).shares
+        moved = _linearised(simulation, motion, entries, at.shares + moved_by, bounds)
+        if np.nanmean(_losses(moved.missing, scale)) >= np.nanmean(_losses(at.missing, scale)):
+            break
+        at = moved
+        if (np.abs(moved_by) <= settings.same_value * np.abs(at.shares)).all():
             break
     return at
 
 
-def _sure(at: _Linearised, bounds: np.ndarray, blocks: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the effects that stay if those whose 95 % interval contains no effect are left out, one by one.
+def _sure(
+    at: _Linearised, bounds: np.ndarray, blocks: int, advance: Callable[[], object]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the effects that stay after the least certain one has been left out again and again.
 
-    Also returns the half-widths of their shares' intervals.
+    This ends when no 95 % interval contains the value without effect. Also returns the intervals' half-widths.
     """
     kept, shares, missing = np.arange(len(at.shares)), at.shares.copy(), at.missing
     while len(kept):
+        advance()
         half_widths = _half_widths(missing, at.changes[..., kept], bounds[:, kept] - shares[kept], blocks)
         doubt = half_widths / np.maximum(np.abs(shares[kept]), 1e-300)
+        doubt[np.abs(shares[kept]) < _NO_SHARE] = np.inf
         if doubt.max() <= 1.0:
             return kept, half_widths
         out = kept[doubt.argmax()]
         kept, missing = np.delete(kept, doubt.argmax()), missing - shares[out] * at.changes[..., out]
         if len(kept):
-            change = _Regression.fit(missing, at.changes[..., kept], bounds[:, kept] - shares[kept]).shares
-            shares[kept] += change
-            missing = missing + at.changes[..., kept] @ change
+            moved_by = _Regression.fit(missing, at.changes[..., kept], bounds[:, kept] - shares[kept]).shares
+            shares[kept] += moved_by
+            missing = missing + at.changes[..., kept] @ moved_by
     return kept, np.zeros(0)
 
 
@@ -293,7 +319,12 @@ class _Regression:
 
     def losses(self, scale: np.ndarray) -> np.ndarray:
         """Mean robust loss of what is left of each force, (nv), in units of ``scale``."""
-        return np.nanmean(np.log1p((self.left / scale) ** 2), axis=0)
+        return _losses(self.left, scale)
+
+
+def _losses(force: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Mean robust loss of each force, (nv), in units of ``scale``."""
+    return np.nanmean(np.log1p((force / scale) ** 2), axis=0)
 
 
 def _least_squares(y: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
