@@ -169,10 +169,9 @@ class MissingForces:
         before = np.maximum(self.before, np.minimum(2.0 * self.by_noise, self.after))
         return (self.after + floor) / (before + floor)
 
-    @property
-    def hardly_any(self) -> bool:
+    def hardly_any(self, share: float = SMALL) -> bool:
         """Whether noise explains about what is missing with the effects, or it is a small share of that without."""
-        return bool((self.after <= np.maximum(2.0 * self.by_noise, SMALL * self.before)).all())
+        return bool((self.after <= np.maximum(2.0 * self.by_noise, share * self.before)).all())
 
     def rise_by(self, factor: float) -> bool:
         """Whether the effects raise one force by more than a factor, and do not lower the others as much.

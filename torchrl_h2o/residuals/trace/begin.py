@@ -115,7 +115,7 @@ def begin_with_forces(
         proposed effects do not leave far smaller forces and significantly smaller errors of the motion.
     """
     found = None if state.exact else _missing_forces(state)
-    if found is None or found.hardly_any:
+    if found is None or found.hardly_any():
         return None
     proposed = _with_proposed(state, catalogue, rng, progress)
     if proposed is None or (forces := _missing_forces(proposed)) is None:
@@ -153,7 +153,10 @@ def replaced_by_forces(
         effects found predict the motion of their joints and do not raise the missing forces.
     """
     found = None if state.exact or not state.entries else _missing_forces(state)
-    if found is None or found.hardly_any:
+    if found is None or found.hardly_any():
+        return None
+    stands = _stands(state, found)
+    if stands and found.hardly_any(state.settings.verdict.force_left_if_stands):
         return None
     others = [index for index, effect in enumerate(state.fit.effects) if not isinstance(effect, PROPOSED)]
     proposed = [
@@ -167,7 +170,7 @@ def replaced_by_forces(
         best, forces = possible[-1]
     without, with_them = (best.first.selection_loss(which) for which in ((), best.fit.effects))
     explains = forces.fall_by(rules.less_force) and with_them < without
-    factor = rules.more_force_if_stands if _stands(state, found) else rules.more_force
+    factor = rules.more_force_if_stands if stands else rules.more_force
     return best if explains and MissingForces(forces.after, found.after).rise_by(factor) else None
 
 
