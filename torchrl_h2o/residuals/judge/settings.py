@@ -93,7 +93,7 @@ class VerdictSettings:
     more_force_if_stands: float = 3.0
     """The same for effects that predict the motion, beyond a regression's proposal that takes their place."""
     force_left_if_stands: float = 0.2
-    """Share of each missing force up to which effects that predict the motion may leave it; they then keep their place."""
+    """Share of each missing force that effects may leave and keep their place, if they predict the motion."""
     own_force: float = 1.2
     """Factor by which effects on a joint may raise its missing force and still count as explaining the forces."""
     less_force: float = 0.5
