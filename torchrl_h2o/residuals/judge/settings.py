@@ -92,7 +92,7 @@ class VerdictSettings:
     """Factor by which effects may raise the force that a joint's measured motion needs beyond the simulator's."""
     more_force_if_stands: float = 3.0
     """The same for effects that predict the motion, beyond a regression's proposal that takes their place."""
-    force_left_if_stands: float = 0.2
+    force_left_if_stands: float = 0.05
     """Share of each missing force that effects may leave and keep their place, if they predict the motion."""
     own_force: float = 1.2
     """Factor by which effects on a joint may raise its missing force and still count as explaining the forces."""
