@@ -85,12 +85,12 @@ def measured_motion(
     moving = (velocity > slowest).all(1) | (velocity < -slowest).all(1)
     middle = (velocity[:, 1:] + velocity[:, :-1]) / 2.0
     later = steps / 2.0 * simulation.control_step
-    total = np.insert(executed_actions(simulation, measured).cumsum(0), 0, 0.0, axis=0)
+    actions = executed_actions(simulation, measured)[rows[:, :1] + np.arange(2 * half)]
     return Motion(
         _moved(model, states[rows[:, :-1], : model.nq], middle, later),
         middle,
         (velocity[:, -1] - velocity[:, 0]) / (2.0 * half * simulation.control_step),
-        np.diff(total[rows], axis=1) / steps[:, None],
+        np.add.reduceat(actions, ends[:-1], axis=1) / steps[:, None],
         measured.time[rows[:, :-1]] + later,
         steps / steps.sum(),
         moving | (moving.sum(0) < settings.least_moving),
@@ -98,7 +98,17 @@ def measured_motion(
 
 
 def _moved(model: mujoco.MjModel, position: np.ndarray, velocity: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Positions, (W, K, nq), after so many seconds, (K), at a velocity, (W, K, nv)."""
+    """Positions that are reached from given ones at constant velocity.
+
+    Args:
+        model: the model, for the kinds of its joints.
+        position: (W, K, nq).
+        velocity: (W, K, nv).
+        seconds: (K), duration of the motion from each position.
+
+    Returns:
+        (W, K, nq).
+    """
     moved = position.copy()
     for window in range(len(position)):
         for part, time in enumerate(seconds):

@@ -67,6 +67,11 @@ def _with_rivals(state: SearchState, advance: Callable[[], object] = lambda: Non
     return replace(state, rivals=rivals)
 
 
+def _with_rivals_shown(state: SearchState, progress: LoopBar) -> SearchState:
+    """The same, with a bar that comes closer after each entry."""
+    return _with_rivals(state, partial(progress.closer, PROPOSAL / (len(state.catalogue) * len(state.entries))))
+
+
 def begin_anew(
     state: SearchState, catalogue: Sequence[CatalogueEntry], rng: np.random.Generator, progress: LoopBar
 ) -> SearchState | None:
@@ -92,8 +97,7 @@ def begin_anew(
     proposed = _with_proposed(state, catalogue, rng, progress, kept_still)
     if proposed is None or not _explains_motion(proposed):
         return None
-    tried = len(proposed.entries) * len(proposed.catalogue)
-    return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / tried))
+    return _with_rivals_shown(proposed, progress)
 
 
 def begin_with_forces(
@@ -127,8 +131,7 @@ def begin_with_forces(
     mine, its = comparable_losses([same_windows, proposed])
     if its.mean() > mine.mean() or proposed.p_value(mine, its) > state.settings.significance.level:
         return None
-    tried = len(proposed.entries) * len(proposed.catalogue)
-    return _with_rivals(proposed, lambda: progress.closer(PROPOSAL / tried))
+    return _with_rivals_shown(proposed, progress)
 
 
 def replaced_by_forces(
@@ -300,7 +303,7 @@ def begin_in_longer_windows(
     """
     if (longer := in_longer_windows(state, catalogue, rng)) is None:
         return None
-    return _with_rivals(longer, partial(progress.closer, PROPOSAL / (len(catalogue) * len(longer.entries))))
+    return _with_rivals_shown(longer, progress)
 
 
 def in_longer_windows(

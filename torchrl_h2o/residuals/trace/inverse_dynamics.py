@@ -201,8 +201,8 @@ def _sure(
     while len(kept):
         advance()
         half_widths = _half_widths(missing, at.changes[..., kept], bounds[:, kept] - shares[kept], blocks)
-        doubt = half_widths / np.maximum(np.abs(shares[kept]), 1e-300)
-        doubt[np.abs(shares[kept]) < _NO_SHARE] = np.inf
+        size = np.abs(shares[kept])
+        doubt = np.where(size < _NO_SHARE, np.inf, half_widths / np.maximum(size, _NO_SHARE))
         if doubt.max() <= 1.0:
             return kept, half_widths
         out = kept[doubt.argmax()]
