@@ -9,6 +9,7 @@ from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
+from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
 from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
@@ -225,7 +226,10 @@ def _by_motion_and_forces(
     forces = missing_forces(simulation, mended, measured, Split.REPORT, settings.inverse_dynamics)
     if forces is None:
         return (), hardly
-    more = needs_more_force(simulation, forces, settings)
+    more = (
+        *needs_more_force(simulation, forces, settings),
+        *force_in_vain(simulation, mended, measured, acting, settings),
+    )
     explained = forces.fall_by(settings.verdict.less_force) and not more
     if explained and not any(_raises_its_forces(effect, mended, forces, settings.verdict) for effect in acting):
         return hardly, ()
