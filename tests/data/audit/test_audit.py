@@ -4,6 +4,7 @@ import importlib
 import json
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -24,9 +25,19 @@ from tests.data.audit.recorded import (
 from torchrl_h2o.data import Audit, DataError, Finding, audit
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals import Simulation
+from torchrl_h2o.residuals import Simulation, StateMap
 
 DEGREES = 180.0 / np.pi
+ONE_JOINT = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody><body>
+    <joint name="hinge" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="1"/>
+  </body></worldbody>
+  <actuator><motor joint="hinge"/></actuator>
+</mujoco>
+"""
 
 
 def severe(data, simulation, check: str) -> str:
@@ -93,6 +104,18 @@ def test_short_delay_of_a_drive_is_a_note(simulation):
 )
 def test_units_of_positions_and_velocities(good, simulation, columns, factor, words):
     assert words in severe(changed(good, scaled(columns, factor)), simulation, "kinematics")
+
+
+@pytest.mark.parametrize(("factor", "words"), [(2.0, "rows that are 20 ms apart"), (DEGREES, "")])
+def test_one_joint_cannot_tell_a_wrong_unit_from_a_wrong_step(factor, words):
+    state_map = StateMap.of_coordinates(("hinge", "hinge_velocity"), ("rad", "rad/s"), (0, 1), num_states=2)
+    simulation = Simulation(lambda: mujoco.MjSpec.from_string(ONE_JOINT), 2, state_map, (), "rod")
+    torques = 0.3 * np.random.default_rng(0).standard_normal((1500, 1)).cumsum(0) / 20.0
+    reached = simulation.rollout(np.zeros((1, 2)), torques[None])[0]
+    rows = np.vstack([np.zeros(2), reached]) * [factor, 1.0]
+    (found,) = [each for each in audit(measured(rows, torques), simulation).severe if each.check == "kinematics"]
+    assert ("or dt" in found.remedy) == bool(words)
+    assert words in found.remedy
 
 
 def test_degrees_of_positions_and_velocities_are_found_with_the_model(good, simulation):

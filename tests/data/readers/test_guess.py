@@ -158,6 +158,22 @@ def test_a_velocity_that_does_not_follow_its_position_is_estimated_instead(tmp_p
     assert "derivative_of" not in right
 
 
+def test_without_a_time_its_step_follows_from_velocities_and_positions(tmp_path):
+    columns = [ANGLE, 4.0 * np.cos(TIME), np.degrees(ANGLE), np.degrees(4.0 * np.cos(TIME)), TIME**2]
+    text = guessed(tmp_path, "q1,qdot1,q2 [deg],qdot2 [deg/s],tau", columns)
+    assert f"dt: {TIME[1] - TIME[0]:.3g}  # no column of time was found; with this time" in text
+
+
+@pytest.mark.parametrize(
+    "velocities",
+    [(4.0 * np.cos(TIME), np.cos(TIME)), (COMMAND + TIME, COMMAND + TIME)],
+    ids=["two units", "not its velocity"],
+)
+def test_without_a_time_velocities_that_disagree_or_do_not_follow_tell_no_step(tmp_path, velocities):
+    text = guessed(tmp_path, "q1,qdot1,q2,qdot2,tau", [ANGLE, velocities[0], ANGLE, velocities[1], COMMAND])
+    assert "dt: 0.01  # no column of time was found: give the time" in text
+
+
 def test_the_only_column_left_is_the_action_of_the_only_actuator(tmp_path):
     model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
     assert "role: action" in guessed(tmp_path, "time,q,drive", [TIME, ANGLE, COMMAND], model)

@@ -9,6 +9,7 @@ import torch
 from torchrl_h2o.effects import ActionDelay, JointFrictionLoss, ObservationGain
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals.measured import initial_states
 from torchrl_h2o.residuals.measured.initial_states import estimate_states, noise_levels, smoothed_states
 from torchrl_h2o.residuals.measured.residual import start_states
 
@@ -109,3 +110,8 @@ def test_every_run_is_estimated_by_itself(simulation, recorded):
     levels = noise_levels(simulation, noisy)
     together = estimate_states(simulation, noisy, levels)[400:]
     np.testing.assert_allclose(together, estimate_states(simulation, alone, levels), atol=1e-5)
+
+
+def test_a_covariance_that_rounding_made_indefinite_is_solved_all_the_same():
+    covariance, right = np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([3.0, 3.0])
+    np.testing.assert_allclose(initial_states._solve(covariance, right), [1.0, 1.0])

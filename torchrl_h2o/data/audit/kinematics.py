@@ -61,7 +61,7 @@ def check_kinematics(
                 found.append(_unrelated(log, index, derivatives, exchanged, settings))
             continue
         if not time_is_wrong and not _explained(derivative, step, settings):
-            wrong = _factor(log, derivative, settings)
+            wrong = _factor(log, derivative, settings, alone=len(derivatives) == 1)
             found += wrong and (_swapped(log, pair, settings) or wrong)
         found += filtered
         found += _bias(log, derivative, step, settings)
@@ -92,7 +92,7 @@ def _explained(derivative: Derivative, step: Response | None, settings: AuditSet
     return deviation(step.error[:, pair.position]) < 0.7 * plain
 
 
-def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[Finding]:
+def _factor(log: Log, derivative: Derivative, settings: AuditSettings, *, alone: bool) -> list[Finding]:
     pair, factor = derivative.pair, derivative.factor
     low, high = settings.scale_severe if _coarse(log, pair, settings) else settings.scale_warning
     if low <= factor <= high:
@@ -101,11 +101,14 @@ def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[F
     words = f"the derivative of {pair.name} is {factor:.3g} × {pair.velocity_name}"
     if factor < 0.0:
         words += ": one of them has the wrong sign"
+    remedy = "correct unit, scale or sign of the columns"
     if not low <= size <= high:
         distance = [abs(np.log(size / known)) for known, _ in _FACTORS]
         nearest = int(np.argmin(distance))
         if distance[nearest] < settings.known_factor:
             words += f": {_FACTORS[nearest][1]}"
+        elif alone and factor > 0.0:
+            remedy += f", or dt: the motion fits rows that are {1e3 * factor * log.dt:.3g} ms apart"
     far = not settings.scale_severe[0] <= factor <= settings.scale_severe[1]
     return [
         Finding(
@@ -113,7 +116,7 @@ def _factor(log: Log, derivative: Derivative, settings: AuditSettings) -> list[F
             "severe" if far else "warning",
             words,
             None,
-            "correct unit, scale or sign of the columns",
+            remedy,
         )
     ]
 

@@ -17,7 +17,7 @@ from torchrl_h2o.data.readers.guess.coordinates import (
 )
 from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body, velocities_together
 from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
-from torchrl_h2o.data.readers.guess.slopes import is_wrapped, relation, time_of
+from torchrl_h2o.data.readers.guess.slopes import is_wrapped, relation, step_of_motion, time_of
 from torchrl_h2o.data.readers.guess.unnamed import recognise
 from torchrl_h2o.data.readers.units import to_si
 
@@ -201,7 +201,7 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
         *(f"{name}: {value}" for name, value in contents.options.items()),
     ]
     if "time" not in kinds:
-        lines.append("dt: 0.01  # no column of time was found: give the time between two rows in s")
+        lines.append(_step(columns, contents, pairs))
     if "action" not in kinds:
         lines.append("free_motion: true  # no column of actions was found: remove this line if there is one")
     lines += _clock(time_of(contents))
@@ -225,6 +225,16 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
             entry = f'{{name: "{name}", role: observation, derivative_of: "{column.name}"}}'
             lines.append(f"  - {entry}  # no such column was found: it is estimated")
     return "\n".join(lines) + "\n"
+
+
+def _step(columns: Sequence[Guess], contents: Contents, pairs: Mapping[str, str]) -> str:
+    """The time between two rows of a log without a column of time."""
+    units = {column.name: column.unit for column in columns}
+    step = step_of_motion([one for one in columns if one.kind == "velocity"], contents, pairs, units)
+    if step is None:
+        return "dt: 0.01  # no column of time was found: give the time between two rows in s"
+    words = "no column of time was found; with this time between two rows, in s, velocities are the slopes of positions"
+    return f"dt: {step:.3g}  # {words}; check"
 
 
 def _clock(time: np.ndarray | None) -> list[str]:

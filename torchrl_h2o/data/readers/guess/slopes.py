@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -12,15 +12,43 @@ from torchrl_h2o.data.readers.units import to_si
 
 _SPANS = (1, 3, 10, 25, 60)  # rows over which displacements are compared with a velocity; the best span counts
 _MOVES = 3.0  # times by which displacements over some rows exceed those over one row where a joint moves
+_FOLLOWS = 0.9  # correlation above which a velocity without a time is the slope of its position
+_AGREE = 1.2  # largest ratio of the steps that two joints tell
 
 
 def relation(
     velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
 ) -> tuple[float, float] | None:
     """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
+    time = time_of(contents)
+    return None if time is None else _relation_over(time, velocity, contents, pairs, units)
+
+
+def step_of_motion(
+    velocities: Sequence[Guess], contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
+) -> float | None:
+    """The time between two rows, in s, with which the velocities are the slopes of their positions.
+
+    Returns:
+        None if no velocity follows its position, or if the joints disagree: then a unit is wrong.
+    """
+    steps = []
+    for velocity in velocities:
+        values = contents.values.get(velocity.name)
+        rows = np.arange(0.0 if values is None else len(values))
+        found = _relation_over(rows, velocity, contents, pairs, units)
+        if found is not None and found[0] > _FOLLOWS:
+            steps.append(found[1] * to_si(units[pairs[velocity.name]])[1] / to_si(velocity.unit)[1])
+    alike = bool(steps) and max(steps) < _AGREE * min(steps)
+    return float(np.median(steps)) if alike else None
+
+
+def _relation_over(
+    time: np.ndarray, velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
+) -> tuple[float, float] | None:
     name = pairs.get(velocity.name, "")
     position, values = contents.values.get(name), contents.values.get(velocity.name)
-    if position is None or values is None or (time := time_of(contents)) is None or len(time) < 3:
+    if position is None or values is None or len(time) < 3:
         return None
     if is_wrapped(position, units[name]):
         position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
