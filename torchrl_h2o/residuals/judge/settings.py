@@ -106,6 +106,8 @@ class VerdictSettings:
     """Share of the error ahead below which an explanation counts in spite of such an AUC."""
     lowers_much: float = 0.8
     """Share of the held-out error that an effect which was not put in must leave at most to be named all the same."""
+    noise_beside_friction: float = 0.8
+    """Share of a dry friction from which noise of the actions at its joint makes its value doubtful."""
     extreme_factor: float = 20.0
     """Factor on a property of the model beyond which the value is reported as implausible."""
     blocks: int = 10

@@ -10,6 +10,7 @@ from scipy.stats import mannwhitneyu
 from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
 from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
+from torchrl_h2o.residuals.judge.friction_beside_noise import friction_beside_noise
 from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
@@ -82,7 +83,10 @@ def reach_verdict(
             against = (*against, *(worse or (f"the effects found raise the error of {headline_words(head)}",)))
         else:
             signs = (*worse, *signs)
-    caveats = short_delays(effects, measured, simulation.control_step)
+    caveats = (
+        *short_delays(effects, measured, simulation.control_step),
+        *friction_beside_noise(simulation, mended, effects, rules),
+    )
     if raised or (signs and not _leaves_little(mended, measured, error, two_sample, settings)):
         where = where_most(mended, measured, settings)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
