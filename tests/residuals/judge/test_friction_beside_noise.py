@@ -24,11 +24,15 @@ ARM = """
 """
 
 
-@pytest.fixture(scope="module")
-def simulation():
+def simulation_of(xml: str) -> Simulation:
     names = ("shoulder", "elbow", "shoulder_velocity", "elbow_velocity")
     state_map = StateMap.of_coordinates(names, ("rad", "rad", "rad/s", "rad/s"), (0, 1, 2, 3), num_states=4)
-    return Simulation(lambda: mujoco.MjSpec.from_string(ARM), 2, state_map, (), "arm")
+    return Simulation(lambda: mujoco.MjSpec.from_string(xml), 2, state_map, (), "arm")
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return simulation_of(ARM)
 
 
 def said(simulation, *effects):
@@ -37,16 +41,24 @@ def said(simulation, *effects):
 
 def test_friction_beside_as_much_noise_may_be_too_large(simulation):
     (words,) = said(simulation, JointFrictionLoss(0.7, "elbow"), ActionNoise(0.9))
-    assert "as large as the dry friction of elbow, 0.7 N·m: on a light link, such friction may be" in words
+    assert "of 0.9 N·m beside the + 0.7 N·m of elbow: on a light link" in words
 
 
 def test_the_noise_of_a_geared_motor_counts_as_a_torque(simulation):
     effects = JointFrictionLoss(0.7, "shoulder"), ActionNoise(0.09)
-    assert "of shoulder, 0.7 N·m" in said(simulation, *effects)[0]
+    assert "of 0.9 N·m beside the + 0.7 N·m of shoulder" in said(simulation, *effects)[0]
 
 
 def test_all_such_joints_are_named(simulation):
-    assert "of shoulder, 0.9 N·m and of elbow, 0.9 N·m" in said(simulation, JointFrictionLoss(0.9), ActionNoise(0.9))[0]
+    (words,) = said(simulation, JointFrictionLoss(0.9), ActionNoise(0.9))
+    assert "N·m of shoulder, of 0.9 N·m beside the + 0.9 N·m of elbow" in words
+
+
+def test_a_control_that_cannot_be_zero_counts_too():
+    spec = mujoco.MjSpec.from_string(ARM)
+    spec.actuators[1].ctrllimited, spec.actuators[1].ctrlrange = True, [1.0, 5.0]
+    positive = simulation_of(spec.to_xml())
+    assert "+ 0.7 N·m of elbow" in said(positive, JointFrictionLoss(0.7, "elbow"), ActionNoise(0.9))[0]
 
 
 @pytest.mark.parametrize(

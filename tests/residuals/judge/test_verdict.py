@@ -179,6 +179,13 @@ def test_action_noise_that_was_found_is_not_missing():
     assert explained.kind == EXPLAINED
 
 
+def test_friction_beside_noise_of_its_size_gets_a_caveat():
+    found = JointFrictionLoss(0.15), ActionNoise(0.2)
+    (caveat,) = verdict(found, found).caveats
+    assert "such noise can raise the dry friction" in caveat
+    assert verdict(found, found[:1]).caveats == ()
+
+
 def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques_spoil_the_motion():
     """The noise is on the logged torques alone. A rotor that hides it is not recommended."""
     simulation, friction = double_pendulum(), (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"))

@@ -27,6 +27,7 @@ _FACTORS = (
     (2.0 * np.pi, "the velocity looks like revolutions per second, the position like rad"),
     (np.pi / 30.0, "the velocity looks like rpm, the position like rad"),
 )
+_DEGREES = (0, 1)  # the first two of them, which no wrong time explains
 _ESTIMATED = "derivative_of estimates it from the position"
 _BETTER_SENSOR = "use a better sensor, or filter positions and velocities alike before logging"
 _BETTER_VELOCITY = f"leave the column out: {_ESTIMATED}; or use a better sensor"
@@ -105,10 +106,11 @@ def _factor(log: Log, derivative: Derivative, settings: AuditSettings, *, alone:
     if not low <= size <= high:
         distance = [abs(np.log(size / known)) for known, _ in _FACTORS]
         nearest = int(np.argmin(distance))
-        if distance[nearest] < settings.known_factor:
+        known = distance[nearest] < settings.known_factor
+        if known:
             words += f": {_FACTORS[nearest][1]}"
-        elif alone and factor > 0.0:
-            remedy += f", or dt: the motion fits rows that are {1e3 * factor * log.dt:.3g} ms apart"
+        if alone and factor > 0.0 and not (known and nearest in _DEGREES):
+            remedy += f", or the time between two rows: the motion fits {1e3 * factor * log.dt:.3g} ms"
     far = not settings.scale_severe[0] <= factor <= settings.scale_severe[1]
     return [
         Finding(

@@ -24,7 +24,8 @@ def friction_beside_noise(
     """Says of dry friction found beside noise of the actions of its size that its value may be wrong.
 
     Where measured torques are noisy, the noise moves a light link in the simulator, but not in reality, and more
-    friction makes up for it. The 95 % interval does not count this.
+    friction makes up for it. The 95 % interval does not count this. Noise of actuators with an activation, such as a
+    filter, is left out: it reaches the joint weakened.
 
     Args:
         simulation: the simulator without the effects.
@@ -33,34 +34,36 @@ def friction_beside_noise(
         rules: the noise, as a share of the friction, from which it is said.
 
     Returns:
-        One sentence, about all joints with so much noise beside their friction, or nothing.
+        One sentence, about all joints with so much noise beside the friction found there, or nothing.
     """
     found = mended.model.dof_frictionloss - simulation.model.dof_frictionloss
     noise = _noise_of_torques(mended.model, effects)
-    doubtful = [
-        f"{joint.name}, {found[joint.velocity]:.2g} {'N' if joint.sliding else 'N·m'}"
-        for joint in degrees_of_freedom(mended.model)
-        if found[joint.velocity] > 0.0 and noise[joint.velocity] > rules.noise_beside_friction * found[joint.velocity]
-    ]
+    doubtful = []
+    for joint in degrees_of_freedom(mended.model):
+        friction, by_noise = found[joint.velocity], noise[joint.velocity]
+        if friction > 0.0 and by_noise > rules.noise_beside_friction * friction:
+            unit = "N" if joint.sliding else "N·m"
+            doubtful.append(f"of {by_noise:.3g} {unit} beside the + {friction:.3g} {unit} of {joint.name}")
     if not doubtful:
         return ()
     return (
-        f"The noise of the actions is as large as the dry friction of {' and of '.join(doubtful)}: on a light link, "
-        "such friction may be too large by half, which its interval does not count; measure torques with less noise.",
+        f"Noise of the actions was found as well, {', '.join(doubtful)}: on a light link, such noise can raise the dry "
+        "friction that is found, in a simulated leg by half, which its interval does not count.",
     )
 
 
 def _noise_of_torques(model: mujoco.MjModel, effects: Sequence[Effect]) -> np.ndarray:
     """Standard deviation of the torque, (nv), that noise of the actions adds at the model's first position."""
     variance, data = np.zeros(model.nv), mujoco.MjData(model)
+    middle = np.where(model.actuator_ctrllimited, model.actuator_ctrlrange.mean(1), 0.0)
     for effect in effects:
         if isinstance(effect, ActionNoise) and effect.std > 0.0:
             for actuator in np.flatnonzero(entry_mask(data.ctrl, effect.actuators)):
                 pair = []
-                for control in (0.0, effect.std):
-                    data.ctrl[actuator] = control
+                for change in (0.0, effect.std):
+                    data.ctrl[:] = middle
+                    data.ctrl[actuator] += change
                     mujoco.mj_forward(model, data)
                     pair.append(data.qfrc_actuator.copy())
-                data.ctrl[actuator] = 0.0
                 variance += (pair[1] - pair[0]) ** 2
     return np.sqrt(variance)

@@ -160,7 +160,10 @@ def _filter(linearised: Linearised, noise: NoiseLevels, settings: MeasuredSettin
 
 
 def _solve(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solves by Cholesky's method: a call of LAPACK for one small matrix takes a fifth of NumPy's time."""
+    """Solves for a symmetric matrix by Cholesky's method.
+
+    A call of LAPACK for up to six observations takes a quarter of the time of NumPy's.
+    """
     _, solution, failed = dposv(covariance, right)
     return np.linalg.solve(covariance, right) if failed else solution  # rounding may leave it not positive definite
 

@@ -153,7 +153,7 @@ class Verdict:
         reasons: figures that the kind follows from, in words.
         recommended: whether the effects should be put into a simulator for training.
         where: when and at which states the unexplained part is largest; empty if nothing is unexplained.
-        caveats: sentences on effects that may have another cause than the one they are named after.
+        caveats: sentences on effects that may have another cause than the one they are named after, or another value.
         undetectable: where nothing is missing, effects that the data could not have shown, in words; one of each kind
             comes first.
         too_few: where nothing was found, an effect that lowers the held-out error, and how many rows there were to

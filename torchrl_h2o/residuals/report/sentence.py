@@ -42,8 +42,9 @@ def sentences(report: ReportContents) -> list[str]:
 
     Returns:
         The result; whether the time for the search was up before its end; other effects that these data cannot rule
-        out; effects that may have another cause; what the effects found do not explain; where nothing is missing,
-        effects that the data could not have shown; and severe faults of the data. Those that do not apply are left out.
+        out; effects that may have another cause or value; what the effects found do not explain; where nothing is
+        missing, effects that the data could not have shown; and severe faults of the data. Those that do not apply are
+        left out.
     """
     words = _verdict_words(report)
     if report.audit is not None and report.audit.severe:

@@ -233,8 +233,8 @@ def _step(columns: Sequence[Guess], contents: Contents, pairs: Mapping[str, str]
     step = step_of_motion([one for one in columns if one.kind == "velocity"], contents, pairs, units)
     if step is None:
         return "dt: 0.01  # no column of time was found: give the time between two rows in s"
-    words = "no column of time was found; with this time between two rows, in s, velocities are the slopes of positions"
-    return f"dt: {step:.3g}  # {words}; check"
+    words = "no column of time was found; with this time between two rows, in s, the velocities are the slopes of the"
+    return f"dt: {step:.3g}  # {words} positions, if their units fit; check"
 
 
 def _clock(time: np.ndarray | None) -> list[str]:

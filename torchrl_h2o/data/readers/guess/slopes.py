@@ -7,21 +7,24 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents
-from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns
+from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, without_unit
 from torchrl_h2o.data.readers.units import to_si
 
 _SPANS = (1, 3, 10, 25, 60)  # rows over which displacements are compared with a velocity; the best span counts
 _MOVES = 3.0  # times by which displacements over some rows exceed those over one row where a joint moves
 _FOLLOWS = 0.9  # correlation above which a velocity without a time is the slope of its position
 _AGREE = 1.2  # largest ratio of the steps that two joints tell
+_SPANS_IN_LOG = 20  # spans that must fit into a log: over fewer, unrelated columns are alike by chance
+_USUAL_STEPS = (1e-4, 1.0)  # times between two rows of a log, in s
 
 
 def relation(
     velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
 ) -> tuple[float, float] | None:
     """Correlation of displacements with the integral of a velocity, and their ratio; None if nothing moves."""
-    time = time_of(contents)
-    return None if time is None else _relation_over(time, velocity, contents, pairs, units)
+    if contents.values.get(pairs.get(velocity.name, "")) is None or (time := time_of(contents)) is None:
+        return None
+    return _relation_over(time, velocity, contents, pairs, units)
 
 
 def step_of_motion(
@@ -29,23 +32,38 @@ def step_of_motion(
 ) -> float | None:
     """The time between two rows, in s, with which the velocities are the slopes of their positions.
 
+    Where neither column's name says a unit, both are taken to have the same one; where one of them does, the pair says
+    nothing. Noise as large as a velocity makes the step too small, by up to a tenth.
+
     Returns:
-        None if no velocity follows its position, or if the joints disagree: then a unit is wrong.
+        None if no velocity follows its position in a log that is long enough to tell, if the joints disagree, or if
+        nobody logs that fast or slowly: then a unit is wrong.
     """
     steps = []
     for velocity in velocities:
-        values = contents.values.get(velocity.name)
-        rows = np.arange(0.0 if values is None else len(values))
-        found = _relation_over(rows, velocity, contents, pairs, units)
+        name, values = pairs.get(velocity.name, ""), contents.values.get(velocity.name)
+        stated = without_unit(velocity.name)[1], without_unit(name)[1]
+        if values is None or (stated[0] is None) != (stated[1] is None):
+            continue
+        found = _relation_over(np.arange(float(len(values))), velocity, contents, pairs, units, overlap=_SPANS_IN_LOG)
         if found is not None and found[0] > _FOLLOWS:
-            steps.append(found[1] * to_si(units[pairs[velocity.name]])[1] / to_si(velocity.unit)[1])
+            factor = 1.0 if stated[0] is None else to_si(units[name])[1] / to_si(velocity.unit)[1]
+            steps.append(factor * found[1])
     alike = bool(steps) and max(steps) < _AGREE * min(steps)
-    return float(np.median(steps)) if alike else None
+    step = float(np.median(steps)) if alike else 0.0
+    return step if _USUAL_STEPS[0] <= step <= _USUAL_STEPS[1] else None
 
 
 def _relation_over(
-    time: np.ndarray, velocity: Guess, contents: Contents, pairs: Mapping[str, str], units: Mapping[str, str]
+    time: np.ndarray,
+    velocity: Guess,
+    contents: Contents,
+    pairs: Mapping[str, str],
+    units: Mapping[str, str],
+    *,
+    overlap: int = 1,
 ) -> tuple[float, float] | None:
+    """The same for given times, over spans of which as many fit into the log as ``overlap`` says."""
     name = pairs.get(velocity.name, "")
     position, values = contents.values.get(name), contents.values.get(velocity.name)
     if position is None or values is None or len(time) < 3:
@@ -56,7 +74,9 @@ def _relation_over(
     expected = 0.5 * (values[1:] + values[:-1]) * steps
     usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved), 0.95)
     good = (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
-    spans = [rows for rows in _SPANS if rows < len(time)]
+    spans = [rows for rows in _SPANS if overlap * rows < len(time)]
+    if not spans:
+        return None
     if max(np.std(position[rows:] - position[:-rows]) for rows in spans) < _MOVES * np.std(moved):
         return None  # noise of a joint at rest does not grow with the span
     found = [_correlation(moved, expected, good, rows) for rows in spans]
