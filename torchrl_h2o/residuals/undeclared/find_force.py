@@ -98,7 +98,7 @@ class _Regression:
         objective: residuals for the fits and the judgement: one step, or long windows.
         further: residuals several steps ahead.
         starts: (W), the transitions.
-        windows: first rows of the windows for the fits, a part of them in a long log.
+        windows: first rows of the windows for the fits, a part of them if they are long.
         path: states and controls within each transition.
         response: (W, n, nv), derivative of the observation by the generalised forces.
         before: mean robust loss of these windows without a force.
@@ -121,7 +121,9 @@ class _Regression:
         starts, std = measured.fitted(), problem.sensor_std
         pose = partial(Problem.pose, simulation, measured, sensor_std=std, settings=settings.residual)
         objective = problem if horizon == 1 else pose(horizon)
-        windows = thinned(measured.fitted(horizon), settings.undeclared.fitted_windows, measured.block)
+        rules = settings.undeclared
+        most = max(rules.min_fitted, rules.fitted_steps // horizon)
+        windows = thinned(measured.fitted(horizon), most, measured.block)
         return cls(
             problem,
             objective,
