@@ -12,7 +12,7 @@ import numpy as np
 from torchrl_h2o.effects import ActionBacklash, ActionDeadBand, ActionSaturation, Effect, Pipeline, ResidualForce
 from torchrl_h2o.effects.force.residual_force import coordinate, degrees_of_freedom
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
-from torchrl_h2o.residuals.measured.transitions import Measured, thinned
+from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.fit import Fit, fit
@@ -75,8 +75,6 @@ def find_undeclared(
     found = _grown(regression, progress or (lambda words: None))
     if found is None:
         return None
-    if len(regression.windows) < len(measured.fitted(horizon)):
-        found = _fitted(replace(regression, windows=measured.fitted(horizon)), _force_of(found))
     objective, judged = regression.objective, measured.selected_on(horizon)
     before, after = objective.residual((), judged), objective.residual(found.effects, judged)
     gain = losses(before) - losses(after)
@@ -98,10 +96,9 @@ class _Regression:
         objective: residuals for the fits and the judgement: one step, or long windows.
         further: residuals several steps ahead.
         starts: (W), the transitions.
-        windows: first rows of the windows for the fits, a part of them if they are long.
         path: states and controls within each transition.
         response: (W, n, nv), derivative of the observation by the generalised forces.
-        before: mean robust loss of these windows without a force.
+        before: mean robust loss without a force.
         settings: thresholds and budgets.
     """
 
@@ -109,7 +106,6 @@ class _Regression:
     objective: Problem
     further: Problem
     starts: np.ndarray
-    windows: np.ndarray
     path: StepPath
     response: np.ndarray
     before: float
@@ -121,18 +117,14 @@ class _Regression:
         starts, std = measured.fitted(), problem.sensor_std
         pose = partial(Problem.pose, simulation, measured, sensor_std=std, settings=settings.residual)
         objective = problem if horizon == 1 else pose(horizon)
-        rules = settings.undeclared
-        most = max(rules.min_fitted, rules.fitted_steps // horizon)
-        windows = thinned(measured.fitted(horizon), most, measured.block)
         return cls(
             problem,
             objective,
             pose(settings.undeclared.further_steps),
             starts,
-            windows,
             step_path(simulation, measured, starts, states=states),
             force_response(simulation, measured, starts, states=states, settings=settings.regression),
-            losses(objective.residual((), windows)).mean(),
+            losses(objective.residual((), measured.fitted(horizon))).mean(),
             settings,
         )
 
@@ -222,15 +214,18 @@ def _force_of(fitted: Fit) -> ResidualForce:
 def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
     """The force fitted in the simulation; start times of steps are not fitted."""
     free = tuple(name for name in effect.parameters if not name.startswith("start"))
-    return fit(regression.objective, (effect,), (free,), regression.windows, settings=regression.settings.fit)
+    objective = regression.objective
+    starts = objective.measured.fitted(objective.horizon)
+    return fit(objective, (effect,), (free,), starts, settings=regression.settings.fit)
 
 
 def _pruned(regression: _Regression, best: Fit) -> Fit:
     """Removes the term that explains least, as long as the loss hardly increases."""
-    problem, windows = regression.objective, regression.windows
+    problem = regression.objective
+    starts = problem.measured.fitted(problem.horizon)
     while len(terms := _force_of(best).terms) > 1:
         rest = [ResidualForce(terms[:i] + terms[i + 1 :]) for i in range(len(terms))]
-        alone = [losses(problem.residual((effect,), windows)).mean() for effect in rest]
+        alone = [losses(problem.residual((effect,), starts)).mean() for effect in rest]
         candidate = _fitted(regression, rest[int(np.argmin(alone))])
         cost = candidate.loss - best.loss
         if cost > regression.settings.undeclared.min_term_gain * (regression.before - best.loss):

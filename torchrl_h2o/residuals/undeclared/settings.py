@@ -18,10 +18,6 @@ class UndeclaredSettings:
     """Share of the loss that a round must explain; removing a term may cost this share of the explained loss."""
     rounds: int = 6
     """Largest number of rounds of adding terms."""
-    fitted_steps: int = 40_000
-    """Control steps, over all windows, in a fit of a force; the force found is then fitted to all windows."""
-    min_fitted: int = 400
-    """Smallest number of windows in such a fit."""
     further_steps: int = 5
     """Control steps ahead at which the force must also lower the loss; a fit to sensor noise does not."""
     max_terms: int = 6
