@@ -5,6 +5,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from torchrl_h2o.data import audit
 from torchrl_h2o.residuals import Measured, Simulation, StateMap
 
 XML = """
@@ -115,3 +116,18 @@ def scaled(columns, factor: float):
         return rows
 
     return change
+
+
+def severe(data, simulation, check: str) -> str:
+    """Words of the first severe finding of a check."""
+    found = [finding for finding in audit(data, simulation).severe if finding.check == check]
+    assert found, audit(data, simulation).words()
+    return found[0].words
+
+
+def warned(data, simulation, check: str) -> str:
+    """Words of the first severe finding or warning of a check."""
+    found = audit(data, simulation)
+    named = [finding for finding in (*found.severe, *found.warnings) if finding.check == check]
+    assert named, found.words()
+    return named[0].words

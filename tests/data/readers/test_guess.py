@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.data.readers.guessing import ANGLE, COMMAND, TIME, guessed
 from torchrl_h2o.data import LogColumns, load, read_robot_log
 from torchrl_h2o.data.readers.guess import guess_layout
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
@@ -124,16 +125,6 @@ def test_irregular_stamps_are_resampled(tmp_path):
     assert np.diff(td["time"].flatten().numpy()) == pytest.approx(0.01, rel=0.05)
 
 
-TIME = 0.01 * np.arange(1500)
-ANGLE = 4.0 * np.sin(TIME)
-COMMAND = np.cos(7.0 * TIME)
-
-
-def guessed(tmp_path, names: str, columns, model=None) -> str:
-    np.savetxt(tmp_path / "log.csv", np.stack(columns, 1), delimiter=",", header=names, comments="")
-    return guess_layout(tmp_path / "log.csv", model).text
-
-
 @pytest.mark.parametrize(("unit", "factor"), [("rad", 1.0), ("deg", 180.0 / np.pi)])
 def test_an_angle_that_jumps_by_a_turn_is_unwrapped(tmp_path, unit, factor):
     wrapped = np.angle(np.exp(1j * ANGLE)) * factor
@@ -156,47 +147,6 @@ def test_a_velocity_that_does_not_follow_its_position_is_estimated_instead(tmp_p
     right = guessed(tmp_path, "time,q,qdot,tau", [TIME, ANGLE, 4.0 * np.cos(TIME), TIME])
     assert '"qdot", role: observation' in right
     assert "derivative_of" not in right
-
-
-SPEED = 4.0 * np.cos(TIME)  # of ANGLE
-
-
-@pytest.mark.parametrize(
-    ("names", "columns"),
-    [
-        ("q,qdot", [ANGLE, SPEED]),
-        ("q [rad],w [rpm]", [ANGLE, SPEED * 30.0 / np.pi]),
-        ("q,qdot", [np.degrees(ANGLE), np.degrees(SPEED)]),  # no unit is stated, and the angle is taken for degrees
-        ("q,qdot", [(ANGLE + np.pi) % (2.0 * np.pi), SPEED]),
-        ("q,qdot", [ANGLE, SPEED + 0.5 * np.random.default_rng(0).standard_normal(1500)]),
-        ("q1,qdot1,q2 [deg],qdot2 [rad/s]", [ANGLE, SPEED, np.degrees(ANGLE), SPEED]),
-    ],
-    ids=["same units", "other units", "degrees without a word", "wrapped", "noise", "two joints"],
-)
-def test_without_a_time_its_step_follows_from_velocities_and_positions(tmp_path, names, columns):
-    text = guessed(tmp_path, f"{names},tau", [*columns, COMMAND])
-    assert "# no column of time was found; with this time between two rows" in text
-    assert float(text.split("dt: ")[1].split()[0]) == pytest.approx(0.01, rel=0.03)
-
-
-@pytest.mark.parametrize(
-    ("names", "columns"),
-    [
-        ("q1,qdot1,q2,qdot2", [ANGLE, SPEED, ANGLE, SPEED / 4.0]),
-        ("q,qdot", [ANGLE, COMMAND + TIME]),
-        ("q,qdot [deg/s]", [ANGLE, np.degrees(SPEED)]),
-        ("q,qdot", [1e4 * ANGLE, SPEED]),
-    ],
-    ids=["two steps", "not its velocity", "one unit", "no such step"],
-)
-def test_without_a_time_no_step_is_made_up(tmp_path, names, columns):
-    text = guessed(tmp_path, f"{names},tau", [*columns, COMMAND])
-    assert "dt: 0.01  # no column of time was found: give the time" in text
-
-
-def test_of_a_short_log_no_step_is_made_up(tmp_path):
-    text = guessed(tmp_path, "q,qdot,tau", [column[:60] for column in (np.sin(TIME), -np.sin(1.1 * TIME), COMMAND)])
-    assert "dt: 0.01  # no column of time was found: give the time" in text
 
 
 def test_the_only_column_left_is_the_action_of_the_only_actuator(tmp_path):

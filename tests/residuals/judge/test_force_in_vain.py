@@ -18,7 +18,7 @@ BOTH = ResidualForce(("torque on elbow: -0.1 · sign(v)", "torque on shoulder: -
 
 
 def clauses(truth, found, judge=force_in_vain):
-    """What is said of effects found in data with noisy torques."""
+    """The clauses about effects that were found in data with noisy torques."""
     measured = recorded(SIMULATION.with_effects(*truth), 3000, noise=0.002)
     noise = 0.1 * np.random.default_rng(1).normal(size=measured.action.shape)
     noisy = replace(measured, action=measured.action + noise)

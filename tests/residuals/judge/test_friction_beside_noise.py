@@ -41,7 +41,7 @@ def said(simulation, *effects):
 
 def test_friction_beside_as_much_noise_may_be_too_large(simulation):
     (words,) = said(simulation, JointFrictionLoss(0.7, "elbow"), ActionNoise(0.9))
-    assert "of 0.9 N·m beside the + 0.7 N·m of elbow: on a light link" in words
+    assert "of 0.9 N·m beside the + 0.7 N·m of elbow. On a light link" in words
 
 
 def test_the_noise_of_a_geared_motor_counts_as_a_torque(simulation):

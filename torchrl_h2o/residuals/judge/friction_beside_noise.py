@@ -31,7 +31,7 @@ def friction_beside_noise(
         simulation: the simulator without the effects.
         mended: the simulator with them.
         effects: the effects found.
-        rules: the noise, as a share of the friction, from which it is said.
+        rules: the smallest share of the friction that noise must have to be mentioned.
 
     Returns:
         One sentence, about all joints with so much noise beside the friction found there, or nothing.
@@ -47,8 +47,8 @@ def friction_beside_noise(
     if not doubtful:
         return ()
     return (
-        f"Noise of the actions was found as well, {', '.join(doubtful)}: on a light link, such noise can raise the dry "
-        "friction that is found, in a simulated leg by half, which its interval does not count.",
+        f"Noise of the actions was found as well, {', '.join(doubtful)}. On a light link, such noise can raise the dry "
+        "friction that is found, in a simulated leg by half; the interval of the friction does not include this error.",
     )
 
 

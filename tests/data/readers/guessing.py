@@ -1,0 +1,14 @@
+"""Columns of a joint that swings, and the layout that is guessed for them."""
+
+import numpy as np
+
+from torchrl_h2o.data.readers.guess import guess_layout
+
+TIME = 0.01 * np.arange(1500)
+ANGLE = 4.0 * np.sin(TIME)
+COMMAND = np.cos(7.0 * TIME)
+
+
+def guessed(tmp_path, names: str, columns, model=None) -> str:
+    np.savetxt(tmp_path / "log.csv", np.stack(columns, 1), delimiter=",", header=names, comments="")
+    return guess_layout(tmp_path / "log.csv", model).text
