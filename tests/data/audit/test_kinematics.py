@@ -52,6 +52,13 @@ def test_one_joint_cannot_tell_a_wrong_unit_from_a_wrong_step(factor, step):
     assert said == step
 
 
+def test_beside_a_sound_joint_the_step_is_not_in_doubt(good, simulation):
+    (found,) = [
+        each for each in audit(changed(good, scaled([1], 2.0)), simulation).severe if each.check == "kinematics"
+    ]
+    assert found.remedy == "correct unit, scale or sign of the columns"
+
+
 def test_degrees_of_positions_and_velocities_are_found_with_the_model(good, simulation):
     words = severe(changed(good, scaled([0, 1, 2, 3], DEGREES)), simulation, "model")
     assert "all angles and their velocities are taken as degrees" in words
