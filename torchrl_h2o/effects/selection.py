@@ -49,6 +49,13 @@ def joint_dofs(model: mujoco.MjModel, patterns: Names) -> list[int]:
     return [dof for dof in range(model.nv) if model.dof_jntid[dof] in chosen]
 
 
+def driven_dofs(model: mujoco.MjModel) -> frozenset[int]:
+    """Returns the degrees of freedom on which an actuator acts."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return frozenset(int(dof) for dof in data.moment_colind[: data.moment_rownnz.sum()])
+
+
 def body_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:
     """Returns the ids of the matching bodies of a compiled model, except the world."""
     views = [model.body(i) for i in range(1, model.nbody)]

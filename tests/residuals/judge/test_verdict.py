@@ -11,6 +11,7 @@ from torchrl_h2o.effects import (
     ActionNoise,
     ActionSaturation,
     Armature,
+    BodyMass,
     Gravity,
     JointDamping,
     JointFrictionLoss,
@@ -184,6 +185,11 @@ def test_friction_beside_noise_of_its_size_gets_a_caveat():
     (caveat,) = verdict(found, found).caveats
     assert "such noise can raise the dry friction" in caveat
     assert verdict(found, found[:1]).caveats == ()
+
+
+def test_a_mass_far_from_the_model_s_gets_a_caveat():
+    (caveat,) = verdict((BodyMass(0.2),), (BodyMass(0.2),)).caveats
+    assert "masses and forces only in proportion" in caveat
 
 
 def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques_spoil_the_motion():

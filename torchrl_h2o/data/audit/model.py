@@ -14,6 +14,7 @@ from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
+from torchrl_h2o.data.audit.undriven import check_undriven_zeros
 from torchrl_h2o.data.audit.unexplained import percent, unexplained, unexplained_and_reversed
 from torchrl_h2o.data.audit.zeros import check_large_zeros, check_small_zeros
 
@@ -37,8 +38,10 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
         if left < best and misfit - left > 0.1:
             best, words = left, what
     if words is None:
-        wrong_columns = _by_regression(response, settings)
-        return wrong_columns or check_large_zeros(response, settings) or check_small_zeros(response, settings)
+        for check in (_by_regression, check_undriven_zeros, check_large_zeros, check_small_zeros):
+            if found := check(response, settings):
+                return found
+        return []
     # a reversed action of one joint can look like a reversed joint
     if any(few.misfit(actions=reversed_action(index)) <= best for index in range(len(few.log.actuators))):
         return []

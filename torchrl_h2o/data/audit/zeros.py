@@ -54,6 +54,8 @@ def check_large_zeros(response: Response, settings: AuditSettings) -> list[Findi
     _, pair, shifts = min(found, key=lambda each: each[0])
     both = (response, _shifted(response, pair, shifts))
     plain, left = (unexplained(each, settings, shifts != 0.0) for each in both)
+    if left >= settings.better * plain:  # gains and friction of the whole log explain these parts as well
+        return []
     return [_finding(response, pair, shifts, plain, left, settings)]
 
 
@@ -233,7 +235,7 @@ def check_small_zeros(response: Response, settings: AuditSettings) -> list[Findi
             continue
         pair = pairs[index]
         left = _shifted(response, pair, np.full(len(response.starts), shift)).misfit()
-        if left < settings.zero_better * misfit:
+        if left < min(settings.zero_better * misfit, settings.foreign):
             words = f"the simulator leaves {percent(misfit)} of the accelerations unexplained, and {percent(left)} "
             words += f"if the zero of {pair.name} is shifted by {-shift:.2f} rad: an offset, or a tilted model"
             remedy = f"measure the angle's zero, for example at rest; offset: {shift:.3g} in its column corrects it"

@@ -108,6 +108,8 @@ class VerdictSettings:
     """Share of the held-out error that an effect which was not put in must leave at most to be named all the same."""
     noise_beside_friction: float = 0.8
     """Share of a dry friction from which noise of the actions at its joint makes its value doubtful."""
+    far_from_model: float = 2.0
+    """Factor on a mass or a motor's gain from which the report says that only ratios show in the motion."""
     extreme_factor: float = 20.0
     """Factor on a property of the model beyond which the value is reported as implausible."""
     blocks: int = 10

@@ -13,6 +13,7 @@ from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
 from torchrl_h2o.residuals.judge.friction_beside_noise import friction_beside_noise
 from torchrl_h2o.residuals.judge.made_worse import made_worse
 from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
+from torchrl_h2o.residuals.judge.only_ratios import only_ratios
 from torchrl_h2o.residuals.judge.separation import where_it_is_large
 from torchrl_h2o.residuals.judge.short_delays import short_delays
 from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead
@@ -86,6 +87,7 @@ def reach_verdict(
     caveats = (
         *short_delays(effects, measured, simulation.control_step),
         *friction_beside_noise(simulation, mended, effects, rules),
+        *only_ratios(effects, simulation.names, rules),
     )
     if raised or (signs and not _leaves_little(mended, measured, error, two_sample, settings)):
         where = where_most(mended, measured, settings)

@@ -163,7 +163,8 @@ def _linearised(
     lengths = np.where(outside, -lengths, lengths)
     here = force(shares)
     changes = [(force(shares + step) - here) / length for step, length in zip(np.diag(lengths), lengths, strict=True)]
-    return _Linearised(shares, here, np.stack(changes, axis=-1))
+    tell = [_telling(simulation.model, entry.effect) for entry in entries]
+    return _Linearised(shares, here, np.stack(changes, axis=-1) * np.stack(tell, axis=-1))
 
 
 def _repeated(
@@ -248,8 +249,20 @@ def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: 
         change = missing_force(simulation.with_effects(entry.starts[0]), motion) - missing
     except ValueError:  # a value that the model rejects
         return None
+    change = change * _telling(simulation.model, entry.effect)
     known = change[motion.moving]
     return change if np.isfinite(known).all() and np.abs(known).max() > 0.0 else None
+
+
+def _telling(model: mujoco.MjModel, effect: Effect) -> np.ndarray:
+    """Mask (nv) of the coordinates whose missing force tells the size of an effect.
+
+    Where no actuator acts, as at the pole of a cart-pole, all forces are in proportion to the masses, so that noise
+    alone would make the masses as small as allowed.
+    """
+    if not isinstance(effect, BodyMass):
+        return np.ones(model.nv)
+    return np.isin(np.arange(model.nv), list(selection.driven_dofs(model))).astype(float)
 
 
 def _heavy_rotor(model: mujoco.MjModel, joints: selection.Names) -> Armature:

@@ -16,7 +16,15 @@ from torchrl_h2o.data.readers.guess.coordinates import (
     without_constants,
 )
 from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE, FreeBody, free_body, velocities_together
-from torchrl_h2o.data.readers.guess.roles import Guess, guess_columns, is_force, may_be_command
+from torchrl_h2o.data.readers.guess.roles import (
+    Guess,
+    guess_columns,
+    is_force,
+    may_be_command,
+    slope_of,
+    without_unit,
+    words_of,
+)
 from torchrl_h2o.data.readers.guess.slopes import is_wrapped, relation, step_of_motion, time_of
 from torchrl_h2o.data.readers.guess.unnamed import recognise
 from torchrl_h2o.data.readers.units import to_si
@@ -73,6 +81,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
     if model is not None and not contents.named:
         columns, contents = recognise(columns, contents, model)
     elif model is not None:
+        columns = _without_surplus(columns, body.coordinates, model)
         columns = _actions_left(columns, contents, len(model.actuators))
     if model is not None and model.forces:
         columns = [replace(one, unit="N") if one.kind == "action" and one.unit == "N·m" else one for one in columns]
@@ -124,14 +133,29 @@ def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
     return result
 
 
+def _without_surplus(columns: Sequence[Guess], of_body: Mapping[str, str], model: Coordinates) -> list[Guess]:
+    """More positions than joints: if as many have a velocity as there are joints, the others are not recognised."""
+    followed = set(_pairs(columns, of_body).values())
+    joints = [name for name in model.units if not name.endswith("_velocity") and name not in of_body.values()]
+    known = {name.lower() for name in model.units}
+    positions = [one for one in columns if one.kind == "position" and one.name not in of_body]
+    if len(positions) <= len(joints) or len(followed) != len(joints):
+        return list(columns)
+    surplus = [one for one in positions if one.name not in followed and one.name.lower() not in known]
+    return [replace(one, kind="unknown", note="") if one in surplus else one for one in columns]
+
+
 def _actions_left(columns: Sequence[Guess], contents: Contents, number: int) -> list[Guess]:
     """The columns that nothing recognised as actions, if there are as many as actuators and no other actions."""
     values = contents.values
     left = [column for column in columns if column.kind == "unknown" and not column.note]
     surely = {_family(column) for column in left if may_be_command(column.name, np.asarray(values[column.name]))}
     left = [column for column in left if _family(column) in surely]
-    if len(left) != number or any(column.kind == "action" for column in columns):
+    if not left or any(column.kind == "action" for column in columns):
         return list(columns)
+    if len(left) != number:
+        note = f"perhaps an action: the model has {number}, and {len(left)} columns are left"
+        return [replace(column, note=note) if column in left and number else column for column in columns]
     note = "not recognised, but as many columns as the model has actuators are left: check role and unit"
     return [replace(column, kind="action", note=note) if column in left else column for column in columns]
 
@@ -142,11 +166,13 @@ def _family(column: Guess) -> str:
 
 
 def _pairs(columns: Sequence[Guess], of_body: Collection[str]) -> dict[str, str]:
-    """Return the position of each velocity: by the rest of their names, or by order if as many are left."""
+    """Return the position of each velocity: by their names, by the rest of these, or by order if as many are left."""
     positions = [column for column in columns if column.kind == "position"]
     velocities = [column for column in columns if column.kind == "velocity"]
-    pairs: dict[str, str] = {}
-    for velocity in velocities:
+    by_name = {tuple(words_of(without_unit(column.name)[0])): column.name for column in reversed(positions)}
+    slopes = {velocity.name: by_name.get(slope_of(velocity.name)) for velocity in velocities}
+    pairs = {velocity: position for velocity, position in slopes.items() if position is not None}
+    for velocity in (one for one in velocities if one.name not in pairs):
         same = [p.name for p in positions if p.stem == velocity.stem and p.name not in pairs.values()]
         if len(same) == 1:
             pairs[velocity.name] = same[0]

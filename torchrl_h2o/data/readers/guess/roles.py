@@ -190,6 +190,11 @@ def words_of(name: str) -> list[str]:
     return [part for word in words for part in _derivative(word)]
 
 
+def slope_of(velocity: str) -> tuple[str, ...]:
+    """The words of the position of which a velocity is the slope by its name: ``angleD`` is that of angle."""
+    return tuple(word for word in words_of(without_unit(velocity)[0]) if word not in _WORDS["velocity"])
+
+
 def _slope(match: re.Match[str]) -> str:
     """``angleD`` as ``angle_dot``; but the joint or encoder D stays what it is."""
     word = match.group(1)

@@ -1,0 +1,97 @@
+"""Angles of joints that no actuator moves, in logs of a cart-pole whose simulator has no friction at the cart."""
+
+import re
+
+import mujoco
+import numpy as np
+import pytest
+
+from tests.data.audit.recorded import measured
+from torchrl_h2o.data import audit
+from torchrl_h2o.effects import (
+    BodyCentreOfMass,
+    BodyMass,
+    JointDamping,
+    JointForce,
+    JointFrictionLoss,
+    JointSpring,
+    Payload,
+)
+from torchrl_h2o.residuals import Simulation, StateMap
+
+XML = """
+<mujoco model="cartpole">
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="slider" type="slide" axis="1 0 0"/>
+      <geom type="box" size="0.02 0.02 0.01" mass="0.25" contype="0" conaffinity="0"/>
+      <body name="pole">
+        <joint name="hinge" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.003" mass="0.1" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="slider"/></actuator>
+</mujoco>
+"""
+FRICTION = JointDamping(4.0, "slider"), JointFrictionLoss(0.5, "slider")
+
+
+def cart_pole(*effects) -> Simulation:
+    names, units = ("x", "angle", "x_velocity", "angle_velocity"), ("m", "rad", "m/s", "rad/s")
+    state_map = StateMap.of_coordinates(names, units, (0, 1, 2, 3), num_states=4)
+    return Simulation(lambda: mujoco.MjSpec.from_string(XML), 2, state_map, effects, "cartpole")
+
+
+def warnings(*effects, zero: float = 0.0, seed: int = 0) -> list[str]:
+    """What the audit warns of in a log of a cart-pole with effects, friction, and noise in the sensors."""
+    rng, action = np.random.default_rng(seed), np.zeros((2000, 1))
+    for row in range(1, len(action)):
+        action[row] = 0.95 * action[row - 1] + 0.8 * rng.standard_normal()
+    start = np.array([[0.0, 0.8, 0.0, 0.0]])
+    reached = cart_pole(*FRICTION, *effects).rollout(start, action[None])[0]
+    observed = np.vstack([start, reached]) + np.array([0.0, zero, 0.0, 0.0])
+    observed += 0.005 * observed.std(0) * rng.standard_normal(observed.shape)
+    found = audit(measured(observed, action), cart_pole())
+    return [finding.words for finding in (*found.severe, *found.warnings)]
+
+
+def shifts(words: list[str]) -> list[float]:
+    """The shifts of zeros that are named, in rad."""
+    return [float(found) for each in words for found in re.findall(r"shifted by (-?[\d.]+) rad", each)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("zero", [0.2, -0.25, 0.4])
+def test_friction_of_the_cart_does_not_hide_the_zero_of_the_pole(zero, seed):
+    """Earlier, no zero was named: the cart's error was most of the error with the right zero as well."""
+    assert shifts(warnings(zero=zero, seed=seed)) == [pytest.approx(zero, abs=0.02)]
+
+
+def test_a_pole_that_counts_from_upright_is_severe():
+    words = warnings(zero=np.pi)
+    assert abs(shifts(words)[0]) == pytest.approx(np.pi, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (),
+        (JointForce(0.03, "hinge"),),
+        (JointSpring(0.1, "hinge"),),
+        (JointFrictionLoss(0.02, "hinge"), JointDamping(0.002, "hinge")),
+        (BodyMass(2.0, "pole"),),
+        (Payload(0.1, z=-0.4, bodies="pole"),),
+        (BodyCentreOfMass(z=0.08, bodies="pole"),),
+    ],
+    ids=["none", "force", "spring", "friction", "mass", "payload", "centre of mass"],
+)
+def test_what_else_a_pole_may_lack_is_no_wrong_zero(effects, seed):
+    assert shifts(warnings(*effects, seed=seed)) == []
+
+
+def test_mass_beside_the_axis_is_named_as_a_possible_cause():
+    (words,) = warnings(BodyCentreOfMass(x=0.05, bodies="pole"))
+    assert "an offset, a tilted model, or a centre of mass beside the joint's axis" in words
