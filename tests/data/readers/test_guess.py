@@ -377,3 +377,20 @@ def test_a_length_is_not_assigned_to_the_hinge_that_is_left(tmp_path):
 def test_positions_whose_names_fit_no_joint_are_assigned_in_order(tmp_path):
     found = of_cart_pole(tmp_path, "time,x,y,Q", [TIME, ANGLE, np.cos(TIME), COMMAND])
     assert (found.coordinates["x"], found.coordinates["y"]) == ("cart", "pole")
+
+
+def test_a_position_beside_as_many_with_velocities_as_the_model_has_joints_is_the_action(tmp_path):
+    """Q is a position by its name; the model's actuator has another name."""
+    values = {"time": TIME, "angle": ANGLE, "angleD": 4.0 * np.cos(TIME), "position": 0.1 * np.sin(3.0 * TIME)}
+    values |= {"positionD": 0.3 * np.cos(3.0 * TIME), "Q": COMMAND}
+    model = Coordinates(CART_POLE.units, ["motor"], forces=True)
+    text = guessed(tmp_path, ",".join(values), [*values.values()], model)
+    assert '"Q", role: action' in text
+    assert '"positionD", role: observation, unit: "m/s"' in text
+    assert "derivative_of" not in text
+
+
+def test_columns_that_may_be_the_action_say_so(tmp_path):
+    model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
+    text = guessed(tmp_path, "time,q,drive,other", [TIME, ANGLE, COMMAND, COMMAND], model)
+    assert text.count("perhaps an action: the model has 1, and 2 columns are left") == 2

@@ -71,8 +71,11 @@ def _finding(response: Response, index: int, settings: AuditSettings) -> Finding
         return None
     share = percent(remains / float(np.nanmedian(plain)))
     words = f"no actuator moves {pair.name}, and beside friction, {share} of the force that the simulator lacks there "
-    words += f"remains if the zero of {pair.name} is shifted by {-total:.2f} rad: an offset, a tilted model, or a centre of mass beside "
-    words += "the joint's axis" + ("; or a constant force there" if remains > settings.zero_better * constant else "")
+    words += (
+        f"remains if the zero of {pair.name} is shifted by {-total:.2f} rad: an offset, a tilted model, or a centre "
+    )
+    words += "of mass beside the joint's axis"
+    words += "; or a constant force there" if remains > settings.zero_better * constant else ""
     severity = "severe" if abs(total) >= settings.zero_severe else "warning"
     remedy = f"measure the angle's zero, for example at rest; offset: {total:.3g} in its column corrects it"
     return Finding(CHECK, severity, words, None, remedy)

@@ -170,8 +170,11 @@ def _pairs(columns: Sequence[Guess], of_body: Collection[str]) -> dict[str, str]
     positions = [column for column in columns if column.kind == "position"]
     velocities = [column for column in columns if column.kind == "velocity"]
     by_name = {tuple(words_of(without_unit(column.name)[0])): column.name for column in reversed(positions)}
-    slopes = {velocity.name: by_name.get(slope_of(velocity.name)) for velocity in velocities}
-    pairs = {velocity: position for velocity, position in slopes.items() if position is not None}
+    pairs: dict[str, str] = {}
+    for velocity in velocities:
+        position = by_name.get(slope_of(velocity.name))
+        if position is not None and position not in pairs.values():
+            pairs[velocity.name] = position
     for velocity in (one for one in velocities if one.name not in pairs):
         same = [p.name for p in positions if p.stem == velocity.stem and p.name not in pairs.values()]
         if len(same) == 1:
