@@ -6,6 +6,7 @@ import pytest
 from tests.data.readers.guessing import ANGLE, COMMAND, TIME, guessed
 
 SPEED = 4.0 * np.cos(TIME)  # of ANGLE
+LOST = np.where(np.arange(1500) == 700, np.nan, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -17,8 +18,10 @@ SPEED = 4.0 * np.cos(TIME)  # of ANGLE
         ("q,qdot", [(ANGLE + np.pi) % (2.0 * np.pi), SPEED]),
         ("q,qdot", [ANGLE, SPEED + 0.5 * np.random.default_rng(0).standard_normal(1500)]),
         ("q1,qdot1,q2 [deg],qdot2 [rad/s]", [ANGLE, SPEED, np.degrees(ANGLE), SPEED]),
+        ("q,qdot", [ANGLE, LOST * SPEED]),
+        ("q,qdot", [LOST * ANGLE, SPEED]),
     ],
-    ids=["same units", "other units", "degrees without a word", "wrapped", "noise", "two joints"],
+    ids=["same units", "other units", "degrees", "wrapped", "noise", "two joints", "lost velocity", "lost position"],
 )
 def test_without_a_time_its_step_follows_from_velocities_and_positions(tmp_path, names, columns):
     text = guessed(tmp_path, f"{names},tau", [*columns, COMMAND])

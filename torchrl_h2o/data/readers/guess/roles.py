@@ -242,7 +242,7 @@ def _unit_of_time(numbers: np.ndarray, unit: str | None) -> tuple[str, str, str]
 
 
 def _unit_of(kind: str, si: str | None, words: list[str], numbers: np.ndarray) -> tuple[str, str]:
-    unit, largest = si or _SI.get(kind, "1"), float(np.abs(numbers).max())
+    unit, largest = si or _SI.get(kind, "1"), float(np.abs(numbers[np.isfinite(numbers)]).max(initial=0.0))
     if si is not None and (kind != "position" or si != "rad"):
         return unit, f"check the unit: the largest value is {largest:.3g}"
     if kind == "action" and any(word in _DUTY for word in words):

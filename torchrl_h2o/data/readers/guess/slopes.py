@@ -72,12 +72,16 @@ def _relation_over(
         position = np.unwrap(position, period=2.0 * np.pi / to_si(units[name])[1])
     steps, moved = np.diff(time), np.diff(position)
     expected = 0.5 * (values[1:] + values[:-1]) * steps
-    usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved), 0.95)
-    good = (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
+    known = np.isfinite(moved) & np.isfinite(expected)
+    if not known.any():
+        return None
+    usual, largest = np.median(steps), 5.0 * np.quantile(np.abs(moved[known]), 0.95)
+    good = known & (steps > 0.0) & (steps < 2.0 * usual) & (np.abs(moved) <= largest)  # no gaps and no resets
+    moved, expected = np.where(known, moved, 0.0), np.where(known, expected, 0.0)
     spans = [rows for rows in _SPANS if overlap * rows < len(time)]
     if not spans:
         return None
-    if max(np.std(position[rows:] - position[:-rows]) for rows in spans) < _MOVES * np.std(moved):
+    if max(np.nanstd(position[rows:] - position[:-rows]) for rows in spans) < _MOVES * np.std(moved[known]):
         return None  # noise of a joint at rest does not grow with the span
     found = [_correlation(moved, expected, good, rows) for rows in spans]
     return max((one for one in found if one is not None), key=lambda one: abs(one[0]), default=None)
