@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 import mujoco
+import numpy as np
 
 Names = str | tuple[str, ...]
 
@@ -50,10 +51,19 @@ def joint_dofs(model: mujoco.MjModel, patterns: Names) -> list[int]:
 
 
 def driven_dofs(model: mujoco.MjModel) -> frozenset[int]:
-    """Returns the degrees of freedom on which an actuator acts."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return frozenset(int(dof) for dof in data.moment_colind[: data.moment_rownnz.sum()])
+    """Returns the degrees of freedom on which an actuator acts in some pose.
+
+    These are all of them in a model with equality constraints, which carry the actuators' forces to other joints.
+    """
+    if model.neq:
+        return frozenset(range(model.nv))
+    data, rng, driven = mujoco.MjData(model), np.random.default_rng(0), set()
+    for size in (0.0, 0.3, 1.0, 1.0):
+        mujoco.mj_integratePos(model, data.qpos, size * rng.standard_normal(model.nv), 1.0)
+        mujoco.mj_fwdPosition(model, data)
+        used = int(data.moment_rownnz.sum())
+        driven |= set(data.moment_colind[:used][np.abs(data.actuator_moment[:used]) > 1e-9].tolist())
+    return frozenset(driven)
 
 
 def body_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:

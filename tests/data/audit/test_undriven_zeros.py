@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.data.audit.recorded import measured
-from torchrl_h2o.data import audit
+from torchrl_h2o.data import Audit, audit
 from torchrl_h2o.effects import (
     BodyCentreOfMass,
     BodyMass,
@@ -38,23 +38,34 @@ XML = """
 FRICTION = JointDamping(4.0, "slider"), JointFrictionLoss(0.5, "slider")
 
 
-def cart_pole(*effects) -> Simulation:
+def cart_pole(*effects, xml: str = XML) -> Simulation:
     names, units = ("x", "angle", "x_velocity", "angle_velocity"), ("m", "rad", "m/s", "rad/s")
-    state_map = StateMap.of_coordinates(names, units, (0, 1, 2, 3), num_states=4)
-    return Simulation(lambda: mujoco.MjSpec.from_string(XML), 2, state_map, effects, "cartpole")
+    if "hinge2" in xml:
+        names = ("x", "angle", "angle2", "x_velocity", "angle_velocity", "angle2_velocity")
+        units = ("m", "rad", "rad", "m/s", "rad/s", "rad/s")
+    state_map = StateMap.of_coordinates(names, units, tuple(range(len(names))), num_states=len(names))
+    return Simulation(lambda: mujoco.MjSpec.from_string(xml), 2, state_map, effects, "cartpole")
 
 
-def warnings(*effects, zero: float = 0.0, seed: int = 0) -> list[str]:
-    """What the audit warns of in a log of a cart-pole with effects, friction, and noise in the sensors."""
+def found(*effects, zeros: tuple[float, ...] = (0.0, 0.0), seed: int = 0, xml: str = XML) -> Audit:
+    """The audit of a log of a cart-pole with effects, friction, wrong zeros of x and angles, and noise."""
     rng, action = np.random.default_rng(seed), np.zeros((2000, 1))
     for row in range(1, len(action)):
         action[row] = 0.95 * action[row - 1] + 0.8 * rng.standard_normal()
-    start = np.array([[0.0, 0.8, 0.0, 0.0]])
-    reached = cart_pole(*FRICTION, *effects).rollout(start, action[None])[0]
-    observed = np.vstack([start, reached]) + np.array([0.0, zero, 0.0, 0.0])
+    simulation = cart_pole(xml=xml)
+    start = np.zeros((1, simulation.model.nq + simulation.model.nv))
+    start[0, 1] = 0.8
+    reached = simulation.with_effects(*FRICTION, *effects).rollout(start, action[None])[0]
+    observed = np.vstack([start, reached])
+    observed[:, : len(zeros)] += zeros
     observed += 0.005 * observed.std(0) * rng.standard_normal(observed.shape)
-    found = audit(measured(observed, action), cart_pole())
-    return [finding.words for finding in (*found.severe, *found.warnings)]
+    return audit(measured(observed, action), simulation)
+
+
+def warnings(*effects, zero: float = 0.0, seed: int = 0, xml: str = XML) -> list[str]:
+    """What the audit warns of."""
+    audited = found(*effects, zeros=(0.0, zero), seed=seed, xml=xml)
+    return [finding.words for finding in (*audited.severe, *audited.warnings)]
 
 
 def shifts(words: list[str]) -> list[float]:
@@ -70,8 +81,34 @@ def test_friction_of_the_cart_does_not_hide_the_zero_of_the_pole(zero, seed):
 
 
 def test_a_pole_that_counts_from_upright_is_severe():
-    words = warnings(zero=np.pi)
-    assert abs(shifts(words)[0]) == pytest.approx(np.pi, abs=0.1)
+    (finding,) = found(zeros=(0.0, np.pi)).severe
+    assert abs(shifts([finding.words])[0]) == pytest.approx(np.pi, abs=0.1)
+
+
+def test_a_smaller_shift_stops_no_search():
+    """A load beside the joint's axis does the same."""
+    assert found(zeros=(0.0, 0.4)).severe == ()
+
+
+LOWER = """
+        <body name="pole2" pos="0 0 -0.4">
+          <joint name="hinge2" axis="0 1 0"/>
+          <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.003" mass="0.1" contype="0" conaffinity="0"/>
+        </body>
+"""
+TWO = XML.replace('<joint name="hinge" axis="0 1 0"/>', f'<joint name="hinge" axis="0 1 0"/>{LOWER}')
+
+
+def test_zeros_of_two_poles_are_found_together():
+    """Fitted one by one, the lower one takes the sum of both."""
+    words = [finding.words for finding in found(zeros=(0.0, 0.3, 0.25), xml=TWO).warnings]
+    assert shifts(words) == [pytest.approx(0.3, abs=0.03), pytest.approx(0.25, abs=0.03)]
+
+
+def test_a_weaker_spring_of_a_joint_that_carries_a_load_is_no_wrong_zero():
+    sprung = XML.replace('<joint name="hinge"', '<joint name="hinge" stiffness="0.6" springref="40"')
+    assert shifts(warnings(xml=sprung)) == []
+    assert shifts(warnings(JointSpring(-0.2, "hinge"), xml=sprung)) == []
 
 
 @pytest.mark.parametrize("seed", range(3))

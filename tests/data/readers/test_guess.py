@@ -385,12 +385,32 @@ def test_a_position_beside_as_many_with_velocities_as_the_model_has_joints_is_th
     values |= {"positionD": 0.3 * np.cos(3.0 * TIME), "Q": COMMAND}
     model = Coordinates(CART_POLE.units, ["motor"], forces=True)
     text = guessed(tmp_path, ",".join(values), [*values.values()], model)
-    assert '"Q", role: action' in text
+    assert '"Q", role: action, unit: "1"' in text
     assert '"positionD", role: observation, unit: "m/s"' in text
     assert "derivative_of" not in text
+    (tmp_path / "log.yaml").write_text(text)
+    assert read_robot_log(tmp_path / "log.csv", tmp_path / "log.yaml")["action"].shape[1] == 1
+
+
+def test_positions_with_the_names_of_joints_are_kept_beside_others_with_velocities(tmp_path):
+    names = "time,m1_pos,m1_vel,m2_pos,m2_vel,arm_pos,pendulum_pos,tau"
+    model = Coordinates({"arm": "rad", "pendulum": "rad", "arm_velocity": "rad/s", "pendulum_velocity": "rad/s"}, ["m"])
+    columns = [TIME, ANGLE, 4.0 * np.cos(TIME), ANGLE, 4.0 * np.cos(TIME), ANGLE, ANGLE, COMMAND]
+    np.savetxt(tmp_path / "log.csv", np.stack(columns, 1), delimiter=",", header=names, comments="")
+    found = guess_layout(tmp_path / "log.csv", model).coordinates
+    assert (found["arm_pos"], found["pendulum_pos"]) == ("arm", "pendulum")
+
+
+def test_a_third_position_does_not_hide_the_only_column_that_nothing_recognised(tmp_path):
+    units = {"q_1": "rad", "q_2": "rad", "q_1_velocity": "rad/s", "q_2_velocity": "rad/s"}
+    columns = [TIME, ANGLE, 4.0 * np.cos(TIME), ANGLE, 4.0 * np.cos(TIME), ANGLE, COMMAND]
+    text = guessed(tmp_path, "time,q_1,v_1,q_2,v_2,yaw,drive", columns, Coordinates(units, ["motor"]))
+    assert '"drive", role: action' in text
+    assert '"yaw", role: ignore}  # a position beyond the model\'s joints' in text
 
 
 def test_columns_that_may_be_the_action_say_so(tmp_path):
     model = Coordinates({"q": "rad", "q_velocity": "rad/s"}, ["motor"])
     text = guessed(tmp_path, "time,q,drive,other", [TIME, ANGLE, COMMAND, COMMAND], model)
-    assert text.count("perhaps an action: the model has 1, and 2 columns are left") == 2
+    assert text.count("perhaps an action: actuators in the model: 1, columns that are left: 2") == 2
+    assert "no column of actions was found; see those marked 'perhaps an action'" in text

@@ -1,33 +1,54 @@
 """Masses and motor gains that the motion shows only in proportion to everything else."""
 
+from dataclasses import replace
+
+import mujoco
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import double_pendulum
+from tests.residuals.pendulum import DOUBLE, double_pendulum
 from torchrl_h2o.effects import ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals.judge.only_ratios import only_ratios
 
+SIMULATION = double_pendulum()
+
+
+def said(*effects, simulation=SIMULATION):
+    return only_ratios(simulation, effects)
+
 
 def test_a_light_link_is_like_everything_else_heavier():
-    (words,) = only_ratios([BodyMass(0.2, "pole"), JointDamping(4.6, "slider")])
-    assert "mass of bodies pole × 0.2 moves the robot as everything else × 5 would" in words
-    assert "Weigh the part" in words
+    (words,) = said(BodyMass(0.2, "lower"), JointDamping(4.6, "elbow"))
+    assert "mass of bodies lower × 0.2 could as well be everything else × 5 (the other masses, rotors" in words
+    assert words.endswith("Weigh the part, unless the motors are known well.")
+
+
+def test_a_light_robot_has_no_other_masses():
+    (words,) = said(BodyMass(0.2))
+    assert "everything else × 5 (rotors, springs" in words
+    assert "Weigh the robot" in words
 
 
 def test_a_weak_motor_is_like_everything_else_heavier():
-    (words,) = only_ratios([ActionGain(0.25)])
-    assert "all actuators × 0.25 moves the robot as everything else × 4 would" in words
-    assert "the other motors' forces" in words
+    (words,) = said(ActionGain(0.25))
+    assert "all actuators × 0.25 could as well be everything else × 4 (masses, rotors" in words
 
 
 def test_of_several_values_the_farthest_is_named():
-    (words,) = only_ratios([BodyMass(3.0, "a"), BodyMass(0.1, "b")])
-    assert "mass of bodies b × 0.1" in words
+    (words,) = said(BodyMass(3.0, "upper"), BodyMass(0.1, "lower"))
+    assert "mass of bodies lower × 0.1" in words
 
 
 @pytest.mark.parametrize("effects", [[], [BodyMass(1.8)], [ActionGain(-1.0)], [ActionGain(0.0)], [Gravity(0.1)]])
 def test_other_values_are_not_mentioned(effects):
-    assert only_ratios(effects) == ()
+    assert said(*effects) == ()
+
+
+def test_the_gain_of_a_servo_scales_no_force():
+    servos = DOUBLE.replace("<motor", '<position kp="8"')
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(servos))
+    assert said(ActionGain(0.25), simulation=simulation) == ()
+    assert len(said(BodyMass(0.2, "lower"), simulation=simulation)) == 1
 
 
 def test_the_same_motion_follows_from_either():

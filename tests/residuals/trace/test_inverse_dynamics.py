@@ -330,14 +330,38 @@ def test_friction_of_a_light_link_is_dry_beside_its_rotor():
         assert getattr(proposed[type(effect)], name) == pytest.approx(getattr(effect, name), rel=0.05)
 
 
+def without_motor(joint: str):
+    """The double pendulum with one motor."""
+    xml = re.sub(f'<motor joint="{joint}".*?/>', "", DOUBLE)
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(xml))
+    assert simulation.model.nu == 1
+    return simulation
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_does_not_make_a_link_light_that_no_actuator_moves(seed):
     """Without a mass, no force is missing at the elbow, whatever the noise; earlier, × 0.01 was proposed."""
-    without_motor = re.sub('<motor joint="elbow".*?/>', "", DOUBLE)
-    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(without_motor))
-    assert simulation.model.nu == 1
+    simulation = without_motor("elbow")
     measured = recorded(simulation.with_effects(JointDamping(0.3, "shoulder")), 3000, noise=0.02, seed=seed)
     kinds = (BodyMass, JointDamping, JointFrictionLoss)
     catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, kinds)]
     (found,) = propose_effects(simulation, measured, catalogue).effects
     assert (found.joints, found.damping) == ("shoulder", pytest.approx(0.3, rel=0.02))
+
+
+@pytest.mark.parametrize(
+    ("without", "moved", "body", "scale"),
+    [
+        ("shoulder", "elbow", "upper", 0.5),
+        ("shoulder", "elbow", "upper", 1.6),
+        ("elbow", "shoulder", "upper", 0.5),
+        ("elbow", "shoulder", "lower", 1.6),
+    ],
+)
+def test_masses_are_found_with_one_motor(without, moved, body, scale):
+    """Of an acrobot, the upper link's mass shows at the shoulder alone, which no actuator moves."""
+    simulation, damping = without_motor(without), JointDamping(0.1, moved)
+    measured = recorded(simulation.with_effects(BodyMass(scale, body), damping), 3000, noise=0.002)
+    found = {type(effect): effect for effect in propose_effects(simulation, measured, simulation.catalogue()).effects}
+    assert found.keys() == {BodyMass, JointDamping}
+    assert (found[BodyMass].bodies, found[BodyMass].scale) == (body, pytest.approx(scale, rel=0.02))

@@ -38,10 +38,12 @@ def check_model(response: Response, settings: AuditSettings) -> list[Finding]:
         if left < best and misfit - left > 0.1:
             best, words = left, what
     if words is None:
-        for check in (_by_regression, check_undriven_zeros, check_large_zeros, check_small_zeros):
-            if found := check(response, settings):
-                return found
-        return []
+        if wrong_columns := _by_regression(response, settings):
+            return wrong_columns
+        undriven = check_undriven_zeros(response, settings)
+        if any(finding.severity == "severe" for finding in undriven):
+            return undriven
+        return check_large_zeros(response, settings) or undriven or check_small_zeros(response, settings)
     # a reversed action of one joint can look like a reversed joint
     if any(few.misfit(actions=reversed_action(index)) <= best for index in range(len(few.log.actuators))):
         return []

@@ -192,7 +192,8 @@ class AuditSettings:
     zero_better: float = 0.8
     """Share of the misfit that a corrected zero must leave at most."""
     force_left: float = 0.6
-    """Share of the force missing at a joint without actuators that a corrected zero must leave at most."""
+    """Share of what friction leaves of the force missing at a joint without actuators that a corrected zero must leave
+    at most."""
     foreign: float = 0.85
     """Misfit that the best gains, friction and zeros leave, above which the log belongs to another robot."""
     cancelled: float = 0.5

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.data.audit.finding import Finding
-from torchrl_h2o.data.audit.log import Pair
 from torchrl_h2o.data.audit.regression import robust_fit
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.settings import AuditSettings
@@ -23,98 +22,137 @@ _PARTS = 3  # of the log, in all of which a shift must explain the force: a sens
 def check_undriven_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
     """Shifted zeros of angles whose joint no actuator moves.
 
-    Whatever the simulator lacks at the other joints, the measured motion of all of them needs no force at this one but
-    friction. So friction of a cart does not hide that the angle of its pole is counted from elsewhere.
+    Whatever the simulator lacks at the other joints, the measured motion of all of them shows which force is missing at
+    this one. So friction of a cart does not hide that the angle of its pole is counted from elsewhere. Dry and viscous
+    friction are fitted beside the shifts, of all such joints together. A constant force and a spring must not explain
+    the force as well as a shift does.
 
     Args:
         response: simulated windows.
         settings: thresholds.
+
+    Returns:
+        A warning for each such angle; severe beyond a quarter of a turn, which no load explains.
     """
-    if response.simulation.state_map.hidden or len(response.moving) < 2:
-        return []
     from torchrl_h2o.effects.selection import driven_dofs
 
-    driven = driven_dofs(response.simulation.model)
-    try:
-        found = [
-            _finding(response, index, settings)
-            for index, pair in enumerate(response.log.pairs)
-            if pair.angle and pair.dof not in driven
-        ]
-    except np.linalg.LinAlgError:  # a joint that no force moves
+    pairs, model = response.log.pairs, response.simulation.model
+    if response.simulation.state_map.hidden or len(pairs) != model.nv:
         return []
-    return [finding for finding in found if finding is not None]
+    driven = driven_dofs(model)
+    free = [index for index, pair in enumerate(pairs) if pair.angle and pair.dof not in driven]
+    return _Undriven(response, free, settings).findings() if free else []
 
 
-def _finding(response: Response, index: int, settings: AuditSettings) -> Finding | None:
-    pair, friction = response.log.pairs[index], _friction(response, index)
+class _Undriven:
+    """The forces that are missing at joints without actuators.
 
-    def left_at(shift: float) -> np.ndarray:
-        return _left(_shifted(response, pair, shift), index, friction, settings)
+    Args:
+        response: simulated windows.
+        free: indices of the pairs of these joints, K of them.
+        settings: thresholds.
+    """
 
-    total, error = min(_STARTS, key=lambda shift: np.nanmedian(left_at(shift))), np.inf
-    for _ in range(_ROUNDS):
-        shift, error = _shift(_shifted(response, pair, total), index, settings)
-        total += shift
-        if not np.isfinite(error) or abs(shift) > _STEP:
-            return None
-    total = float(np.angle(np.exp(1j * total)))
-    if abs(total) < max(settings.zero_warning, settings.significance * error):
-        return None
-    plain, left = left_at(0.0), left_at(total)
-    for part in np.array_split(np.arange(len(plain)), _PARTS):
-        if not np.nanmedian(left[part]) < settings.force_left * np.nanmedian(plain[part]):
-            return None
-    constant = np.nanmedian(_left(response, index, np.column_stack([friction, np.ones(len(friction))]), settings))
-    remains = float(np.nanmedian(left))
-    if remains > constant:
-        return None
-    share = percent(remains / float(np.nanmedian(plain)))
-    words = f"no actuator moves {pair.name}, and beside friction, {share} of the force that the simulator lacks there "
-    words += (
-        f"remains if the zero of {pair.name} is shifted by {-total:.2f} rad: an offset, a tilted model, or a centre "
-    )
-    words += "of mass beside the joint's axis"
-    words += "; or a constant force there" if remains > settings.zero_better * constant else ""
-    severity = "severe" if abs(total) >= settings.zero_severe else "warning"
-    remedy = f"measure the angle's zero, for example at rest; offset: {total:.3g} in its column corrects it"
-    return Finding(CHECK, severity, words, None, remedy)
+    def __init__(self, response: Response, free: list[int], settings: AuditSettings):
+        self.response, self.free, self.settings = response, free, settings
+        velocity = (response.before + 0.5 * response.change)[:, free]
+        self.friction = np.stack([velocity, np.sign(velocity)], -1)  # (W, K, 2)
+        positions = [response.log.pairs[index].coordinate for index in free]
+        self.position = response.states[:, positions]  # (W, K)
+        self.usual = _usual(self._missing(np.zeros(len(free))))
 
+    def findings(self) -> list[Finding]:
+        shifts, errors = self._shifts()
+        if shifts is None:
+            return []
+        nothing, settings = np.zeros(len(self.free)), self.settings
+        plain, left = self._left(nothing), self._left(shifts)
+        line = np.stack([np.ones_like(self.position), self.position], -1)
+        rival = np.nanmedian(self._left(nothing, np.concatenate([self.friction, line], -1)), axis=0)
+        found = []
+        for place, index in enumerate(self.free):
+            shift, remains = float(shifts[place]), float(np.nanmedian(left[:, place]))
+            if abs(shift) < max(settings.zero_warning, settings.significance * errors[place]) or remains > rival[place]:
+                continue
+            if self._lowers(plain[:, place], left[:, place]):
+                share = percent(remains / float(np.nanmedian(plain[:, place])))
+                either = remains > settings.zero_better * rival[place]
+                found.append(self._finding(self.response.log.pairs[index].name, shift, share, either))
+        return found
 
-def _shifted(response: Response, pair: Pair, shift: float) -> Response:
-    states = response.states.copy()
-    states[:, pair.coordinate] += shift
-    return replace(response, states=states)
+    def _finding(self, name: str, shift: float, share: str, either: bool) -> Finding:
+        words = f"no actuator moves {name}, and beside friction, {share} of the force that the simulator lacks there "
+        words += (
+            f"remains if the zero of {name} is shifted by {-shift:.2f} rad: an offset, a tilted model, or a centre "
+        )
+        words += f"of mass beside the joint's axis{'; or a constant force or a spring there' if either else ''}"
+        severity = "severe" if abs(shift) > 0.5 * np.pi else "warning"
+        remedy = f"measure the angle's zero, for example at rest; if it is wrong, add offset: {shift:.3g} to its column"
+        return Finding(CHECK, severity, words, None, remedy)
 
+    def _lowers(self, plain: np.ndarray, left: np.ndarray) -> bool:
+        """Whether a shift lowers the missing force (W,) of its joint in all parts of the log."""
+        parts = np.array_split(np.arange(len(plain)), _PARTS)
+        return all(np.nanmedian(left[p]) < self.settings.force_left * np.nanmedian(plain[p]) for p in parts)
 
-def _missing(response: Response) -> np.ndarray:
-    """Constant forces at all pairs with which each window of the simulation ends as measured, (W, pairs)."""
-    error = response.change - response.simulated_with(response.limited[response.rows])
-    return np.linalg.solve(response.by_force, error[..., None])[..., 0]
+    def _shifts(self) -> tuple[np.ndarray | None, np.ndarray]:
+        """Shifts, (K,), that lower the missing forces most, and their standard errors; None if there are none."""
+        nothing = together = np.zeros(len(self.free))
+        starts = [nothing]
+        for each in np.eye(len(self.free)):
+            starts.append(min((start * each for start in _STARTS), key=self._size))
+            together = min((together + start * each for start in _STARTS), key=self._size)
+        found = [self._from(start) for start in (*starts, together)]
+        converged = [(shifts, errors) for shifts, errors in found if shifts is not None]
+        return min(converged, key=lambda one: self._size(one[0]), default=(None, nothing))
 
+    def _from(self, shifts: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+        """The shifts that Newton's method reaches, and their standard errors; None if it does not settle nearby."""
+        errors = np.zeros(len(self.free))
+        for _ in range(_ROUNDS):
+            change, errors = self._newton(shifts)
+            shifts = shifts + change
+            if not np.isfinite(errors).all() or (np.abs(change) > _STEP).any():
+                return None, errors
+        return np.angle(np.exp(1j * shifts)), errors
 
-def _friction(response: Response, index: int) -> np.ndarray:
-    """What friction adds to the missing force of a joint, (W, 2): its velocity and the sign of it."""
-    velocity = response.before[:, index] + 0.5 * response.change[:, index]
-    return np.stack([velocity, np.sign(velocity)], -1)
+    def _size(self, shifts: np.ndarray) -> float:
+        """What is missing with shifts, in the usual sizes of what is missing without."""
+        return float((np.nanmedian(self._left(shifts), axis=0) / self.usual).sum())
 
+    def _newton(self, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Change of the shifts by one fit of the missing forces, beside friction, and its standard errors, (K,)."""
+        count, step = len(self.free), self.settings.zero_nudge
+        missing = self._missing(shifts)
+        moved = np.stack([self._missing(shifts + step * each) for each in np.eye(count)], -1)
+        explained = np.concatenate([-(moved - missing[..., None]) / step, self._own(self.friction)], -1)
+        found = robust_fit(missing, explained, _usual(missing), self.settings.robust)
+        return found.values[:count], found.errors[:count]
 
-def _shift(response: Response, index: int, settings: AuditSettings) -> tuple[float, float]:
-    """The shift of an angle that lowers the missing force of its joint most, and its standard error, in rad."""
-    pair, size = response.log.pairs[index], settings.zero_nudge
-    missing = _missing(response)[:, index]
-    change = (_missing(_shifted(response, pair, size))[:, index] - missing) / size
-    explained = np.column_stack([-change, _friction(response, index)])
-    found = robust_fit(missing[:, None], explained[:, None], _usual(missing), settings.robust)
-    return float(found.values[0]), float(found.errors[0])
+    def _left(self, shifts: np.ndarray, explained: np.ndarray | None = None) -> np.ndarray:
+        """Sizes of the missing forces, (W, K), beside what explains each of them, (W, K, P), by default friction."""
+        missing, own = self._missing(shifts), self._own(self.friction if explained is None else explained)
+        found = robust_fit(missing, own, _usual(missing), self.settings.robust)
+        return np.abs(missing - own @ found.values)
 
+    @staticmethod
+    def _own(explained: np.ndarray) -> np.ndarray:
+        """Columns that explain each force alone, (W, K, P), as columns of a fit of all, (W, K, K P)."""
+        count = explained.shape[1]
+        own = explained[:, :, None, :] * np.eye(count)[:, :, None]
+        return own.reshape(len(explained), count, -1)
 
-def _left(response: Response, index: int, explained: np.ndarray, settings: AuditSettings) -> np.ndarray:
-    """Size of the force that is missing at a joint beside a fit of what is explained, (W, P), in each window, (W,)."""
-    missing = _missing(response)[:, index]
-    found = robust_fit(missing[:, None], explained[:, None], _usual(missing), settings.robust)
-    return np.abs(missing - explained @ found.values)
+    def _missing(self, shifts: np.ndarray) -> np.ndarray:
+        """Constant forces with which each window ends as measured, at the joints without actuators, (W, K)."""
+        states = self.response.states.copy()
+        states[:, [self.response.log.pairs[index].coordinate for index in self.free]] += shifts
+        shifted = replace(self.response, states=states)
+        error = shifted.change - shifted.simulated_with(shifted.limited[shifted.rows])
+        by_force, missing = shifted.by_force, np.full(error.shape, np.nan)
+        known = np.isfinite(error).all(1) & np.isfinite(by_force).all((1, 2))
+        missing[known] = (np.linalg.pinv(by_force[known]) @ error[known, :, None])[..., 0]
+        return missing[:, self.free]
 
 
 def _usual(force: np.ndarray) -> np.ndarray:
-    return np.array([max(float(np.nanmedian(np.abs(force))), 1e-12)])
+    return np.maximum(np.nanmedian(np.abs(force), axis=0), 1e-12)

@@ -4,45 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchrl_h2o.effects import ActionGain, BodyMass, Effect
-from torchrl_h2o.effects.effect import NO_NAMES, EntryNames
+import mujoco
+
+from torchrl_h2o.effects import ActionGain, BodyMass, Effect, selection
 from torchrl_h2o.residuals.judge.settings import VerdictSettings
 from torchrl_h2o.residuals.report.words import effect_words, number
 from torchrl_h2o.residuals.settings import DEFAULTS
+from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
 def only_ratios(
-    effects: Sequence[Effect], names: EntryNames = NO_NAMES, rules: VerdictSettings = DEFAULTS.verdict
+    simulation: Simulation, effects: Sequence[Effect], rules: VerdictSettings = DEFAULTS.verdict
 ) -> tuple[str, ...]:
     """Says of a mass or a motor gain far from the model's that the same motion has another explanation.
 
-    If all masses, rotors, springs, friction and motor forces of a robot are multiplied by one factor, it moves as
-    before. So a pole with a fifth of its mass moves as the same pole on a cart that is five times as heavy, with five
-    times the friction and a motor that is five times as strong. A guessed motor constant has this effect.
+    If all masses and all forces of a robot are multiplied by one factor, it moves as before. So a pole with a fifth of
+    its mass moves as the same pole on a cart that is five times as heavy, with five times the friction and a motor that
+    is five times as strong. A guessed motor constant has this effect. Gains of servos and of actuators whose force
+    depends on the motion are left out: they scale a command and not a force.
 
     Args:
+        simulation: the simulator without the effects.
         effects: the effects found.
-        names: names of entries and actuators, as for :meth:`Effect.describe`.
         rules: the factor from which a mass or gain is mentioned.
 
     Returns:
         One sentence on the value that is farthest from the model's, or nothing.
     """
-    far = [
-        effect
-        for effect in effects
-        if isinstance(effect, BodyMass | ActionGain) and effect.scale > 0.0 and _times(effect) >= rules.far_from_model
-    ]
+    model = simulation.model
+    plain = bool((model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE).all())
+    kinds = BodyMass | ActionGain if plain else BodyMass
+    found = [effect for effect in effects if isinstance(effect, kinds) and effect.scale > 0.0]
+    far = [effect for effect in found if _times(effect) >= rules.far_from_model]
     if not far:
         return ()
     one = max(far, key=_times)
-    others = "the other masses, rotors, springs, friction, the motors' forces"
-    weigh = "Weigh the part, if the motors' forces are not measured."
+    masses, others, what = "the other masses", "the motors' forces", "the part"
     if isinstance(one, ActionGain):
-        others, weigh = "masses, rotors, springs, friction, the other motors' forces", "Measure one of them."
+        masses, others, what = "masses", "all other forces", "a part, or measure a force"
+    elif len(selection.body_ids(model, one.bodies)) == model.nbody - 1:
+        masses, what = "", "the robot"
+    rest = ", ".join(filter(None, (masses, "rotors", "springs", "friction", others)))
+    weigh = f"Weigh {what}{'' if isinstance(one, ActionGain) else ', unless the motors are known well'}."
     return (
-        f"The motion shows masses and forces only in proportion: {effect_words(one, names)} moves the robot as "
-        f"everything else × {number(1.0 / one.scale, 3)} would ({others}). {weigh}",
+        "Multiplying all masses and all forces by one factor would not change the motion: "
+        f"{effect_words(one, simulation.names)} could as well be everything else × {number(1.0 / one.scale, 3)} "
+        f"({rest}). {weigh}",
     )
 
 

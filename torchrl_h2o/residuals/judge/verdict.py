@@ -87,7 +87,7 @@ def reach_verdict(
     caveats = (
         *short_delays(effects, measured, simulation.control_step),
         *friction_beside_noise(simulation, mended, effects, rules),
-        *only_ratios(effects, simulation.names, rules),
+        *only_ratios(simulation, effects, rules),
     )
     if raised or (signs and not _leaves_little(mended, measured, error, two_sample, settings)):
         where = where_most(mended, measured, settings)

@@ -10,7 +10,7 @@ Research 5(3), 101-119.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -153,7 +153,7 @@ def _linearised(
 
     def force(at: np.ndarray) -> np.ndarray:
         effects = (_at(entry, share, simulation.model) for entry, share in zip(entries, at, strict=True))
-        left = missing_force(simulation.with_effects(*effects), motion)
+        left = _missing_force_with(simulation, effects, motion)
         if not np.isfinite(left[motion.moving]).all():
             raise ValueError("the missing force is not finite")
         return left
@@ -163,8 +163,7 @@ def _linearised(
     lengths = np.where(outside, -lengths, lengths)
     here = force(shares)
     changes = [(force(shares + step) - here) / length for step, length in zip(np.diag(lengths), lengths, strict=True)]
-    tell = [_telling(simulation.model, entry.effect) for entry in entries]
-    return _Linearised(shares, here, np.stack(changes, axis=-1) * np.stack(tell, axis=-1))
+    return _Linearised(shares, here, np.stack(changes, axis=-1))
 
 
 def _repeated(
@@ -246,23 +245,24 @@ def _change(simulation: Simulation, motion: Motion, missing: np.ndarray, entry: 
         if isinstance(entry.effect, JointFrictionLoss):
             simulation = simulation.with_effects(_heavy_rotor(simulation.model, entry.effect.joints))
             missing = missing_force(simulation, motion)
-        change = missing_force(simulation.with_effects(entry.starts[0]), motion) - missing
+        change = _missing_force_with(simulation, [entry.starts[0]], motion) - missing
     except ValueError:  # a value that the model rejects
         return None
-    change = change * _telling(simulation.model, entry.effect)
     known = change[motion.moving]
     return change if np.isfinite(known).all() and np.abs(known).max() > 0.0 else None
 
 
-def _telling(model: mujoco.MjModel, effect: Effect) -> np.ndarray:
-    """Mask (nv) of the coordinates whose missing force tells the size of an effect.
+def _missing_force_with(simulation: Simulation, effects: Iterable[Effect], motion: Motion) -> np.ndarray:
+    """The missing force with effects, (W, nv), where no actuator acts in units of the inertia that they leave there.
 
-    Where no actuator acts, as at the pole of a cart-pole, all forces are in proportion to the masses, so that noise
-    alone would make the masses as small as allowed.
+    Where no actuator acts, as at the pole of a cart-pole, all forces are in proportion to the masses beyond the joint.
+    Without masses none would be missing, so that noise alone would make them as small as allowed.
     """
-    if not isinstance(effect, BodyMass):
-        return np.ones(model.nv)
-    return np.isin(np.arange(model.nv), list(selection.driven_dofs(model))).astype(float)
+    changed = simulation.with_effects(*effects)
+    before, after = (which.dof_M0 - which.dof_armature for which in (simulation.model, changed.model))
+    driven = np.isin(np.arange(simulation.model.nv), list(selection.driven_dofs(simulation.model)))
+    known = ~driven & (before > 0.0) & (after > 0.0)
+    return missing_force(changed, motion) * np.where(known, before / np.where(known, after, 1.0), 1.0)
 
 
 def _heavy_rotor(model: mujoco.MjModel, joints: selection.Names) -> Armature:

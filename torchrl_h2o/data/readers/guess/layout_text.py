@@ -20,6 +20,7 @@ from torchrl_h2o.data.readers.guess.roles import (
     Guess,
     guess_columns,
     is_force,
+    kind_of_joint,
     may_be_command,
     slope_of,
     without_unit,
@@ -32,6 +33,8 @@ from torchrl_h2o.data.readers.units import to_si
 JUMP = 0.5  # share of the median step by which a step must differ for the run to end there
 UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the steps differ from the median by this share
 
+_SURPLUS = "a position beyond the model's joints"
+_PERHAPS = "perhaps an action"
 _RELATED = 0.5  # correlation of both below which the column is not that velocity
 
 
@@ -134,30 +137,40 @@ def _servo_commands(columns: Sequence[Guess]) -> list[Guess]:
 
 
 def _without_surplus(columns: Sequence[Guess], of_body: Mapping[str, str], model: Coordinates) -> list[Guess]:
-    """More positions than joints: if as many have a velocity as there are joints, the others are not recognised."""
+    """More positions than joints: if as many have a velocity as there are joints, the others are left out.
+
+    Nothing is changed if one of the others has the name of a joint.
+    """
     followed = set(_pairs(columns, of_body).values())
     joints = [name for name in model.units if not name.endswith("_velocity") and name not in of_body.values()]
-    known = {name.lower() for name in model.units}
     positions = [one for one in columns if one.kind == "position" and one.name not in of_body]
-    if len(positions) <= len(joints) or len(followed) != len(joints):
+    surplus = [one for one in positions if one.name not in followed]
+    named = any(joint.lower() in one.name.lower() for joint in joints for one in surplus)
+    if named or len(positions) <= len(joints) or len(followed) != len(joints):
         return list(columns)
-    surplus = [one for one in positions if one.name not in followed and one.name.lower() not in known]
-    return [replace(one, kind="unknown", note="") if one in surplus else one for one in columns]
+    return [replace(one, kind="unknown", unit="1", note=_SURPLUS) if one in surplus else one for one in columns]
 
 
 def _actions_left(columns: Sequence[Guess], contents: Contents, number: int) -> list[Guess]:
-    """The columns that nothing recognised as actions, if there are as many as actuators and no other actions."""
+    """The columns that nothing recognised as actions, if there are as many as actuators and no other actions.
+
+    Positions beyond the model's joints count only if no other column is left, and if their names tell no angle or
+    length: Q may be a command.
+    """
     values = contents.values
     left = [column for column in columns if column.kind == "unknown" and not column.note]
     surely = {_family(column) for column in left if may_be_command(column.name, np.asarray(values[column.name]))}
     left = [column for column in left if _family(column) in surely]
-    if not left or any(column.kind == "action" for column in columns):
+    surplus = [column for column in columns if column.note == _SURPLUS and kind_of_joint(column.name) is None]
+    if any(column.kind == "action" for column in columns) or not number or not (left or surplus):
         return list(columns)
-    if len(left) != number:
-        note = f"perhaps an action: the model has {number}, and {len(left)} columns are left"
-        return [replace(column, note=note) if column in left and number else column for column in columns]
-    note = "not recognised, but as many columns as the model has actuators are left: check role and unit"
-    return [replace(column, kind="action", note=note) if column in left else column for column in columns]
+    chosen = left if len(left) == number else surplus if not left and len(surplus) == number else []
+    if chosen:
+        note = "not recognised, but as many columns as the model has actuators are left: check role and unit"
+        return [replace(column, kind="action", note=note) if column in chosen else column for column in columns]
+    maybe = [*left, *surplus]
+    note = f"{_PERHAPS}: actuators in the model: {number}, columns that are left: {len(maybe)}"
+    return [replace(column, note=note) if column in maybe else column for column in columns]
 
 
 def _family(column: Guess) -> str:
@@ -232,7 +245,9 @@ def _text(path: str | Path, contents: Contents, columns: Sequence[Guess], pairs:
     if "time" not in kinds:
         lines.append(_step(columns, contents, pairs))
     if "action" not in kinds:
-        lines.append("free_motion: true  # no column of actions was found: remove this line if there is one")
+        perhaps = any(column.note.startswith(_PERHAPS) for column in columns)
+        which = f"; see those marked '{_PERHAPS}'" if perhaps else ""
+        lines.append(f"free_motion: true  # no column of actions was found{which}: remove this line if there is one")
     lines += _clock(time_of(contents))
     lines.append("columns:")
     for column in columns:
