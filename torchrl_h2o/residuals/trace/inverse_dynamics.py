@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from scipy.optimize import lsq_linear
 from scipy.stats import t as student_t
 
 from torchrl_h2o.effects import (
@@ -35,6 +34,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.families import elements
+from torchrl_h2o.residuals.trace.force_regression import ForceRegression, robust_losses, usual_size
 from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 
 #: the properties of links and joints that are identified; the gain of a motor is not among them, because with a gain of
@@ -177,12 +177,12 @@ def _repeated(
 ) -> _Linearised:
     """Regressions, each around the values of the one before, until no less force is missing or no value changes."""
     at = _linearised(simulation, motion, entries, shares, bounds)
-    scale = _usual(at.missing)
+    scale = usual_size(at.missing)
     for _ in range(settings.rounds):
         advance()
-        moved_by = _Regression.fit(at.missing, at.changes, bounds - at.shares).shares
+        moved_by = ForceRegression.fit(at.missing, at.changes, bounds - at.shares).shares
         moved = _linearised(simulation, motion, entries, at.shares + moved_by, bounds)
-        if np.nanmean(_losses(moved.missing, scale)) >= np.nanmean(_losses(at.missing, scale)):
+        if np.nanmean(robust_losses(moved.missing, scale)) >= np.nanmean(robust_losses(at.missing, scale)):
             break
         at = moved
         if (np.abs(moved_by) <= settings.same_value * np.abs(at.shares)).all():
@@ -208,7 +208,7 @@ def _sure(
         out = kept[doubt.argmax()]
         kept, missing = np.delete(kept, doubt.argmax()), missing - shares[out] * at.changes[..., out]
         if len(kept):
-            moved_by = _Regression.fit(missing, at.changes[..., kept], bounds[:, kept] - shares[kept]).shares
+            moved_by = ForceRegression.fit(missing, at.changes[..., kept], bounds[:, kept] - shares[kept]).shares
             shares[kept] += moved_by
             missing = missing + at.changes[..., kept] @ moved_by
     return kept, np.zeros(0)
@@ -219,7 +219,7 @@ def _half_widths(missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, b
     parts = np.array_split(np.arange(len(missing)), blocks)
     left_out = np.array(
         [
-            _Regression.fit(np.delete(missing, part, 0), np.delete(changes, part, 0), bounds).shares
+            ForceRegression.fit(np.delete(missing, part, 0), np.delete(changes, part, 0), bounds).shares
             for part in parts
             if len(part)
         ]
@@ -286,11 +286,11 @@ def _needed(
         settings: how much more than the whole set a smaller one may leave.
     """
     kept = np.arange(changes.shape[-1])
-    whole = found = _Regression.fit(missing, changes, bounds)
+    whole = found = ForceRegression.fit(missing, changes, bounds)
     least = whole.losses(whole.scale)
     while len(kept):
         fewer = np.delete(kept, found.least_needed)
-        smaller = _Regression.fit(missing, changes[..., fewer], bounds[:, fewer])
+        smaller = ForceRegression.fit(missing, changes[..., fewer], bounds[:, fewer])
         losses = smaller.losses(whole.scale)
         one_is_worse = (losses > settings.more_left_of_one * least).any()
         if one_is_worse or np.nanmean(losses) > settings.more_left * np.nanmean(least):
@@ -299,63 +299,6 @@ def _needed(
     shares = np.zeros(changes.shape[-1])
     shares[kept] = found.shares
     return shares
-
-
-@dataclass(frozen=True, eq=False)
-class _Regression:
-    """A robust regression of forces.
-
-    Args:
-        shares: coefficients, (P).
-        left: (W, nv), forces that are left.
-        scale: (nv), usual size of what is left.
-        least_needed: index of the coefficient without which the weighted square of what is left rises least; 0 if there
-            is no coefficient.
-    """
-
-    shares: np.ndarray
-    left: np.ndarray
-    scale: np.ndarray
-    least_needed: int
-
-    @classmethod
-    def fit(cls, missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, rounds: int = 6) -> _Regression:
-        """Least squares with weights for the usual size of each force, and less weight for unusually large ones."""
-        left, shares, cost = missing, np.zeros(0), np.zeros(1)
-        for _ in range(rounds if changes.shape[-1] else 0):
-            scale = _usual(left)
-            root = 1.0 / (scale * np.sqrt(np.maximum(1.0, np.abs(left / scale) / 2.0)))
-            known = np.isfinite(missing)
-            shares, cost = _least_squares((missing * root)[known], (changes * root[..., None])[known], bounds)
-            left = missing + changes @ shares
-        return cls(shares, left, _usual(left), int(cost.argmin()))
-
-    def losses(self, scale: np.ndarray) -> np.ndarray:
-        """Mean robust loss of what is left of each force, (nv), in units of ``scale``."""
-        return _losses(self.left, scale)
-
-
-def _losses(force: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Mean robust loss of each force, (nv), in units of ``scale``."""
-    return np.nanmean(np.log1p((force / scale) ** 2), axis=0)
-
-
-def _least_squares(y: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounded shares, (P), that minimise the square of ``y``, (N), plus the changes, (N, P).
-
-    Also returns the rise of the square without each of them, (P).
-    """
-    x = changes
-    size = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
-    inner = (x / size).T @ (x / size) + 1e-9 * np.eye(len(size))
-    factor = np.linalg.cholesky(inner)
-    towards = np.linalg.solve(factor, -(x / size).T @ y)
-    scaled = lsq_linear(factor.T, towards, bounds * size, method="bvls").x
-    return scaled / size, scaled**2 / np.diag(np.linalg.inv(inner))
-
-
-def _usual(force: np.ndarray) -> np.ndarray:
-    return 1.4826 * np.nanmedian(np.abs(force), axis=0) + 1e-12
 
 
 def _scaled(entry: CatalogueEntry) -> tuple[str, ...]:
