@@ -365,3 +365,17 @@ def test_masses_are_found_with_one_motor(without, moved, body, scale):
     found = {type(effect): effect for effect in propose_effects(simulation, measured, simulation.catalogue()).effects}
     assert found.keys() == {BodyMass, JointDamping}
     assert (found[BodyMass].bodies, found[BodyMass].scale) == (body, pytest.approx(scale, rel=0.02))
+
+
+@pytest.mark.parametrize(("true", "kind"), [(Payload(0.4, bodies="cart"), Armature), (BodyMass(0.5, "cart"), BodyMass)])
+def test_of_effects_that_are_the_same_the_simplest_is_proposed(true, kind):
+    """On a rail, a rotor, the cart's mass and a payload are the same, but a rotor cannot take mass away."""
+    xml = """
+    <mujoco><option timestep="0.005"/><worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0"/>
+    <geom size="0.1" mass="0.8"/></body></worldbody><actuator><motor joint="rail"/></actuator></mujoco>
+    """
+    state_map = StateMap.of_coordinates(("rail", "rail_velocity"), ("m", "m/s"), (0, 1), num_states=2)
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(xml), state_map=state_map)
+    measured = recorded(simulation.with_effects(true, JointDamping(0.3, "rail")), 2000, noise=0.001)
+    found = propose_effects(simulation, measured, simulation.catalogue()).effects
+    assert {type(effect) for effect in found} == {kind, JointDamping}

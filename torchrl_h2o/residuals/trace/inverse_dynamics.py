@@ -42,6 +42,7 @@ from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 PROPOSED = (JointFrictionLoss, JointDamping, JointSpring, JointForce, Armature, BodyMass, Payload)
 
 _HEAVY = 1e3  # inertia of a rotor beside which friction is dry, in inertias of its joint
+_ALIKE = 1.0 - 1e-9  # cosine of two changes of the force from which they are the same
 _NO_SHARE = 1e-6  # share of a trial below which an effect is none
 
 
@@ -99,7 +100,7 @@ def propose_effects(
     if not entries:
         return Proposal()
     bounds, changes = np.array([_bounds(entry, simulation.model) for entry in entries]).T, np.stack(columns, axis=-1)
-    shares = _needed(missing, changes, bounds, settings)
+    shares = _simplest(_needed(missing, changes, bounds, settings), changes, bounds, entries)
     kept = np.flatnonzero(shares)
     while len(kept):
         chosen = [entries[index] for index in kept]
@@ -298,6 +299,27 @@ def _needed(
         kept, found = fewer, smaller
     shares = np.zeros(changes.shape[-1])
     shares[kept] = found.shares
+    return shares
+
+
+def _simplest(
+    shares: np.ndarray, changes: np.ndarray, bounds: np.ndarray, entries: Sequence[CatalogueEntry]
+) -> np.ndarray:
+    """The shares, (P), with effects that change the force alike replaced by the first of them in ``PROPOSED``.
+
+    On a rail, a rotor, the mass of the cart and a payload are the same; then rounding would choose one of them.
+    """
+    shares, columns = shares.copy(), np.nan_to_num(changes.reshape(-1, changes.shape[-1]))
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    order = sorted(range(len(entries)), key=lambda index: PROPOSED.index(type(entries[index].effect)))
+    for index in np.flatnonzero(shares):
+        for simpler in order[: order.index(index)]:
+            along = columns[:, index] @ columns[:, simpler]
+            instead = shares[index] * along / size[simpler] ** 2
+            alike = abs(along) > _ALIKE * size[index] * size[simpler]
+            if alike and shares[simpler] == 0.0 and bounds[0, simpler] <= instead <= bounds[1, simpler]:
+                shares[index], shares[simpler] = 0.0, instead
+                break
     return shares
 
 
