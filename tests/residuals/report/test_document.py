@@ -13,6 +13,7 @@ from torchrl.envs import GymEnv, TransformedEnv
 
 from tests.residuals.report.made_up_reports import DATA, full_report, no_conclusion, nothing_missing, trace, windowed
 from torchrl_h2o.data import DataError
+from torchrl_h2o.data.audit import Audit, Finding
 from torchrl_h2o.effects import (
     ActionBias,
     ActionGain,
@@ -147,6 +148,22 @@ def test_the_sentence_says_what_a_search_whose_time_was_up_has_not_done(stage, w
     assert ("its time was up while" in report.why_not_recommended()) is (stage == OTHERS)
     assert Report.load(report.save(tmp_path)).ended_in == stage
     assert words in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("severity", "check", "words"),
+    [
+        ("severe", "time", "Do not rely on this: the data are faulty (the zero is off)."),
+        ("warning", "model", "Check this first, because the effects found may stand for it: the zero is off."),
+        ("warning", "rows", ""),
+        ("note", "model", ""),
+    ],
+)
+def test_the_sentence_says_what_the_audit_found_wrong(severity, check, words):
+    report = dataclasses.replace(full_report(), audit=Audit((Finding(check, severity, "the zero is off"),)))
+    assert report.sentence() == " ".join([full_report().sentence(), words]).rstrip()
+    nothing = dataclasses.replace(report, found=(), indistinguishable=())
+    assert ("Check this first" in nothing.sentence()) is False
 
 
 def test_an_error_that_is_not_known_is_left_out_of_the_sentence():

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import takewhile
 
+from torchrl_h2o.data.audit.model import CHECK as MODEL_CHECK
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.effects.effect import EntryNames
 from torchrl_h2o.residuals.progress import FORCES, NOISE
@@ -43,13 +44,17 @@ def sentences(report: ReportContents) -> list[str]:
     Returns:
         The result; whether the time for the search was up before its end; other effects that these data cannot rule
         out; effects that may have another cause or value; what the effects found do not explain; where nothing is
-        missing, effects that the data could not have shown; and severe faults of the data. Those that do not apply are
-        left out.
+        missing, effects that the data could not have shown; and severe faults of the data, or warnings that the data do
+        not fit the model. Those that do not apply are left out.
     """
     words = _verdict_words(report)
     if report.audit is not None and report.audit.severe:
         faults = "; ".join(finding.words for finding in report.audit.severe)
         words.append(f"Do not rely on this: the data are faulty ({faults}).")
+    elif report.audit is not None and report.found:
+        doubts = "; ".join(finding.words for finding in report.audit.warnings if finding.check == MODEL_CHECK)
+        if doubts:
+            words.append(f"Check this first, because the effects found may stand for it: {doubts}.")
     return words
 
 
