@@ -312,7 +312,7 @@ def _simplest(
     shares, columns = shares.copy(), np.nan_to_num(changes.reshape(-1, changes.shape[-1]))
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     order = sorted(range(len(entries)), key=lambda index: PROPOSED.index(type(entries[index].effect)))
-    for index in np.flatnonzero(shares):
+    for index in np.flatnonzero(shares).tolist():
         for simpler in order[: order.index(index)]:
             along = columns[:, index] @ columns[:, simpler]
             instead = shares[index] * along / size[simpler] ** 2
