@@ -30,7 +30,18 @@ def test_one_command_leaves_everything_that_a_user_looks_at(command, tmp_path):
     assert summary["updates"] == 60
     assert summary["env"] == "wheel_legged"
     assert summary["return_real"].keys() >= {"mean", "std", "episodes"}
-    told = {"gap", "data", "backbone", "mixing", "seed", "return_sim", "updates_per_second", "wall_s", "versions"}
+    told = {
+        "gap",
+        "data",
+        "backbone",
+        "mixing",
+        "seed",
+        "return_sim",
+        "updates_per_second",
+        "wall_s",
+        "versions",
+        "commit",
+    }
     assert told <= set(summary)
     assert {row["method"] for row in rows(out)} == {"H2O+"}
     assert (out / "learning_curve.png").stat().st_size > 10_000

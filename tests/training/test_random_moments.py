@@ -16,7 +16,7 @@ from torchrl_h2o.training.run_folder import claimed, resumable
 
 MOMENTS = 20
 FORK = multiprocessing.get_context("fork")  # the packages are imported once, so a run takes seconds
-UNEQUAL = {"wall_s", "updates_per_second", "versions"}  # times, and the state of the repository
+UNEQUAL = {"wall_s", "updates_per_second", "cpu_s", "dirty"}  # times, and the state of the repository
 
 
 def run_once(cfg, folder):

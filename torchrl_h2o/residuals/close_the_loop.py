@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.provenance import cpu_seconds, provenance
 from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report, unfinished_report
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
 from torchrl_h2o.residuals.explanation import Explanation
@@ -87,7 +88,7 @@ def close_the_loop(
         >>> [effect.describe() for effect in report.effects]
         ['gravity × 0.5']
     """
-    start = time.perf_counter()
+    start, cpu_start = time.perf_counter(), cpu_seconds()
     simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
     measured = read_measured(data, simulation, source, held_out, settings)
     if (reason := why_no_conclusion(simulation, measured)) is not None:
@@ -111,7 +112,8 @@ def close_the_loop(
         judgement = judge(evidence, explanation, entries, seed=seed, advance=one_more, settings=settings)
         bar.finish()
         wall_s = time.perf_counter() - start
-        return compose_report(evidence, explanation, judgement, wall_s=wall_s, settings=settings)
+        made_by = provenance(cpu_start)
+        return compose_report(evidence, explanation, judgement, wall_s=wall_s, made_by=made_by, settings=settings)
 
 
 def read_measured(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import Effect
@@ -34,6 +36,7 @@ def compose_report(
     judgement: Judgement,
     *,
     wall_s: float | None = None,
+    made_by: Mapping[str, Any] | None = None,
     settings: LoopSettings = DEFAULTS,
 ) -> Report:
     """Composes the report.
@@ -43,6 +46,7 @@ def compose_report(
         explanation: the effects.
         judgement: held-out errors and tests of these effects.
         wall_s: duration of the whole run, in s.
+        made_by: see :func:`~torchrl_h2o.provenance.provenance`.
         settings: thresholds, for the description of the stop test.
     """
     simulation, measured = evidence.simulation, judgement.measured
@@ -78,6 +82,7 @@ def compose_report(
         unexplained_intervals=_intervals(judgement),
         stop_test=stop_test(settings),
         wall_s=wall_s,
+        made_by=made_by or {},
         windows=judgement.windows,
         runs=judgement.runs,
         trace=judgement.trace,

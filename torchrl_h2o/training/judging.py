@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterable, Mapping
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
-import torchrl_h2o
+from torchrl_h2o.provenance import provenance
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
 from torchrl_h2o.training.mending import lines_of_mending, summary_of_mending
 from torchrl_h2o.training.preprocessing import Preprocessing
@@ -27,7 +25,6 @@ from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
 from torchrl_h2o.whole_file import write_text
 
-PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 DATA = "the data's behaviour"
 
 
@@ -132,35 +129,9 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
 
 
 def write_summary(directory: Path, summary: dict) -> None:
-    """Writes summary.json, and adds the result of ``mend``, the versions of the packages and the command."""
-    summary = (
-        summary
-        | summary_of_mending(directory)
-        | {
-            "versions": _versions() | _commit(),
-            "command": shlex.join(["python", *sys.argv]),
-        }
-    )
+    """Writes summary.json, and adds the result of ``mend``, what produced it, and the command."""
+    summary = summary | summary_of_mending(directory) | provenance() | {"command": shlex.join(["python", *sys.argv])}
     write_text(directory / "summary.json", json.dumps(summary, indent=2) + "\n")
-
-
-def _versions() -> dict[str, str]:
-    own = {"python": sys.version.split()[0], "torchrl_h2o": torchrl_h2o.__version__}  # it need not be installed
-    return own | {name: version(name) for name in PACKAGES}
-
-
-def _commit() -> dict[str, str]:
-    """Commit of the library, if it runs from its repository, marked -dirty if files outside recipes/results changed."""
-    git, own = ["git", "-C", str(Path(__file__).parent)], Path(__file__).name
-    told: dict[str, Any] = {"capture_output": True, "text": True, "check": True}
-    try:  # an installed library may be inside a repository of the user, which does not track it
-        subprocess.run([*git, "ls-files", "--error-unmatch", own], **told)
-        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], **told)
-    except (OSError, subprocess.CalledProcessError):
-        return {}
-    unchanged = [*git, "diff", "--quiet", "HEAD", "--", ":/", ":(exclude,top)recipes/results"]
-    dirty = "-dirty" * (subprocess.run(unchanged, check=False).returncode != 0)
-    return {"commit": commit.stdout.strip() + dirty}
 
 
 def table_of_run(

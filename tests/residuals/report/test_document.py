@@ -205,7 +205,7 @@ def test_the_file_holds_what_a_reader_of_it_looks_for():
     entries = full_report().to_json()
     assert set(entries) == {
         *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "two_sample"),
-        *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "trace"),
+        *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "made_by", "trace"),
         *("windows", "runs", "mended_model", "verdict", "failures", "unfinished", "ended_in", "audit", "others"),
     }
     assert {"name", "declared", "parameters", "error_after"} <= set(entries["effects"][0])

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import Effect
@@ -229,6 +230,7 @@ class ReportContents:
         unexplained_intervals: intervals that were excluded as disturbed.
         stop_test: description of the test by which the search stopped.
         wall_s: duration in s; None if not timed.
+        made_by: commit, versions, CPU seconds and machine, see :func:`~torchrl_h2o.provenance.provenance`.
         conclusion: reason why there is no conclusion; None if effects were found or nothing is missing.
         verdict: what the held-out data say of the explanation; None for an unfinished report, and in files of earlier
             versions.
@@ -256,6 +258,7 @@ class ReportContents:
     unexplained_intervals: tuple[Interval, ...] = ()
     stop_test: str = ""
     wall_s: float | None = None
+    made_by: Mapping[str, Any] = field(default_factory=dict)
     conclusion: str | None = None
     verdict: Verdict | None = None
     failures: tuple[str, ...] = ()

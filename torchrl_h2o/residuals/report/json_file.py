@@ -115,6 +115,7 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "stop_test": report.stop_test,
             "conclusion": report.conclusion,
             "wall_s": report.wall_s,
+            "made_by": report.made_by,
             "windows": [dataclasses.asdict(window) for window in report.windows],
             "runs": [dataclasses.asdict(run) for run in report.runs],
             "mended_model": None if report.mended_model is None else _mended_to_json(report.mended_model),
@@ -150,6 +151,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "stop_test": entries["stop_test"],
         "conclusion": entries["conclusion"],
         "wall_s": entries["wall_s"],
+        "made_by": entries.get("made_by", {}),
         # not in files of earlier versions
         "windows": tuple(_window(entry) for entry in entries.get("windows", ())),
         "runs": tuple(_read(RunError, entry) for entry in entries.get("runs", ())),

@@ -1,7 +1,6 @@
-"""The summary of a run: which version of the library it names."""
+"""What a result says of the code that produced it."""
 
 import importlib.metadata
-import json
 import shutil
 import subprocess
 
@@ -9,7 +8,8 @@ import pytest
 import torch
 
 import torchrl_h2o
-from torchrl_h2o.training import judging
+from torchrl_h2o import provenance as module
+from torchrl_h2o.provenance import provenance
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 
@@ -17,10 +17,10 @@ pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 @pytest.fixture
 def repository(tmp_path, monkeypatch):
     """A repository of the user with one commit, and the library's file in an environment inside it."""
-    installed = tmp_path / "mine" / "env" / "judging.py"
+    installed = tmp_path / "mine" / "env" / "provenance.py"
     installed.parent.mkdir(parents=True)
     installed.write_text("")
-    monkeypatch.setattr(judging, "__file__", str(installed))
+    monkeypatch.setattr(module, "__file__", str(installed))
     for name in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE"):  # set where a hook of git runs the tests
         monkeypatch.delenv(name, raising=False)
 
@@ -36,37 +36,38 @@ def repository(tmp_path, monkeypatch):
     return git
 
 
-def commit_in_summary(folder):
-    judging.write_summary(folder, {})
-    return json.loads((folder / "summary.json").read_text())["versions"].get("commit")
-
-
-def test_the_commit_of_a_repository_that_only_surrounds_the_installed_library_is_not_told(repository, tmp_path):
-    assert commit_in_summary(tmp_path) is None
+def test_the_commit_of_a_repository_that_only_surrounds_the_installed_library_is_not_told(repository):
+    assert provenance()["commit"] is None
 
 
 def test_the_commit_is_that_of_the_repository_the_library_runs_from(repository, tmp_path):
     repository("add", ".")
     repository("commit", "-m", "second")
-    commit = repository("rev-parse", "--short", "HEAD")
-    assert commit_in_summary(tmp_path) == commit
-    (tmp_path / "mine" / "env" / "judging.py").write_text("changed")
-    assert commit_in_summary(tmp_path) == f"{commit}-dirty"
+    made_by = provenance()
+    assert made_by["commit"] == repository("rev-parse", "--short", "HEAD")
+    assert made_by["dirty"] is False
+    (tmp_path / "mine" / "env" / "provenance.py").write_text("changed")
+    assert provenance()["dirty"] is True
 
 
 def test_without_git_no_commit_is_told(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert commit_in_summary(tmp_path) is None
+    assert provenance()["commit"] is None
 
 
-def test_a_library_that_runs_from_a_copy_and_is_not_installed_has_a_summary(tmp_path, monkeypatch):
+def test_a_package_that_is_not_installed_has_no_version(monkeypatch):
     def uninstalled(name, version=importlib.metadata.version):
-        if name == "torchrl_h2o":
+        if name == "mujoco":
             raise importlib.metadata.PackageNotFoundError(name)
         return version(name)
 
-    monkeypatch.setattr(judging, "version", uninstalled)
-    judging.write_summary(tmp_path, {})
-    versions = json.loads((tmp_path / "summary.json").read_text())["versions"]
+    monkeypatch.setattr(module, "version", uninstalled)
+    versions = provenance()["versions"]
+    assert "mujoco" not in versions
     assert versions["torchrl_h2o"] == torchrl_h2o.__version__
     assert versions["torch"] == torch.__version__
+
+
+def test_cpu_time_counts_from_where_the_work_began():
+    began = module.cpu_seconds()
+    assert 0.0 <= provenance(began)["cpu_s"] <= provenance()["cpu_s"]
