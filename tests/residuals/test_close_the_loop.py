@@ -18,7 +18,6 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.residuals import LoopSettings, Report, Simulation, Split, close_the_loop, residuals
 from torchrl_h2o.residuals.report.contents import UNDECIDED
-from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -27,7 +26,7 @@ ROWS = 5000
 
 
 # the classifier has its own tests; here it only has to run
-SETTINGS = LoopSettings(judge=JudgeSettings(classifier_updates=20))
+SETTINGS = LoopSettings(classifier_updates=20)
 
 
 def closed(measured, simulation=SIMULATION, catalogue=None, **kwargs):

@@ -95,7 +95,7 @@ def close_the_loop(
         return inconclusive_report(simulation, measured, reason, audit)
     entries = offered_entries(simulation, measured) if catalogue is None else catalogue
     with LoopBar(disable=not progress, minutes=minutes) as bar:
-        evidence = gather_evidence(simulation, measured, settings, audit=audit)
+        evidence = gather_evidence(simulation, measured, audit=audit)
         explanation = explain(
             evidence,
             entries,
@@ -125,8 +125,8 @@ def read_measured(
 ) -> Measured:
     """Measured transitions, checked against the simulation, with the sampling of the settings."""
     if isinstance(data, Measured):
-        return replace(data, settings=settings.measured)
-    return Measured.from_ted(data, simulation, source=source, held_out=held_out, settings=settings.measured)
+        return replace(data, max_windows=settings.max_windows)
+    return Measured.from_ted(data, simulation, source=source, held_out=held_out, max_windows=settings.max_windows)
 
 
 def explain(

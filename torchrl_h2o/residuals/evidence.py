@@ -10,8 +10,9 @@ from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_intervals, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+MAX_DIVERGED = 0.1  # largest share of transitions at which the simulator may diverge in one step, for example at falls
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,7 @@ def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
     if (reason := measured.why_no_conclusion()) is not None:
         return reason
     diverged = ~np.isfinite(residuals(simulation, measured, measured.fitted())).all((1, 2))
-    if diverged.mean() <= measured.settings.max_diverged:
+    if diverged.mean() <= MAX_DIVERGED:
         return None
     return (
         f"the simulator diverges within one step of {diverged.mean():.0%} of the measured states; check its timestep, "
@@ -46,16 +47,13 @@ def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
     )
 
 
-def gather_evidence(
-    simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS, *, audit: Audit | None = None
-) -> Evidence:
+def gather_evidence(simulation: Simulation, measured: Measured, *, audit: Audit | None = None) -> Evidence:
     """Excludes the intervals that may have been disturbed from outside.
 
     Args:
         simulation: the simulator.
         measured: the data.
-        settings: thresholds of a disturbance.
         audit: findings of the audit of the data, for the report.
     """
-    suspected = outside_intervals(simulation, measured, settings=settings.outside)
+    suspected = outside_intervals(simulation, measured)
     return Evidence(simulation, measured, without_intervals(measured, suspected), tuple(suspected), audit)

@@ -1,61 +1,41 @@
-"""The settings of closing the loop: one frozen dataclass of thresholds and budgets for each stage."""
+"""The settings of closing the loop: confidence, horizons and budgets. Other thresholds are constants in the modules."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-from torchrl_h2o.residuals.judge.settings import JudgeSettings, VerdictSettings
-from torchrl_h2o.residuals.measured.settings import MeasuredSettings, OutsideSettings, ResidualSettings
-from torchrl_h2o.residuals.noise.settings import NoiseSettings
-from torchrl_h2o.residuals.trace.settings import (
-    FitSettings,
-    HorizonSettings,
-    InverseDynamicsSettings,
-    LongerWindowsSettings,
-    SignificanceSettings,
-    TraceSettings,
-)
-from torchrl_h2o.residuals.undeclared.settings import RegressionSettings, UndeclaredSettings
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """The settings of :func:`close_the_loop`, stage by stage.
+    """The settings of :func:`close_the_loop`.
 
     Examples:
-        >>> from dataclasses import replace
-        >>> strict = LoopSettings(trace=TraceSettings(min_gain=0.01))
-        >>> replace(strict, judge=JudgeSettings(horizons=(1, 10))).judge.horizons
+        >>> LoopSettings(level=0.001, horizons=(1, 10)).horizons
         (1, 10)
     """
 
-    measured: MeasuredSettings = field(default_factory=MeasuredSettings)
-    """Reading and sampling of the data, states and sensor noise."""
-    outside: OutsideSettings = field(default_factory=OutsideSettings)
-    """Disturbances from outside."""
-    residual: ResidualSettings = field(default_factory=ResidualSettings)
-    """Scaling of residuals, in every fit."""
-    significance: SignificanceSettings = field(default_factory=SignificanceSettings)
-    """Paired tests, in every search."""
-    fit: FitSettings = field(default_factory=FitSettings)
-    """Least-squares fits, in every search."""
-    horizon: HorizonSettings = field(default_factory=HorizonSettings)
-    """Choice of the window length."""
-    trace: TraceSettings = field(default_factory=TraceSettings)
-    """Search over the catalogue."""
-    longer_windows: LongerWindowsSettings = field(default_factory=LongerWindowsSettings)
-    inverse_dynamics: InverseDynamicsSettings = field(default_factory=InverseDynamicsSettings)
-    """Regression of missing forces."""
-    undeclared: UndeclaredSettings = field(default_factory=UndeclaredSettings)
-    """Search for a force outside the catalogue."""
-    regression: RegressionSettings = field(default_factory=RegressionSettings)
-    """Terms of that force."""
-    noise: NoiseSettings = field(default_factory=NoiseSettings)
-    """Action noise."""
-    judge: JudgeSettings = field(default_factory=JudgeSettings)
-    """Held-out errors and the report."""
-    verdict: VerdictSettings = field(default_factory=VerdictSettings)
-    """The verdict."""
+    level: float = 0.01
+    """Significance level of a whole search; a search over a catalogue divides it by the number of entries."""
+    blocks: int = 30
+    """Blocks of neighbouring windows that the paired tests treat as independent."""
+    horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
+    """Control steps ahead at which errors are reported."""
+    window_seconds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+    """Window lengths that the search chooses from, in s, ascending; one control step is always among them."""
+    max_windows: int = 3500
+    """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
+    screened_steps: int = 400
+    """Control steps, over all windows, on which entries of the catalogue are screened."""
+    fitted_steps: int = 1200
+    """Control steps, over all windows, in a fit during the search."""
+    max_evaluations: int = 25
+    """Evaluations of the residual in a full fit, finite differences not counted."""
+    max_effects: int = 6
+    """Largest number of effects in one explanation; the same effect on each of several joints counts as one."""
+    rounds: int = 3
+    """Largest number of rounds of growing and simplifying."""
+    classifier_updates: int = 600
+    """Updates of the discriminators in the two-sample test."""
 
 
 DEFAULTS = LoopSettings()

@@ -6,11 +6,8 @@ import mujoco
 import numpy as np
 
 from tests.residuals.pendulum import XML, double_pendulum, pendulum
-from torchrl_h2o.effects import Armature, Gravity, JointFrictionLoss
 from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
-from torchrl_h2o.residuals.judge.verdict import _raises_its_forces
 from torchrl_h2o.residuals.measured.missing_force import MissingForces
-from torchrl_h2o.residuals.settings import DEFAULTS
 
 
 def test_the_joint_with_the_largest_rise_is_named_with_its_torques():
@@ -29,12 +26,3 @@ def test_a_sliding_joint_has_forces():
 
 def test_nothing_is_said_of_effects_that_lower_the_forces():
     assert needs_more_force(pendulum(), MissingForces(np.array([0.2]), np.array([0.1]))) == ()
-
-
-def test_an_effect_is_judged_by_the_forces_of_its_own_joints():
-    """Right friction of the shoulder must not excuse a rotor at the elbow that raises the force there."""
-    forces, rules = MissingForces(np.array([1.0, 1.0]), np.array([0.1, 1.3])), DEFAULTS.verdict
-    mended = double_pendulum()
-    assert _raises_its_forces(Armature(0.1, "elbow"), mended, forces, rules)
-    assert not _raises_its_forces(JointFrictionLoss(0.1, "shoulder"), mended, forces, rules)
-    assert not _raises_its_forces(Gravity(0.9), mended, forces, rules)

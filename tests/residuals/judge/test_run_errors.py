@@ -8,9 +8,8 @@ import pytest
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals.judge.held_out_error import overall_error
-from torchrl_h2o.residuals.judge.run_errors import run_errors
+from torchrl_h2o.residuals.judge.run_errors import MAX_RUNS, run_errors
 from torchrl_h2o.residuals.measured.transitions import Split
-from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
 REAL = SIMULATION.with_effects(Gravity(1.5))
@@ -40,5 +39,7 @@ def test_a_single_run_has_the_error_of_the_summary():
 def test_runs_without_usable_rows_and_too_many_runs_are_left_out():
     gone = dataclasses.replace(RUNS, usable=RUNS.run != 1)
     assert [run.name for run in run_errors(SIMULATION, HALF, gone)] == ["0", "2"]
-    longest = run_errors(SIMULATION, HALF, RUNS, settings=JudgeSettings(max_runs=2))
-    assert [run.name for run in longest] == ["0", "2"]
+    many = dataclasses.replace(RUNS, run=np.minimum(np.arange(1500) // 5, MAX_RUNS))
+    names = [run.name for run in run_errors(SIMULATION, HALF, many)]
+    assert len(names) == MAX_RUNS
+    assert str(MAX_RUNS) in names  # the longest one

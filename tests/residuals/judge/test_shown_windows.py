@@ -9,7 +9,6 @@ from torchrl_h2o.effects import Gravity, JointDamping
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Split
-from torchrl_h2o.residuals.settings import JudgeSettings
 
 SIMULATION = pendulum()
 REAL = SIMULATION.with_effects(Gravity(1.5), JointDamping(0.1))
@@ -47,13 +46,6 @@ def test_a_window_holds_the_measured_values_and_both_simulations():
             for which, values in ((SIMULATION, quantity.before), (MENDED, quantity.after)):
                 simulated = which.rollout(which.state_map.states(start), actions)[0, :, column]
                 np.testing.assert_allclose(values[1:], simulated, atol=1e-12)
-
-
-def test_the_length_and_the_number_of_quantities_are_settings():
-    settings = JudgeSettings(shown_seconds=0.3, shown_quantities=1)
-    (window, *_) = shown_windows(SIMULATION, MENDED, MEASURED, settings=settings)
-    assert len(window.ahead) == 16
-    assert len(window.quantities) == 1
 
 
 def test_few_windows_are_shown_once_and_none_not_at_all():

@@ -10,7 +10,6 @@ from torchrl_h2o.effects import ActionNoise, ActionSaturation, CatalogueEntry, G
 from torchrl_h2o.residuals import Split, close_the_loop
 from torchrl_h2o.residuals.judge.undetectable import undetectable_effects
 from torchrl_h2o.residuals.settings import LoopSettings
-from torchrl_h2o.residuals.trace.settings import HorizonSettings
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.5}, {"scale": 0.8}, {"scale": 2.0}))
@@ -51,7 +50,7 @@ def test_a_slow_effect_is_detectable_because_a_search_would_lengthen_its_windows
     slow = CatalogueEntry(JointDamping(), ({"damping": 0.006},))
     assert missed(slow, noise=0.01) == ()
     measured = recorded(SIMULATION, 1000, noise=0.01)
-    short = LoopSettings(horizon=HorizonSettings(seconds=()))
+    short = LoopSettings(window_seconds=())
     assert undetectable_effects(SIMULATION, measured, [slow], settings=short) == (JointDamping(0.006),)
 
 

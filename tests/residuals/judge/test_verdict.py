@@ -30,10 +30,10 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
     Verdict,
 )
-from torchrl_h2o.residuals.settings import DEFAULTS
+from torchrl_h2o.residuals.settings import LoopSettings
 
 SIMULATION = pendulum()
-SHORT = replace(DEFAULTS.judge, classifier_updates=200)  # enough for the gaps of these tests
+SHORT = LoopSettings(classifier_updates=200)  # enough for the gaps of these tests
 
 
 def verdict(truth, found=(), noise=0.01, rows=3000):

@@ -10,7 +10,7 @@ from torchrl_h2o.effects import RollingResistance
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.residual import residuals, start_states
-from torchrl_h2o.residuals.measured.transitions import thinned
+from torchrl_h2o.residuals.measured.transitions import SETTLING_STEPS, thinned
 
 ROWS = 600
 HOPS = RollingResistance(0.003, geoms="*_wheel")  # its wheels lift off and land again
@@ -50,8 +50,7 @@ def test_a_row_settles_alike_alone_and_among_others(hopping):
 
 def test_the_first_rows_of_a_run_are_left_out_at_most_a_quarter(hopping):
     _, measured = hopping
-    steps = measured.settings.settling_steps
-    assert not measured.usable[measured.run == 0][:steps].any()
+    assert not measured.usable[measured.run == 0][:SETTLING_STEPS].any()
     short = replace(measured, run=np.arange(ROWS) // 40)
     assert short.run_beginnings().sum() == 10 * len(short.runs)
 

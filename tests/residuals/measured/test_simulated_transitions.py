@@ -7,9 +7,9 @@ from torchrl.envs import TransformedEnv
 from torchrl_h2o.effects import ActionDelay, ActionNoise, BodyMass, ObservationDelay, ObservationNoise
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Simulation, simulate_transitions
-from torchrl_h2o.residuals.settings import DEFAULTS
+from torchrl_h2o.residuals.measured.transitions import SETTLING_STEPS
 
-ROWS, SETTLING = 300, DEFAULTS.measured.settling_steps
+ROWS, SETTLING = 300, SETTLING_STEPS
 
 
 def robot(*effects):

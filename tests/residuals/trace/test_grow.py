@@ -37,7 +37,7 @@ def test_of_several_lists_the_one_with_a_clearly_lower_loss_is_kept(order):
 def test_a_further_effect_must_contribute_its_share_however_significant_it_is(order):
     gravity, both = lists(friction=5e-4)
     losses = [both.selection_losses(state.fit.effects) for state in (gravity, both)]
-    assert both.p_value(*losses) < both.settings.significance.level
+    assert both.p_value(*losses) < both.settings.level
     assert found(_simplest_of_best([gravity, both][::order])) == found(gravity)
 
 

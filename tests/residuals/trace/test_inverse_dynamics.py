@@ -24,9 +24,8 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import Split, StateMap, trace_effects
 from torchrl_h2o.residuals.measured.missing_force import measured_motion
-from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
-from torchrl_h2o.residuals.settings import DEFAULTS
-from torchrl_h2o.residuals.trace import search
+from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.settings import LoopSettings
 from torchrl_h2o.residuals.trace.begin import begin_anew, begin_with_forces, replaced_by_forces
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.inverse_dynamics import propose_effects
@@ -67,20 +66,11 @@ def test_friction_is_proposed_as_it_acts_in_the_simulator():
 
 def test_no_effect_is_proposed_that_its_own_interval_does_not_tell_from_none():
     noisy = with_noisy_torques(MEASURED, 0.3)
-    every = replace(DEFAULTS.inverse_dynamics, more_left=1.0, more_left_of_one=1.0)
-    found = propose_effects(SIMULATION, noisy, CATALOGUE, settings=every)
+    found = propose_effects(SIMULATION, noisy, CATALOGUE)
     assert found.effects
     for effect, widths in zip(found.effects, found.half_widths, strict=True):
         for name, width in widths.items():
             assert abs(getattr(effect, name) - effect.parameters[name].neutral) > width
-
-
-def test_friction_that_one_joint_alone_needs_is_kept():
-    """Among many joints, one without its friction hardly raises the mean of what is left."""
-    alone = replace(DEFAULTS.inverse_dynamics, more_left=np.inf)
-    found = propose_effects(SIMULATION, MEASURED, CATALOGUE, settings=alone)
-    proposed = {(type(effect), effect.joints) for effect in found.effects}
-    assert proposed == {(type(effect), effect.joints) for effect in FRICTION}
 
 
 def test_a_payload_is_proposed_with_its_mass():
@@ -149,7 +139,7 @@ def test_a_search_for_effects_begins_anew_after_its_first_growth():
     truth, rotors = (JointFrictionLoss(0.1, "shoulder"), JointDamping(1.0, "*")), Armature(30.0, "*")
     slow = recorded(SIMULATION.with_effects(*truth), 700, noise=0.002)
     few = [entry_of(effect, CATALOGUE) for effect in (rotors, truth[0], *(JointDamping(1.0, j) for j in JOINTS))]
-    one = replace(DEFAULTS, trace=replace(DEFAULTS.trace, max_effects=1, rounds=1))
+    one = LoopSettings(max_effects=1, rounds=1)
     with LoopBar(disable=True) as bar:
         rng = np.random.default_rng(0)
         trace = trace_effects(SIMULATION, slow, few, rng=rng, progress=bar, known=[rotors], settings=one)
@@ -293,29 +283,6 @@ def test_effects_that_no_regression_proposes_stay_beside_the_friction(other):
     assert found.fit.effects[0] == other
     model = SIMULATION.with_effects(*found.fit.effects).model
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.25)
-
-
-def test_a_search_ends_with_the_forces_where_its_effects_contradict_them(monkeypatch):
-    """And with what it has found if its time is up while the forces are asked."""
-    few = [entry_of(Armature(0.0, "*"), CATALOGUE)]
-    asked = []
-
-    def of_forces(state, catalogue, rng, progress):
-        asked.append(state.fit.effects)
-        if len(asked) > 1:
-            raise OutOfTimeError("looking for effects")
-        return state.with_found((), Fit((), (), 0.0, ()))
-
-    monkeypatch.setattr(search, "replaced_by_forces", of_forces)
-    noisy = with_noisy_torques(recorded(SIMULATION.with_effects(*FRICTION), 800, noise=0.002))
-    with LoopBar(disable=True) as bar:
-        replaced, in_time = (
-            trace_effects(SIMULATION, noisy, few, rng=np.random.default_rng(0), progress=bar) for _ in range(2)
-        )
-    assert replaced.by_forces
-    assert replaced.entries == ()
-    assert in_time.ended_in == "looking for effects"
-    assert in_time.fit.effects == asked[1]
 
 
 def test_friction_of_a_light_link_is_dry_beside_its_rotor():

@@ -9,11 +9,9 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, JointDamping, JointFrictionLoss, ObservationDelay
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.fit import fit
-from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows, longer_windows
+from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.settings import LongerWindowsSettings
 
 TRUE = {"damping": 0.05, "torque": 0.12}
 CATALOGUE = (
@@ -66,29 +64,6 @@ def test_a_fit_to_data_without_noise_stays():
     assert problem.sensor_std is None
     assert fitted_in_longer_windows(problem, short) is short
     np.testing.assert_allclose([short.effects[0].damping, short.effects[1].torque], list(TRUE.values()), rtol=1e-3)
-
-
-@pytest.mark.parametrize(
-    "rules",
-    [LongerWindowsSettings(longest=0.01), LongerWindowsSettings(steps=1, seconds=0.0)],
-    ids=["a control step is longer than a window may be", "the windows are as long already"],
-)
-def test_without_longer_windows_the_fit_stays(rules):
-    problem, short = one_step_fit(0.03, 0)
-    assert fitted_in_longer_windows(problem, short, replace(DEFAULTS, longer_windows=rules)) is short
-
-
-@pytest.mark.parametrize(
-    ("rules", "steps"),
-    [
-        (LongerWindowsSettings(steps=1, seconds=0.1), 5),
-        (LongerWindowsSettings(steps=7, seconds=0.1), 7),
-        (LongerWindowsSettings(steps=7, longest=0.06), 3),
-    ],
-)
-def test_longer_windows_have_a_number_of_steps_and_a_length(rules, steps):
-    problem = Problem.pose(pendulum(), recorded(pendulum(), 600, noise=0.03))
-    assert longer_windows(problem, replace(DEFAULTS, longer_windows=rules)) == steps
 
 
 def test_too_few_longer_windows_are_not_fitted():

@@ -7,7 +7,6 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, ObservationGain
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -22,7 +21,7 @@ TRUTH = (ObservationGain(1.3, entries=(1,)), Gravity(1.2))
 def nearly_found(entries, truth, noise=0.0):
     """A search that has found the entries with wrong values, and takes the rest for noise of the velocity's sensor."""
     measured = observed(truth, noise)
-    state = SearchState.begin(Problem.pose(SIMULATION, measured), entries, np.random.default_rng(0), DEFAULTS)
+    state = SearchState.begin(Problem.pose(SIMULATION, measured), entries, np.random.default_rng(0))
     found = tuple(entry.effect.with_parameters({"scale": 1.15}) for entry in entries)
     state = state.with_found(entries, Fit(found, (("scale",),) * len(entries), 1.0, ({},) * len(entries)))
     taken_for_noise = np.array([0.0, 0.05]) * measured.observation.std(0)

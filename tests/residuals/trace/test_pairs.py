@@ -62,6 +62,5 @@ def test_pairs_that_do_not_come_close_to_other_lists_are_left_out(singles, to_be
 
 
 def test_no_pair_is_tried_where_the_limit_leaves_room_for_one_effect(singles, to_beat):
-    settings = singles.state.settings
-    limited = replace(settings, trace=replace(settings.trace, max_effects=1))
+    limited = replace(singles.state.settings, max_effects=1)
     assert not found(replace(singles, state=replace(singles.state, settings=limited)), (), to_beat)

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
-from torchrl_h2o.effects import ActionSaturation, ResidualForce
+from torchrl_h2o.effects import ActionSaturation
 from torchrl_h2o.residuals import Split, residuals
-from torchrl_h2o.residuals.settings import DEFAULTS
-from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.undeclared.find_force import _fitted, _Regression, _straightened, find_undeclared
+from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 LAWS = {
     "torque ripple": (0.2, lambda q, v, t: np.sin(7.0 * q + 0.5)),
@@ -84,15 +82,3 @@ def test_no_power_of_a_control_is_beside_its_saturation():
     alone = find_undeclared(simulation, measured)
     assert "a0" in alone.effect.describe()
     assert beside is None or "a0" not in beside.effect.describe()
-
-
-def test_a_wave_that_is_nearly_straight_becomes_a_line():
-    simulation = pendulum()
-    measured = recorded(simulation.with_effects(UnknownForce(-0.5, lambda q, v, t: q)), noise=0.002)
-    problem = Problem.pose(simulation, measured)
-    wave = ResidualForce(("torque on elbow: -5 · sin(0.1 q)",))
-    regression = _Regression.of(problem, 1, DEFAULTS)
-    line = _straightened(regression, _fitted(regression, wave))
-    (term,) = line.effects[0].parsed
-    assert str(term.factors[0]) == "q"
-    assert term.coefficient == pytest.approx(-0.5, rel=0.05)

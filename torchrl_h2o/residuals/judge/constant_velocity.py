@@ -9,6 +9,7 @@ import numpy as np
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.judge.headline import VELOCITY_UNITS
 from torchrl_h2o.residuals.measured.constant_velocity import (
+    BETTER_THAN_GUESS,
     ErrorsAhead,
     effects_on_unpredicted_joints,
     errors_ahead,
@@ -19,12 +20,11 @@ from torchrl_h2o.residuals.measured.constant_velocity import (
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.sentence import effects_in_words
 from torchrl_h2o.residuals.report.words import duration, quantity
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
 def no_better_than_constant_velocity(
-    mended: Simulation, measured: Measured, effects: Sequence[Effect], settings: LoopSettings = DEFAULTS
+    mended: Simulation, measured: Measured, effects: Sequence[Effect]
 ) -> tuple[str, ...]:
     """Says so if effects predict motion no better than the guess that every velocity stays as it is.
 
@@ -35,13 +35,12 @@ def no_better_than_constant_velocity(
         mended: the simulator with the effects found.
         measured: the data, of which the part for the report is used.
         effects: the effects; each is judged by the joints that it acts on.
-        settings: times ahead, and the share of the guess's error up to which a prediction counts as better.
 
     Returns:
         One clause if most quantities are predicted no better at any time ahead, or about the effects on joints all of
         whose quantities are predicted no better.
     """
-    errors, most = errors_ahead(mended, measured, Split.REPORT, settings), settings.verdict.better_than_guess
+    errors, most = errors_ahead(mended, measured, Split.REPORT), BETTER_THAN_GUESS
     if not explains_motion(errors, most):
         everything = range(len(mended.state_map.names))
         return (f"the effects found predict the motion {_hardly_better(mended, errors[0], everything)}",)

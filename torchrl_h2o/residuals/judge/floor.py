@@ -8,8 +8,14 @@ from torch import nn
 
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+WIDTH = 64  # width of the two hidden layers of the network that estimates the floor
+BATCH = 128  # batch size of the floor network's updates
+EPOCHS = 60  # epochs of the floor network's training
+PATIENCE = 12  # epochs without a new lowest loss after which the floor network's training stops
+BLOCKS = 20  # blocks of neighbouring rows; every fifth block is used for early stopping of the floor network
+CLIP = 5.0  # standard deviations at which the floor network's inputs and targets are clipped
 
 
 def explainable_floor(
@@ -18,7 +24,6 @@ def explainable_floor(
     *,
     states: np.ndarray | None = None,
     seed: int = 0,
-    settings: JudgeSettings = DEFAULTS.judge,
 ) -> np.ndarray:
     """Estimates the held-out one-step error that the best possible model would leave.
 
@@ -32,24 +37,23 @@ def explainable_floor(
         measured: the data.
         states: (T, nq + nv), start states; the measured ones by default.
         seed: seed of the network's weights and batches; torch's global generator is not changed.
-        settings: size and training of the network.
 
     Returns:
         RMSE of each dimension, (n), in its unit: at most that of the residual itself.
     """
     fitted, judged = measured.fitted(), measured.reported_on()
-    inputs = _standard(_inputs(simulation, measured), fitted, settings.floor_clip)
+    inputs = _standard(_inputs(simulation, measured), fitted, CLIP)
     targets = np.full_like(measured.observation, np.nan)
     for rows in (fitted, judged):
         targets[rows] = residuals(simulation, measured, rows, states=states)[:, 0]
     fitted, judged = (rows[np.isfinite(targets[rows]).all(1)] for rows in (fitted, judged))
     scale = np.maximum(targets[fitted].std(0), 1e-12 + 1e-9 * measured.observation.std(0))
-    stopping = np.arange(len(fitted)) * settings.floor_blocks // len(fitted) % 5 == 4
+    stopping = np.arange(len(fitted)) * BLOCKS // len(fitted) % 5 == 4
     x, y = (torch.as_tensor(values, dtype=torch.float32) for values in (inputs, np.nan_to_num(targets) / scale))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        y = y.clamp(-settings.floor_clip, settings.floor_clip)
-        network = _trained(x, y, fitted[~stopping], fitted[stopping], settings)
+        y = y.clamp(-CLIP, CLIP)
+        network = _trained(x, y, fitted[~stopping], fitted[stopping])
     with torch.no_grad():
         explained = network(x).double().numpy() * scale
     rest = targets - explained
@@ -76,19 +80,17 @@ def _trained(
     y: torch.Tensor,
     rows: np.ndarray | torch.Tensor,
     stopping: np.ndarray | torch.Tensor,
-    settings: JudgeSettings,
 ) -> nn.Module:
     """Trains a network on some rows; keeps the weights of the epoch with the lowest loss on the stopping rows."""
-    width = settings.floor_width
     network = nn.Sequential(
-        nn.Linear(x.shape[1], width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, y.shape[1])
+        nn.Linear(x.shape[1], WIDTH), nn.SiLU(), nn.Linear(WIDTH, WIDTH), nn.SiLU(), nn.Linear(WIDTH, y.shape[1])
     )
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=1e-3, foreach=True)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.floor_epochs)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, EPOCHS)
     rows, stopping = torch.as_tensor(rows), torch.as_tensor(stopping)
     best, weights, since = torch.inf, network.state_dict(), 0
-    for _ in range(settings.floor_epochs):
-        for batch in rows[torch.randperm(len(rows))].split(settings.floor_batch):
+    for _ in range(EPOCHS):
+        for batch in rows[torch.randperm(len(rows))].split(BATCH):
             optimizer.zero_grad()
             nn.functional.mse_loss(network(x[batch]), y[batch]).backward()
             optimizer.step()
@@ -99,7 +101,7 @@ def _trained(
         if loss < best:
             best, since = loss, 0
             weights = {name: weight.clone() for name, weight in network.state_dict().items()}
-        if since > settings.floor_patience:
+        if since > PATIENCE:
             break
     network.load_state_dict(weights)
     return network

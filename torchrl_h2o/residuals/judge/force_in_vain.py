@@ -10,7 +10,6 @@ from torchrl_h2o.effects import Effect, ResidualForce
 from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
 from torchrl_h2o.residuals.measured.missing_force import LOWER, measured_motion, missing_force
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
@@ -19,7 +18,6 @@ def force_in_vain(
     mended: Simulation,
     measured: Measured,
     effects: Sequence[Effect],
-    settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """Says so if a force outside the catalogue is found at a joint, and as much force is missing there as without it.
 
@@ -31,7 +29,6 @@ def force_in_vain(
         mended: the simulator with them.
         measured: the data, of which the part for the report is used.
         effects: the effects found.
-        settings: rows and smoothing of the missing force.
 
     Returns:
         One clause, about the first of these joints, or nothing; nothing if the missing force is not known.
@@ -41,7 +38,7 @@ def force_in_vain(
         return ()
     sizes = []
     for which in (simulation, mended):
-        motion = measured_motion(which, measured, Split.REPORT, settings.inverse_dynamics)
+        motion = measured_motion(which, measured, Split.REPORT)
         if motion is None:
             return ()
         sizes.append(np.nanmean(np.abs(missing_force(which, motion)), axis=0))  # a mean, as a force may act seldom

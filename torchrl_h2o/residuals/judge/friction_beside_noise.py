@@ -10,16 +10,16 @@ import numpy as np
 from torchrl_h2o.effects import ActionNoise, Effect
 from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
 from torchrl_h2o.effects.indices import entry_mask
-from torchrl_h2o.residuals.judge.settings import VerdictSettings
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+# share of a dry friction from which noise of the actions at its joint makes its value doubtful
+NOISE_BESIDE_FRICTION = 0.8
 
 
 def friction_beside_noise(
     simulation: Simulation,
     mended: Simulation,
     effects: Sequence[Effect],
-    rules: VerdictSettings = DEFAULTS.verdict,
 ) -> tuple[str, ...]:
     """Says of dry friction found beside noise of the actions of its size that its value may be wrong.
 
@@ -31,7 +31,6 @@ def friction_beside_noise(
         simulation: the simulator without the effects.
         mended: the simulator with them.
         effects: the effects found.
-        rules: the smallest share of the friction that noise must have to be mentioned.
 
     Returns:
         One sentence, about all joints with so much noise beside the friction found there, or nothing.
@@ -41,7 +40,7 @@ def friction_beside_noise(
     doubtful = []
     for joint in degrees_of_freedom(mended.model):
         friction, by_noise = found[joint.velocity], noise[joint.velocity]
-        if friction > 0.0 and by_noise > rules.noise_beside_friction * friction:
+        if friction > 0.0 and by_noise > NOISE_BESIDE_FRICTION * friction:
             unit = "N" if joint.sliding else "N·m"
             doubtful.append(f"of {by_noise:.3g} {unit} beside the + {friction:.3g} {unit} of {joint.name}")
     if not doubtful:

@@ -4,41 +4,42 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_h2o.residuals.measured.constant_velocity import HEADLINE_SECONDS, HEADLINE_WINDOWS
 from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, thinned
 from torchrl_h2o.residuals.report.errors import HeadlineError
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+HEADLINE_LEAST = 1.5  # median error over that by noise alone from which a quantity may be the sentence's
+HEADLINE_STANDS_OUT = 3.0  # median error over the median error by sensor noise at which the sentence's time is chosen
+NOISE_WINDOWS = 100  # largest number of windows by which that time is chosen
 
 VELOCITY_UNITS = ("rad/s", "m/s")
 
 
-def headline_horizon(
-    simulation: Simulation, measured: Measured, settings: JudgeSettings = DEFAULTS.judge
-) -> int | None:
+def headline_horizon(simulation: Simulation, measured: Measured) -> int | None:
     """Control steps ahead at which the report's sentence gives the error; None if the data hold too few windows.
 
-    The shortest of the settings' times at which the simulator's error exceeds the sensors' noise by a factor, on the
+    The shortest of the possible times at which the simulator's error exceeds the sensors' noise by a factor, on the
     part of the data for fits; the longest possible time if it never does.
 
     Args:
         simulation: the simulator before effects are put in.
         measured: the data.
-        settings: times to choose from.
     """
     sensor_std, rng = sensor_noise(simulation, measured), np.random.default_rng(0)
     chosen = None
-    for seconds in settings.headline_seconds:
+    for seconds in HEADLINE_SECONDS:
         steps = max(1, round(seconds / simulation.control_step))
-        if len(measured.reported_on(steps)) < settings.headline_windows:
+        if len(measured.reported_on(steps)) < HEADLINE_WINDOWS:
             break
-        chosen, starts = steps, _fitted_in_motion(measured, steps, settings)
+        chosen, starts = steps, _fitted_in_motion(measured, steps)
         if sensor_std is None or not len(starts):
             break
-        if error_over_noise(simulation, measured, starts, steps, sensor_std, rng).max() > settings.headline_stands_out:
+        if error_over_noise(simulation, measured, starts, steps, sensor_std, rng).max() > HEADLINE_STANDS_OUT:
             break
     return chosen
 
@@ -48,7 +49,6 @@ def headline_error(
     mended: Simulation,
     measured: Measured,
     steps: int,
-    settings: JudgeSettings = DEFAULTS.judge,
 ) -> HeadlineError:
     """The median error some steps ahead of the quantity in which it is largest, in units of the quantity's spread.
 
@@ -61,14 +61,13 @@ def headline_error(
         mended: the simulator with them.
         measured: the data.
         steps: control steps ahead.
-        settings: what counts as more than noise.
     """
-    starts = in_motion(measured, measured.reported_on(steps), steps, settings.headline_windows)
+    starts = in_motion(measured, measured.reported_on(steps), steps, HEADLINE_WINDOWS)
     before, after = (_median(which, measured, starts, steps) for which in (simulation, mended))
     names, units = simulation.state_map.names, simulation.state_map.units
     spread = np.maximum(measured.observation.std(0), 1e-12)
     positions = np.array([unit not in VELOCITY_UNITS for unit in units])
-    beyond_noise = _beyond_noise(simulation, measured, steps, settings)
+    beyond_noise = _beyond_noise(simulation, measured, steps)
     choices = (positions & beyond_noise, beyond_noise, positions, np.ones_like(positions))
     chosen = next(which for which in choices if which.any())
     index = int(np.where(chosen, before / spread, -1.0).argmax())
@@ -77,19 +76,19 @@ def headline_error(
     )
 
 
-def _beyond_noise(simulation: Simulation, measured: Measured, steps: int, settings: JudgeSettings) -> np.ndarray:
+def _beyond_noise(simulation: Simulation, measured: Measured, steps: int) -> np.ndarray:
     """Quantities whose error, on the part of the data for fits, clearly exceeds what sensor noise causes, (n,)."""
-    sensor_std, starts = sensor_noise(simulation, measured), _fitted_in_motion(measured, steps, settings)
+    sensor_std, starts = sensor_noise(simulation, measured), _fitted_in_motion(measured, steps)
     if sensor_std is None or not len(starts):
         return np.ones(len(simulation.state_map.names), bool)
     ratio = error_over_noise(simulation, measured, starts, steps, sensor_std, np.random.default_rng(0))
-    return ratio > settings.headline_least
+    return ratio > HEADLINE_LEAST
 
 
-def _fitted_in_motion(measured: Measured, steps: int, settings: JudgeSettings) -> np.ndarray:
-    """First rows of windows for fits in which something moves, thinned to the settings' number."""
-    starts = in_motion(measured, measured.fitted(steps), steps, settings.headline_windows)
-    return thinned(starts, settings.noise_windows)
+def _fitted_in_motion(measured: Measured, steps: int) -> np.ndarray:
+    """First rows of windows for fits in which something moves, thinned to ``NOISE_WINDOWS``."""
+    starts = in_motion(measured, measured.fitted(steps), steps, HEADLINE_WINDOWS)
+    return thinned(starts, NOISE_WINDOWS)
 
 
 def _median(simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:

@@ -10,14 +10,14 @@ from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HorizonError
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 METRIC = "held-out one-step RMSE, each dimension divided by the standard deviation of its one-step change"
 
 
 def error_summary(
-    simulation: Simulation, mended: Simulation, measured: Measured, settings: JudgeSettings = DEFAULTS.judge
+    simulation: Simulation, mended: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS
 ) -> ErrorSummary:
     """Summarises the held-out errors of two simulations.
 
@@ -25,13 +25,13 @@ def error_summary(
         simulation: the simulator before the effects are put in.
         mended: the simulator with them.
         measured: the data.
-        settings: horizons, and the network that estimates the floor.
+        settings: horizons.
     """
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
-    ahead = headline_horizon(simulation, measured, settings)
-    floor = explainable_floor(mended, measured, settings=settings)
-    whiteness = autocorrelation(mended, measured, settings)
+    ahead = headline_horizon(simulation, measured)
+    floor = explainable_floor(mended, measured)
+    whiteness = autocorrelation(mended, measured)
     columns = (values.tolist() for values in (before, after, floor, whiteness))
     return ErrorSummary(
         metric=METRIC,
@@ -41,7 +41,7 @@ def error_summary(
         floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
         per_dimension=tuple(map(DimensionError, names, units, *columns)),
         horizons=_horizons(simulation, mended, measured, settings),
-        headline=None if ahead is None else headline_error(simulation, mended, measured, ahead, settings),
+        headline=None if ahead is None else headline_error(simulation, mended, measured, ahead),
     )
 
 
@@ -57,7 +57,7 @@ def spread(measured: Measured) -> np.ndarray:
 
 
 def _horizons(
-    simulation: Simulation, mended: Simulation, measured: Measured, settings: JudgeSettings
+    simulation: Simulation, mended: Simulation, measured: Measured, settings: LoopSettings
 ) -> tuple[HorizonError, ...]:
     """Errors at each horizon with at least two held-out windows."""
     names, found = simulation.state_map.names, []

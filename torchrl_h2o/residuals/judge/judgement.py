@@ -28,9 +28,13 @@ from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.outcome import Attempt, RivalSet
+
+MAX_REJECTED = 30  # largest number of rejected effects in the report
+# share of the held-out error that an effect which was not put in must leave at most to be named all the same
+LOWERS_MUCH = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,23 +105,23 @@ def judge(
             the data could not have shown.
         seed: seed of the classifiers.
         advance: called after each entry of the catalogue that is judged.
-        settings: horizons, networks and lengths of the lists.
+        settings: horizons, significance level and the classifier's updates.
 
     Returns:
         The held-out figures and the verdict.
     """
     simulation, effects = evidence.simulation, explanation.effects
-    disturbed = _remaining_disturbances(evidence, explanation, settings)
+    disturbed = _remaining_disturbances(evidence, explanation)
     measured = without_intervals(evidence.measured, disturbed)
     mended = simulation.with_effects(*_without_noise(effects))
-    error = error_summary(simulation, mended, measured, settings.judge)
+    error = error_summary(simulation, mended, measured, settings)
     # random effects are drawn in the two-sample test
     two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
-    rejected, failures = _rejected(simulation, measured, explanation, settings)
+    rejected, failures = _rejected(simulation, measured, explanation)
     undetermined = undetermined_values(explanation.parts, simulation.names)
     verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings, undetermined)
     if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None:
-        too_few = too_few_rows(simulation, measured, rejected, error, explanation.trace.loss, settings.verdict)
+        too_few = too_few_rows(simulation, measured, rejected, error, explanation.trace.loss)
         verdict = replace(verdict, too_few=too_few)
     if verdict.kind == NOTHING_MISSING and explanation.ended_in is not None:
         verdict = replace(verdict, kind=UNDECIDED)
@@ -134,17 +138,17 @@ def judge(
         ),
         rejected=rejected,
         alternatives=tuple(
-            _alternatives(simulation, measured, effects, index, part.alike, settings)
+            _alternatives(simulation, measured, effects, index, part.alike)
             for index, part in enumerate(explanation.parts)
             if part.alike
         ),
         two_sample=two_sample,
         trace=_residual_trace(simulation, mended, measured),
-        windows=shown_windows(simulation, mended, measured, _shown_steps(error, simulation), settings=settings.judge),
-        runs=run_errors(simulation, mended, measured, settings=settings.judge),
+        windows=shown_windows(simulation, mended, measured, _shown_steps(error, simulation)),
+        runs=run_errors(simulation, mended, measured),
         verdict=verdict,
         failures=(*explanation.failures, *failures),
-        others=_others(simulation, mended, measured, explanation, settings),
+        others=_others(simulation, mended, measured, explanation),
     )
 
 
@@ -154,7 +158,6 @@ def too_few_rows(
     rejected: Sequence[tuple[Attempt, float]],
     error: ErrorSummary,
     loss: float,
-    rules: VerdictSettings,
 ) -> str:
     """An effect that was not put in although it clearly lowers the error on data that chose nothing, in words.
 
@@ -167,11 +170,10 @@ def too_few_rows(
         rejected: attempts, and the error with each of them alone.
         error: the error without them.
         loss: the loss without them on the part by which effects are chosen.
-        rules: how much lower an error has to be.
     """
-    rejected = [(attempt, after) for attempt, after in rejected if attempt.loss < rules.lowers_much * loss]
+    rejected = [(attempt, after) for attempt, after in rejected if attempt.loss < LOWERS_MUCH * loss]
     attempt, after = min(rejected, key=lambda pair: (np.isnan(pair[1]), pair[1]), default=(None, math.nan))
-    if attempt is None or not after < rules.lowers_much * error.before:
+    if attempt is None or not after < LOWERS_MUCH * error.before:
         return ""
     rows = int((measured.split == Split.SELECTION).sum())
     words = effect_words(attempt.effect, simulation.names)
@@ -187,12 +189,10 @@ def _shown_steps(error: ErrorSummary, simulation: Simulation) -> int | None:
     return None if error.headline is None else round(error.headline.seconds / simulation.control_step)
 
 
-def _remaining_disturbances(
-    evidence: Evidence, explanation: Explanation, settings: LoopSettings
-) -> list[OutsideInterval]:
+def _remaining_disturbances(evidence: Evidence, explanation: Explanation) -> list[OutsideInterval]:
     """The suspected disturbances that the mended simulator does not explain."""
     mended = evidence.simulation.with_effects(*explanation.effects)
-    return still_outside(evidence.suspected, mended, evidence.measured, settings=settings.outside)
+    return still_outside(evidence.suspected, mended, evidence.measured)
 
 
 def _without_noise(effects: tuple[Effect, ...]) -> list[Effect]:
@@ -200,13 +200,13 @@ def _without_noise(effects: tuple[Effect, ...]) -> list[Effect]:
 
 
 def _rejected(
-    simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
+    simulation: Simulation, measured: Measured, explanation: Explanation
 ) -> tuple[tuple[tuple[Attempt, float], ...], tuple[str, ...]]:
     """The attempts that are not part of the explanation, with the error of each alone; and those that failed."""
     trace = explanation.trace
     found = {entry.name for entry in trace.entries}
     sized = [attempt for attempt in trace.attempts if not is_negligible(attempt.effect, attempt.entry.trials)]
-    listed = [attempt for attempt in sized[: settings.judge.max_rejected] if attempt.entry.name not in found]
+    listed = [attempt for attempt in sized[:MAX_REJECTED] if attempt.entry.name not in found]
     rejected, failures = [], []
     for attempt in listed:
         try:
@@ -225,25 +225,22 @@ def _alternatives(
     effects: tuple[Effect, ...],
     index: int,
     others: tuple[Effect, ...],
-    settings: LoopSettings,
 ) -> Alternatives:
     """An effect and its alternatives, each judged together with the remaining effects."""
     alike, before, after = (effects[index], *others), effects[:index], effects[index + 1 :]
     errors = (overall_error(simulation.with_effects(*before, other, *after), measured) for other in alike)
-    where = separated_by(
-        simulation, measured, alike, _without_noise(before), _without_noise(after), settings=settings.judge
-    )
+    where = separated_by(simulation, measured, alike, _without_noise(before), _without_noise(after))
     return Alternatives(alike, tuple(errors), where)
 
 
 def _others(
-    simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
+    simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation
 ) -> tuple[tuple[RivalSet, float, str], ...]:
     """Error of each other set of effects, and the data that would distinguish it from the effects found."""
     others = []
     for rival in explanation.trace.others:
         other = simulation.with_effects(*rival.fit.effects)
-        where = difference_between((mended, other), measured, settings=settings.judge)
+        where = difference_between((mended, other), measured)
         others.append((rival, overall_error(other, measured), where))
     return tuple(others)
 
@@ -254,7 +251,7 @@ def _two_sample(
     sensor_std = sensor_noise(mended, measured)
     return TwoSample(
         *(
-            two_sample_auc(which, measured, sensor_std=sensor_std, seed=seed, settings=settings.judge)
+            two_sample_auc(which, measured, sensor_std=sensor_std, seed=seed, settings=settings)
             for which in (simulation, mended)
         )
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_h2o.residuals.measured.constant_velocity import NEGLIGIBLE_ERROR
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -11,7 +12,11 @@ from torchrl_h2o.residuals.report.errors import HeadlineError
 from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.problem import WORST
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+
+FAR_WINDOWS = 8  # smallest number of windows by which the error far ahead is judged
+WORSE = 1.1  # factor on the median error of a quantity above which the effects make it worse
 
 
 def made_worse(
@@ -27,25 +32,25 @@ def made_worse(
         mended: the simulator with them.
         measured: the data, of which the part for the report is used.
         steps: control steps ahead at which the errors are compared.
-        settings: smallest rise of the median error, and significance level.
+        settings: significance level.
 
     Returns:
         One clause, or nothing if no error rises by enough and significantly.
     """
-    least = settings.verdict.far_windows
-    starts = in_motion(measured, measured.reported_on(steps), steps, least)
-    if len(starts) < least:
+    starts = in_motion(measured, measured.reported_on(steps), steps, FAR_WINDOWS)
+    if len(starts) < FAR_WINDOWS:
         return ()
     names, units = simulation.state_map.names, simulation.state_map.units
-    worst = settings.residual.worst * np.maximum(measured.observation.std(0), 1e-12)
+    spread = np.maximum(measured.observation.std(0), 1e-12)
     before, after = (
-        np.fmin(np.abs(residuals(which, measured, starts, steps)[:, -1]), worst) for which in (simulation, mended)
+        np.fmin(np.abs(residuals(which, measured, starts, steps)[:, -1]), WORST * spread)
+        for which in (simulation, mended)
     )
     medians = np.median(before, axis=0), np.median(after, axis=0)
-    rise = medians[1] / np.maximum(medians[0], settings.verdict.worse_negligible * worst / settings.residual.worst)
+    rise = medians[1] / np.maximum(medians[0], NEGLIGIBLE_ERROR * spread)
     index = int(rise.argmax())
-    p = p_value_of_losses(after[:, index], before[:, index], settings.significance)
-    if rise[index] <= settings.verdict.worse or p >= settings.verdict.level / len(names):
+    p = p_value_of_losses(after[:, index], before[:, index], settings)
+    if rise[index] <= WORSE or p >= settings.level / len(names):
         return ()
     old, new = (float(median[index]) for median in medians)
     rose = HeadlineError(names[index], units[index], steps * simulation.control_step, old, new)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from torchrl_h2o.residuals.measured.missing_force import MissingForces
+from torchrl_h2o.residuals.measured.missing_force import MORE_FORCE, MissingForces
 from torchrl_h2o.residuals.report.words import quantity
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names
 
 
-def needs_more_force(
-    simulation: Simulation, forces: MissingForces, settings: LoopSettings = DEFAULTS
-) -> tuple[str, ...]:
+def needs_more_force(simulation: Simulation, forces: MissingForces) -> tuple[str, ...]:
     """Says so if effects contradict the measured forces: with them, far larger forces are missing than without them.
 
     A rotor that is too heavy predicts that a joint keeps its velocity, which is a good guess over some steps. But the
@@ -20,12 +17,11 @@ def needs_more_force(
     Args:
         simulation: the simulator, for the names of its joints.
         forces: the missing forces without and with the effects, on the part of the data for the report.
-        settings: the largest factor by which effects may raise a missing force.
 
     Returns:
         One clause, about the joint whose missing force rises most, or nothing.
     """
-    if not forces.rise_by(settings.verdict.more_force):
+    if not forces.rise_by(MORE_FORCE):
         return ()
     dof, model = int(forces.factors.argmax()), simulation.model
     names, units = (each[model.nq + dof] for each in coordinate_names(model))

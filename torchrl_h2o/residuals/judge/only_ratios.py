@@ -7,15 +7,14 @@ from collections.abc import Sequence
 import mujoco
 
 from torchrl_h2o.effects import ActionGain, BodyMass, Effect, selection
-from torchrl_h2o.residuals.judge.settings import VerdictSettings
 from torchrl_h2o.residuals.report.words import effect_words, number
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+# factor on a mass or a motor's gain from which the report says that only ratios show in the motion
+FAR_FROM_MODEL = 2.0
 
-def only_ratios(
-    simulation: Simulation, effects: Sequence[Effect], rules: VerdictSettings = DEFAULTS.verdict
-) -> tuple[str, ...]:
+
+def only_ratios(simulation: Simulation, effects: Sequence[Effect]) -> tuple[str, ...]:
     """Says of a mass or a motor gain far from the model's that the same motion has another explanation.
 
     If all masses and all forces of a robot are multiplied by one factor, it moves as before. So a pole with a fifth of
@@ -26,7 +25,6 @@ def only_ratios(
     Args:
         simulation: the simulator without the effects.
         effects: the effects found.
-        rules: the factor from which a mass or gain is mentioned.
 
     Returns:
         One sentence on the value that is farthest from the model's, or nothing.
@@ -35,7 +33,7 @@ def only_ratios(
     plain = bool((model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE).all())
     kinds = BodyMass | ActionGain if plain else BodyMass
     found = [effect for effect in effects if isinstance(effect, kinds) and effect.scale > 0.0]
-    far = [effect for effect in found if _times(effect) >= rules.far_from_model]
+    far = [effect for effect in found if _times(effect) >= FAR_FROM_MODEL]
     if not far:
         return ()
     one = max(far, key=_times)

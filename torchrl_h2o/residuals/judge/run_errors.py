@@ -8,13 +8,12 @@ from torchrl_h2o.residuals.judge.held_out_error import spread
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.windows import RunError
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+MAX_RUNS = 200  # largest number of runs whose errors are listed
 
-def run_errors(
-    simulation: Simulation, mended: Simulation, measured: Measured, *, settings: JudgeSettings = DEFAULTS.judge
-) -> tuple[RunError, ...]:
+
+def run_errors(simulation: Simulation, mended: Simulation, measured: Measured) -> tuple[RunError, ...]:
     """Returns the error of each run: the one-step RMSE over all dimensions, each in units of its spread.
 
     A run with held-out transitions is judged by these alone, another run by all of its usable transitions.
@@ -23,7 +22,6 @@ def run_errors(
         simulation: the simulator before the effects are put in.
         mended: the simulator with them.
         measured: the data.
-        settings: largest number of runs; of more, the longest are listed.
 
     Returns:
         An entry for each run with usable transitions, in the order of the data.
@@ -36,7 +34,7 @@ def run_errors(
         held_out = np.array([row for row in rows if int(row) in judged], dtype=int)
         if len(rows):
             found.append((index, held_out if len(held_out) else rows, bool(len(held_out))))
-    longest = {entry[0] for entry in sorted(found, key=lambda entry: -len(entry[1]))[: settings.max_runs]}
+    longest = {entry[0] for entry in sorted(found, key=lambda entry: -len(entry[1]))[:MAX_RUNS]}
     listed = [entry for entry in found if entry[0] in longest]
     if not listed:
         return ()

@@ -11,8 +11,12 @@ from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.words import number, quantity
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+# share of the transitions, those with the largest differences of the predictions, that are described
+DESCRIBED_SHARE = 0.05
+NEGLIGIBLE = 1e-6  # difference of predictions, in spreads, below which they count as equal
+UNUSUAL_FACTOR = 1.5  # factor by which a coordinate must differ from its usual size to be named in the description
 
 
 def separated_by(
@@ -21,8 +25,6 @@ def separated_by(
     effects: Sequence[Effect],
     before: Sequence[Effect] = (),
     after: Sequence[Effect] = (),
-    *,
-    settings: JudgeSettings = DEFAULTS.judge,
 ) -> str:
     """Describes which data would distinguish the first of some effects from the others.
 
@@ -32,25 +34,21 @@ def separated_by(
         effects: alternatives, each at its best fit.
         before: effects that precede each alternative.
         after: effects that follow it.
-        settings: thresholds of the description.
 
     Returns:
         A clause with the dimension in which the predictions differ most, the difference per step, and the states or
         actions at which they differ.
     """
     simulations = [simulation.with_effects(*before, effect, *after) for effect in effects]
-    return difference_between(simulations, measured, settings=settings)
+    return difference_between(simulations, measured)
 
 
-def difference_between(
-    simulations: Sequence[Simulation], measured: Measured, *, settings: JudgeSettings = DEFAULTS.judge
-) -> str:
+def difference_between(simulations: Sequence[Simulation], measured: Measured) -> str:
     """Describes which data would distinguish the first of some simulations from the others, as :func:`separated_by`.
 
     Args:
         simulations: simulators with alternative effects.
         measured: the data.
-        settings: thresholds of the description.
     """
     rows = measured.windows(1)
     of_first, *of_others = (residuals(each, measured, rows)[:, 0] for each in simulations)
@@ -58,13 +56,13 @@ def difference_between(
     spread = measured.observation.std(0) + 1e-12
     difference = np.nan_to_num(np.max([np.abs(of_first - other) for other in of_others], axis=0) / spread)
     size = difference.max(1)
-    most = np.argsort(size)[-max(1, round(settings.separation_share * len(size))) :]
-    if size[most].mean() < settings.separation_negligible:
+    most = np.argsort(size)[-max(1, round(DESCRIBED_SHARE * len(size))) :]
+    if size[most].mean() < NEGLIGIBLE:
         return "a direct measurement of one of the quantities, because the predictions for these sensors are equal"
     dimension = int(difference[most].mean(0).argmax())
     name, unit = simulation.state_map.names[dimension], simulation.state_map.units[dimension]
     by = difference[most, dimension].mean() * spread[dimension]
-    where = where_it_is_large(simulation, measured, rows, size, most, settings.separation_factor)
+    where = where_it_is_large(simulation, measured, rows, size, most, UNUSUAL_FACTOR)
     return (
         f"more data{where}, because the predictions differ most in {name}, by {quantity(by, unit, 2)} per step; or a "
         "direct measurement of one of the quantities"

@@ -7,8 +7,11 @@ import numpy as np
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.windows import ShownWindow, WindowQuantity
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+SHOWN_SECONDS = 0.1  # time ahead, in s, of the windows that the report shows
+SHOWN_STEPS = 5  # smallest number of control steps in these windows
+SHOWN_QUANTITIES = 4  # largest number of quantities shown of a window, those with the largest errors
 
 
 def shown_windows(
@@ -16,8 +19,6 @@ def shown_windows(
     mended: Simulation,
     measured: Measured,
     steps: int | None = None,
-    *,
-    settings: JudgeSettings = DEFAULTS.judge,
 ) -> tuple[ShownWindow, ...]:
     """Returns the worst, the median and the best held-out window by the error with the effects at its end.
 
@@ -28,8 +29,7 @@ def shown_windows(
         simulation: the simulator before the effects are put in.
         mended: the simulator with them.
         measured: the data.
-        steps: control steps per window; by default as many as cover ``settings.shown_seconds``.
-        settings: length of the windows, and number of quantities.
+        steps: control steps per window; by default as many as cover ``SHOWN_SECONDS``.
 
     Returns:
         Three windows in this order, each with the quantities whose errors are largest over all windows; fewer, or none,
@@ -45,7 +45,7 @@ def shown_windows(
         (['worst', 'median', 'best'], 11)
     """
     if steps is None:
-        steps = max(settings.shown_steps, round(settings.shown_seconds / simulation.control_step))
+        steps = max(SHOWN_STEPS, round(SHOWN_SECONDS / simulation.control_step))
     starts = measured.reported_on(steps)
     if not len(starts):
         return ()
@@ -58,7 +58,7 @@ def shown_windows(
     ranks = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
     finite = np.where(np.isfinite(scaled), scaled, np.nan)
     largest = np.argsort(-np.nan_to_num(np.nanmean(finite**2, axis=1)).max(0), kind="stable")
-    quantities = largest[: settings.shown_quantities]
+    quantities = largest[:SHOWN_QUANTITIES]
     chosen = {int(window): rank for rank, window in reversed(ranks.items())}  # of a few windows, some coincide
     return tuple(
         _shown(rank, simulation, measured, int(starts[window]), missed[:, window], scaled[:, window], quantities)

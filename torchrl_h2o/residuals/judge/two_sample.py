@@ -12,8 +12,11 @@ from tensordict import TensorDict
 from torchrl_h2o.objectives import DynamicsRatioLoss, make_dynamics_ratio_estimator
 from torchrl_h2o.residuals.measured.residual import residuals, start_states
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS, JudgeSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+CLASSIFIER_BATCH = 256  # transitions in an update of the discriminators
+CLASSIFIER_CELLS = (64, 64)  # hidden layers of the discriminators
 
 
 def two_sample_auc(
@@ -22,7 +25,7 @@ def two_sample_auc(
     *,
     sensor_std: np.ndarray | None = None,
     seed: int = 0,
-    settings: JudgeSettings = DEFAULTS.judge,
+    settings: LoopSettings = DEFAULTS,
 ) -> float:
     """Measures how well a classifier separates measured from simulated next observations of the same state and action.
 
@@ -35,7 +38,7 @@ def two_sample_auc(
         sensor_std: (n), standard deviation of the readings' noise, which is then added to the simulated outcomes and
             their start states.
         seed: seed of the networks and the batches.
-        settings: size and training of the networks.
+        settings: number of updates.
 
     Returns:
         Area under the ROC curve: 0.5 if the gap is undetectable, 1 if every transition is classified correctly.
@@ -50,14 +53,14 @@ def two_sample_auc(
         estimator = make_dynamics_ratio_estimator(
             measured.observation.shape[1],
             measured.action.shape[1],
-            settings.classifier_cells,
+            CLASSIFIER_CELLS,
             logit_bound=None,
             clamp=None,
         )
         loss = DynamicsRatioLoss(estimator)
         optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2, fused=True)
         for _ in range(settings.classifier_updates):
-            losses = loss(train[torch.randint(len(train), (settings.classifier_batch,))])
+            losses = loss(train[torch.randint(len(train), (CLASSIFIER_BATCH,))])
             optimiser.zero_grad()
             (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
             optimiser.step()

@@ -10,7 +10,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
-from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.problem import MIN_GAIN, MIN_GAIN_UNDER_NOISE, Problem, losses
 from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
@@ -33,14 +33,14 @@ def undetectable_effects(
         measured: the data.
         catalogue: the entries that the search tried; those of random effects are left out.
         advance: called after each entry.
-        settings: thresholds of the search.
+        settings: window lengths and significance level.
 
     Returns:
         The effects at the trials that would be missed; of an entry with several parameters one, if all trials would be
         missed. The effect of each kind that shows most comes first, then the others, in descending order of what shows.
     """
-    level = settings.significance.level / max(1, len(catalogue))
-    lengths = [h for h in possible_horizons(simulation, measured, settings.horizon) if len(measured.selected_on(h))]
+    level = settings.level / max(1, len(catalogue))
+    lengths = [h for h in possible_horizons(simulation, measured, settings) if len(measured.selected_on(h))]
     if not lengths:
         return ()
     tests = [_Test(simulation, measured, horizon, level, settings) for horizon in lengths]
@@ -65,7 +65,7 @@ class _Test:
     def __init__(
         self, simulation: Simulation, measured: Measured, horizon: int, level: float, settings: LoopSettings
     ) -> None:
-        self.problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+        self.problem = Problem.pose(simulation, measured, horizon)
         self.judged, self.level, self.settings = measured.selected_on(horizon), level, settings
         self.right = self.problem.residual((), self.judged)
         self.after = losses(self.right)
@@ -75,9 +75,8 @@ class _Test:
         change = self.right - self.problem.residual((effect,), self.judged)
         before, after = losses(self.right + change), self.after
         share = 1.0 - float(after.mean() / max(before.mean(), 1e-300))
-        rules = self.settings.trace
-        least = rules.min_gain if self.problem.sensor_std is None else rules.min_gain_under_noise
-        missed = share <= least or p_value_of_losses(before, after, self.settings.significance) >= self.level
+        least = MIN_GAIN if self.problem.sensor_std is None else MIN_GAIN_UNDER_NOISE
+        missed = share <= least or p_value_of_losses(before, after, self.settings) >= self.level
         return share, missed
 
 

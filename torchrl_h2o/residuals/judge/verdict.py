@@ -11,16 +11,16 @@ from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
 from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
 from torchrl_h2o.residuals.judge.friction_beside_noise import friction_beside_noise
-from torchrl_h2o.residuals.judge.made_worse import made_worse
+from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, made_worse
 from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
 from torchrl_h2o.residuals.judge.only_ratios import only_ratios
-from torchrl_h2o.residuals.judge.separation import where_it_is_large
+from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
 from torchrl_h2o.residuals.judge.short_delays import short_delays
-from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead
+from torchrl_h2o.residuals.measured.constant_velocity import NEGLIGIBLE_ERROR, errors_ahead
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
-from torchrl_h2o.residuals.measured.missing_force import MissingForces, missing_forces
+from torchrl_h2o.residuals.measured.missing_force import LESS_FORCE, MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
@@ -35,9 +35,26 @@ from torchrl_h2o.residuals.report.contents import (
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, VerdictSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.trace.problem import WORST
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+
+# held-out AUC above which a classifier tells measured from simulated; noise and contacts alone give up to 0.56
+TELLING_AUC = 0.65
+AUTOCORRELATION = 0.2  # rank correlation of successive residuals above which they are not noise
+# median error far ahead, in multiples of the median error by sensor noise, above which something is missing
+FAR_RATIO = 2.0
+FAR_NEGLIGIBLE = 0.01  # median error far ahead, in spreads, that is negligible without sensor noise
+SMALL_REMAINDER = 0.02  # share of the error ahead below which the remaining error is not reported as a missing effect
+# factor by which effects on a joint may raise its missing force and still count as explaining the forces
+OWN_FORCE = 1.2
+# AUC with the effects above which an explanation is not recommended, unless it lowers the error much
+AUC_NEAR_ONE = 0.95
+RAISED = 1.1  # factor by which effects may raise the error in the report's sentence; beyond it they are not recommended
+MUCH_LOWER = 0.5  # share of the error ahead below which an explanation counts in spite of an AUC near one
+EXTREME_FACTOR = 20.0  # factor on a property of the model beyond which the value is reported as implausible
+BLOCKS = 10  # blocks of the report's data in which the largest residual is looked for
 
 
 def reach_verdict(
@@ -66,31 +83,30 @@ def reach_verdict(
         settings: thresholds.
         undetermined: reasons against effects whose value the data leave open.
     """
-    rules = settings.verdict
     with_noise = simulation.with_effects(*effects)
     signs = signs_of_something_missing(with_noise, measured, error, two_sample, settings)
     if not effects:
         if not signs:
             return Verdict(NOTHING_MISSING)
-        return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured, settings))
+        return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured))
     against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
-    of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects, settings)
+    of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects)
     against, signs = (*against, *undetermined, *of_forces), (*signs, *of_motion)
     raised = False
     if (head := error.headline) is not None:
         steps = max(1, round(head.seconds / simulation.control_step))
         worse = made_worse(simulation, mended, measured, steps, settings)
-        if raised := _raises(head, measured, simulation, effects, rules):
+        if raised := _raises(head, measured, simulation, effects):
             against = (*against, *(worse or (f"the effects found raise the error of {headline_words(head)}",)))
         else:
             signs = (*worse, *signs)
     caveats = (
         *short_delays(effects, measured, simulation.control_step),
-        *friction_beside_noise(simulation, mended, effects, rules),
-        *only_ratios(simulation, effects, rules),
+        *friction_beside_noise(simulation, mended, effects),
+        *only_ratios(simulation, effects),
     )
-    if raised or (signs and not _leaves_little(mended, measured, error, two_sample, settings)):
-        where = where_most(mended, measured, settings)
+    if raised or (signs and not _leaves_little(mended, measured, error, two_sample)):
+        where = where_most(mended, measured)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
         return Verdict(kind, (*against, *signs), recommended=not against, where=where, caveats=caveats)
     return Verdict(NOT_EXPLAINED if against else EXPLAINED, against, recommended=not against, caveats=caveats)
@@ -101,32 +117,29 @@ def _raises(
     measured: Measured,
     simulation: Simulation,
     effects: Sequence[Effect],
-    rules: VerdictSettings,
 ) -> bool:
     """Whether effects other than noise raise the error of the sentence, beyond what is negligible."""
     spread = float(measured.observation[:, simulation.state_map.names.index(head.name)].std())
-    return bool(_acting(effects)) and head.after > max(rules.raised * head.before, rules.worse_negligible * spread)
+    return bool(_acting(effects)) and head.after > max(RAISED * head.before, NEGLIGIBLE_ERROR * spread)
 
 
-def _leaves_little(
-    mended: Simulation, measured: Measured, error: ErrorSummary, two_sample: TwoSample, settings: LoopSettings
-) -> bool:
+def _leaves_little(mended: Simulation, measured: Measured, error: ErrorSummary, two_sample: TwoSample) -> bool:
     """Whether hardly an error of the sentence's quantity is left, and of all quantities if a classifier sees one.
 
     If it does, the error must also be small beside that of the guess that every velocity stays as it is. A simulator
     without the rotor of a light link is wrong by turns, and a hundredth of that says little.
     """
-    rules, head, auc = settings.verdict, error.headline, two_sample.auc_after
-    if head is None or head.after >= rules.small_rest * head.before:
+    head, auc = error.headline, two_sample.auc_after
+    if head is None or head.after >= SMALL_REMAINDER * head.before:
         return False
-    if auc is None or auc <= rules.auc:
+    if auc is None or auc <= TELLING_AUC:
         return True
-    if error.after >= rules.small_rest * error.before:
+    if error.after >= SMALL_REMAINDER * error.before:
         return False
     steps, index = max(1, round(head.seconds / mended.control_step)), mended.state_map.names.index(head.name)
-    ahead = [one for one in errors_ahead(mended, measured, Split.REPORT, settings) if one.steps == steps]
+    ahead = [one for one in errors_ahead(mended, measured, Split.REPORT) if one.steps == steps]
     by_guess = [one.guessed[index] for one in ahead if np.isfinite(one.guessed[index])]
-    return not by_guess or bool(head.after < rules.small_rest * by_guess[0])
+    return not by_guess or bool(head.after < SMALL_REMAINDER * by_guess[0])
 
 
 def signs_of_something_missing(
@@ -137,12 +150,12 @@ def signs_of_something_missing(
     settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """The tests by which a simulation with all effects still differs from the data, each in words with its figure."""
-    rules, signs = settings.verdict, []
+    signs = []
     auc = two_sample.auc_after
-    if auc is not None and auc > rules.auc:
+    if auc is not None and auc > TELLING_AUC:
         signs.append(f"a classifier tells measured from simulated transitions (AUC {number(auc, 2)})")
     correlations = {d.name: d.autocorrelation for d in error.per_dimension if d.autocorrelation is not None}
-    high = {name: value for name, value in correlations.items() if np.isfinite(value) and value > rules.autocorrelation}
+    high = {name: value for name, value in correlations.items() if np.isfinite(value) and value > AUTOCORRELATION}
     if high:
         name = max(high, key=lambda name: high[name])
         signs.append(f"successive residuals of {name} are alike (rank correlation {number(high[name], 2)})")
@@ -152,9 +165,9 @@ def signs_of_something_missing(
 
 def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSettings) -> tuple[str, ...]:
     """Whether the error far ahead exceeds what the sensors' noise causes."""
-    rules, names, units = settings.verdict, simulation.state_map.names, simulation.state_map.units
-    times = [max(1, round(seconds / simulation.control_step)) for seconds in settings.horizon.seconds]
-    possible = [steps for steps in times if len(measured.reported_on(steps)) >= rules.far_windows]
+    names, units = simulation.state_map.names, simulation.state_map.units
+    times = [max(1, round(seconds / simulation.control_step)) for seconds in settings.window_seconds]
+    possible = [steps for steps in times if len(measured.reported_on(steps)) >= FAR_WINDOWS]
     if not possible:
         return ()
     steps = max(possible)
@@ -162,16 +175,16 @@ def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSetting
     sensor_std = sensor_noise(simulation, measured)
     if sensor_std is None:
         sensor_std = np.zeros(len(names))
-    starts = in_motion(measured, measured.reported_on(steps), steps, rules.far_windows)
+    starts = in_motion(measured, measured.reported_on(steps), steps, FAR_WINDOWS)
     rng = np.random.default_rng(0)
     error, by_noise = errors_and_noise(simulation, measured, starts, steps, sensor_std, rng)
-    if len(error) < rules.far_windows:
+    if len(error) < FAR_WINDOWS:
         return ()
-    usual = np.maximum(np.median(by_noise, axis=0), rules.far_negligible * spread)
+    usual = np.maximum(np.median(by_noise, axis=0), FAR_NEGLIGIBLE * spread)
     ratio = np.median(error, axis=0) / usual
     worst = int(ratio.argmax())
     p = mannwhitneyu(error[:, worst], np.maximum(by_noise[:, worst], usual[worst]), alternative="greater").pvalue
-    if ratio[worst] <= rules.far_ratio or p >= settings.significance.level / len(names):
+    if ratio[worst] <= FAR_RATIO or p >= settings.level / len(names):
         return ()
     missed, noise = (quantity(v, units[worst], 2) for v in (np.median(error[:, worst]), usual[worst]))
     ahead = duration(steps * simulation.control_step)
@@ -188,24 +201,22 @@ def reasons_against(
     settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """Reasons against putting effects into a simulator for training; empty if there are none."""
-    rules, reasons = settings.verdict, []
+    reasons = []
     acting = _acting(effects)
     if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
     head, auc = error.headline, two_sample.auc_after
     auc_before = two_sample.auc_before
-    if not acting and auc_before is not None and auc is not None and auc > max(rules.auc, auc_before):
+    if not acting and auc_before is not None and auc is not None and auc > max(TELLING_AUC, auc_before):
         before, after = (number(value, 2) for value in (auc_before, auc))
         reasons.append(
             f"the noise found makes simulated transitions no more like the measured ones (AUC {before} → {after})"
         )
-    halved = head is not None and head.after < rules.much_lower * head.before
-    if auc is not None and auc > rules.auc_near_one and not halved:
+    halved = head is not None and head.after < MUCH_LOWER * head.before
+    if auc is not None and auc > AUC_NEAR_ONE and not halved:
         reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")
     names = simulation.names
-    reasons += [
-        f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect, rules))
-    ]
+    reasons += [f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect))]
     return tuple(reasons)
 
 
@@ -219,7 +230,6 @@ def _by_motion_and_forces(
     mended: Simulation,
     measured: Measured,
     effects: Sequence[Effect],
-    settings: LoopSettings,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Signs of something missing, and reasons against effects, by the motion and by the forces that it needs.
 
@@ -228,25 +238,25 @@ def _by_motion_and_forces(
     """
     if not (acting := _acting(effects)):
         return (), ()
-    hardly = no_better_than_constant_velocity(mended, measured, acting, settings)
-    forces = missing_forces(simulation, mended, measured, Split.REPORT, settings.inverse_dynamics)
+    hardly = no_better_than_constant_velocity(mended, measured, acting)
+    forces = missing_forces(simulation, mended, measured, Split.REPORT)
     if forces is None:
         return (), hardly
     more = (
-        *needs_more_force(simulation, forces, settings),
-        *force_in_vain(simulation, mended, measured, acting, settings),
+        *needs_more_force(simulation, forces),
+        *force_in_vain(simulation, mended, measured, acting),
     )
-    explained = forces.fall_by(settings.verdict.less_force) and not more
-    if explained and not any(_raises_its_forces(effect, mended, forces, settings.verdict) for effect in acting):
+    explained = forces.fall_by(LESS_FORCE) and not more
+    if explained and not any(_raises_its_forces(effect, mended, forces) for effect in acting):
         return hardly, ()
     return (), (*hardly, *more)
 
 
-def _raises_its_forces(effect: Effect, mended: Simulation, forces: MissingForces, rules: VerdictSettings) -> bool:
+def _raises_its_forces(effect: Effect, mended: Simulation, forces: MissingForces) -> bool:
     """Whether more force is missing at one of an effect's joints than without the effects."""
     if (joints := getattr(effect, "joints", None)) is None:
         return False
-    return bool(forces.factors[selection.joint_dofs(mended.model, joints)].max(initial=0.0) > rules.own_force)
+    return bool(forces.factors[selection.joint_dofs(mended.model, joints)].max(initial=0.0) > OWN_FORCE)
 
 
 def _lowers_the_error(
@@ -265,18 +275,18 @@ def _lowers_the_error(
         for which in (simulation, mended):
             states = estimate_states(which, measured) if noisy else None
             missed = residuals(which, measured, starts, steps, states=states)[:, -1] / spread
-            sizes.append(np.nan_to_num(np.abs(missed), nan=settings.residual.worst).mean(1))
-        level = settings.verdict.level / len(ahead)
-        if len(starts) >= 2 and p_value_of_losses(sizes[0], sizes[1], settings.significance) < level:
+            sizes.append(np.nan_to_num(np.abs(missed), nan=WORST).mean(1))
+        level = settings.level / len(ahead)
+        if len(starts) >= 2 and p_value_of_losses(sizes[0], sizes[1], settings) < level:
             return True
     return False
 
 
-def _why_implausible(effect: Effect, rules: VerdictSettings) -> str:
+def _why_implausible(effect: Effect) -> str:
     """Why a value is implausible: a factor far from one, or a fit that ended at a bound; empty if it is plausible."""
     for parameter in effect.parameters.values():
         if parameter.neutral == 1.0:  # a factor; a reversed sensor or motor has -1
-            if not 1.0 / rules.extreme_factor < abs(parameter.value) < rules.extreme_factor:
+            if not 1.0 / EXTREME_FACTOR < abs(parameter.value) < EXTREME_FACTOR:
                 return "implausibly far from the model's value"
         elif any(_reached(bound, parameter.value, parameter.neutral) for bound in parameter.bounds):
             return "at the end of what was allowed"
@@ -289,19 +299,18 @@ def _reached(bound: float, value: float, neutral: float) -> bool:
     return bool(np.isfinite(bound) and bound != neutral and abs(value - bound) <= tolerance)
 
 
-def where_most(simulation: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS) -> str:
+def where_most(simulation: Simulation, measured: Measured) -> str:
     """When, in which quantity and at which states the remaining one-step residual is largest, as a clause."""
     rows = measured.reported_on()
     missed = np.abs(residuals(simulation, measured, rows)[:, 0])
     change = np.maximum((measured.following - measured.observation)[rows].std(0), 1e-12)
     size = np.nan_to_num(missed / change, nan=0.0)
     dimension = int(size.mean(0).argmax())
-    blocks = np.array_split(np.arange(len(rows)), settings.verdict.blocks)
+    blocks = np.array_split(np.arange(len(rows)), BLOCKS)
     block = max(blocks, key=lambda part: size[part, dimension].mean() if len(part) else -1.0)
     ends = rows[block[[0, -1]]]
     begin, end = (number(float(measured.time[row]), 3) for row in ends)
     run = f" (run {' to '.join(map(str, np.unique(measured.run[ends])))})" if measured.run[-1] > 0 else ""
-    rules = settings.judge
-    most = np.argsort(size[:, dimension])[-max(1, round(rules.separation_share * len(rows))) :]
-    where = where_it_is_large(simulation, measured, rows, size[:, dimension], most, rules.separation_factor)
+    most = np.argsort(size[:, dimension])[-max(1, round(DESCRIBED_SHARE * len(rows))) :]
+    where = where_it_is_large(simulation, measured, rows, size[:, dimension], most, UNUSUAL_FACTOR)
     return f"most in {simulation.state_map.names[dimension]}, between {begin} and {end} s{run}{where and ',' + where}"

@@ -12,8 +12,13 @@ from torchrl_h2o.effects import Effect, selection
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals, start_states, undelayed_following
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+HEADLINE_SECONDS = (0.1, 0.2, 0.5, 1.0)  # times ahead, in s, from which that of the report's sentence is chosen
+HEADLINE_WINDOWS = 8  # smallest number of held-out windows for such a time
+NEGLIGIBLE_ERROR = 0.001  # median error, in spreads, below which a rise does not count
+# median error ahead up to which effects explain the motion, in errors of the guess of constant velocities
+BETTER_THAN_GUESS = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +43,7 @@ class ErrorsAhead:
         return self.simulated / np.maximum(self.guessed, self.negligible)
 
 
-def errors_ahead(
-    simulation: Simulation, measured: Measured, split: Split, settings: LoopSettings = DEFAULTS
-) -> list[ErrorsAhead]:
+def errors_ahead(simulation: Simulation, measured: Measured, split: Split) -> list[ErrorsAhead]:
     """Errors of a simulator and of the guess at the times ahead of the report's sentence, in ascending order.
 
     Windows in which nothing moves are left out, because no simulator beats the guess there.
@@ -49,14 +52,13 @@ def errors_ahead(
         simulation: the simulator.
         measured: the data.
         split: part of the data.
-        settings: times ahead, and the number of windows that a time needs.
     """
-    rules, errors = settings.judge, []
+    errors = []
     states, following = start_states(simulation, measured), undelayed_following(simulation, measured)
-    negligible = settings.verdict.worse_negligible * np.maximum(measured.observation.std(0), 1e-12)
-    for steps in sorted({max(1, round(time / simulation.control_step)) for time in rules.headline_seconds}):
-        starts = in_motion(measured, measured.spread_windows(split, steps), steps, rules.headline_windows)
-        if len(starts) < rules.headline_windows:
+    negligible = NEGLIGIBLE_ERROR * np.maximum(measured.observation.std(0), 1e-12)
+    for steps in sorted({max(1, round(time / simulation.control_step)) for time in HEADLINE_SECONDS}):
+        starts = in_motion(measured, measured.spread_windows(split, steps), steps, HEADLINE_WINDOWS)
+        if len(starts) < HEADLINE_WINDOWS:
             continue
         missed = residuals(simulation, measured, starts, steps, states=states)[:, -1]
         wrong = following[starts + steps - 1] - at_constant_velocity(simulation, states[starts], steps)

@@ -23,9 +23,7 @@ def in_motion(measured: Measured, starts: np.ndarray, steps: int, least: int) ->
     Returns:
         (V), first rows of these windows.
     """
-    rows = measured.remembered(
-        "rows in motion", None, lambda: moving_rows(measured.observation, measured.run, measured.settings)
-    )
+    rows = measured.remembered("rows in motion", None, lambda: moving_rows(measured.observation, measured.run))
     passed = np.concatenate([[0], np.cumsum(rows)])
     moves = passed[starts + steps] > passed[starts]
     return starts[moves] if moves.sum() >= least else starts

@@ -15,8 +15,11 @@ from torchrl_h2o.residuals.measured.linearised import Linearised
 from torchrl_h2o.residuals.measured.residual import executed_actions
 from torchrl_h2o.residuals.measured.settling import settle
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
-from torchrl_h2o.residuals.settings import MeasuredSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+NOISE_CLIP = 4.0  # robust standard deviations at which residuals are clipped before the sensors' noise is estimated
+FILTER_SURPRISE = 4.0  # normalised squared innovation beyond which the Kalman filter follows the measurement
+VARIANCE_FLOOR = 1e-12  # smallest variance in the filter, in squared spreads
 
 (_posv,) = get_lapack_funcs(("posv",), dtype=np.float64)
 
@@ -74,7 +77,7 @@ def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
 def _estimated_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None) -> np.ndarray:
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
-    return _states(simulation, measured, linearised, _filter(linearised, noise, measured.settings).mean)
+    return _states(simulation, measured, linearised, _filter(linearised, noise).mean)
 
 
 def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None = None) -> np.ndarray:
@@ -85,7 +88,7 @@ def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
     """
     linearised = Linearised.about(simulation, measured)
     noise = _noise_levels(linearised, measured) if noise is None else noise
-    return _states(simulation, measured, linearised, _smooth(linearised, _filter(linearised, noise, measured.settings)))
+    return _states(simulation, measured, linearised, _smooth(linearised, _filter(linearised, noise)))
 
 
 def _states(simulation: Simulation, measured: Measured, linearised: Linearised, estimate: np.ndarray) -> np.ndarray:
@@ -105,13 +108,12 @@ def noise_levels(simulation: Simulation, measured: Measured) -> NoiseLevels:
 
 
 def _noise_levels(linearised: Linearised, measured: Measured) -> NoiseLevels:
-    settings = measured.settings
     known, n = linearised.known & measured.usable & (measured.split == Split.FIT), linearised.observed.shape[1]
     rows = np.flatnonzero(known[:-1] & known[1:] & linearised.follows[:-1])
     residual = np.zeros_like(linearised.observed)
     residual[rows] = linearised.observed[rows + 1] - linearised.reached[rows]
-    size = np.median(np.abs(residual[rows]), axis=0) / 0.6745 + np.sqrt(settings.variance_floor)
-    clipped = np.clip(residual, -settings.noise_clip * size, settings.noise_clip * size)
+    size = np.median(np.abs(residual[rows]), axis=0) / 0.6745 + np.sqrt(VARIANCE_FLOOR)
+    clipped = np.clip(residual, -NOISE_CLIP * size, NOISE_CLIP * size)
     pairs = rows[:-1][np.diff(rows) == 1]
     sensor = _sensor_variance(clipped[pairs], clipped[pairs + 1], linearised.slope[pairs + 1], size)
     by_sensors = np.einsum("tij,j,tkj->ik", linearised.slope[rows], sensor, linearised.slope[rows]) / max(1, len(rows))
@@ -133,11 +135,11 @@ def _sensor_variance(before: np.ndarray, after: np.ndarray, slope: np.ndarray, s
     return np.maximum(share, 0.0) * size**2
 
 
-def _filter(linearised: Linearised, noise: NoiseLevels, settings: MeasuredSettings) -> _Filtered:
+def _filter(linearised: Linearised, noise: NoiseLevels) -> _Filtered:
     observed, known, n = linearised.observed, linearised.known, linearised.observed.shape[1]
     spread = linearised.spread
-    sensor = np.diag((noise.sensor / spread) ** 2 + 1e-4 * settings.variance_floor)
-    model = noise.model / np.outer(spread, spread) + settings.variance_floor * np.eye(n)
+    sensor = np.diag((noise.sensor / spread) ** 2 + 1e-4 * VARIANCE_FLOOR)
+    model = noise.model / np.outer(spread, spread) + VARIANCE_FLOOR * np.eye(n)
     mean, covariance = observed.copy(), np.tile(sensor, (len(observed), 1, 1))
     predicted_mean, predicted_covariance = mean.copy(), covariance.copy()
     for row in np.flatnonzero(linearised.follows):
@@ -151,7 +153,7 @@ def _filter(linearised: Linearised, noise: NoiseLevels, settings: MeasuredSettin
         if known[following]:
             innovation = observed[following] - guess
             surprise = innovation @ _solve(doubt + sensor, innovation) / n
-            if surprise > settings.filter_surprise:
+            if surprise > FILTER_SURPRISE:
                 doubt = doubt * surprise
             gain = _solve(doubt + sensor, doubt).T
             mean[following] = guess + gain @ innovation

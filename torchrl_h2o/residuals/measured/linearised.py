@@ -12,6 +12,8 @@ from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+STATE_NUDGE = 1e-3  # step of the finite differences by the observation, in spreads
+
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
@@ -44,7 +46,7 @@ class Linearised:
         spread = np.where(spread > 0.0, spread, 1.0)
         actions = executed_actions(simulation, measured)
         at = {"time": measured.time, "activations": activations(simulation, measured, actions)}
-        reached, slope = one_step(simulation, states, actions, measured.settings.state_nudge * spread, **at)
+        reached, slope = one_step(simulation, states, actions, STATE_NUDGE * spread, **at)
         slope = slope * spread / spread[:, None]
         follows = np.append(measured.run[1:] == measured.run[:-1], False)
         return cls(spread, observed / spread, reached / spread, slope, follows, states)

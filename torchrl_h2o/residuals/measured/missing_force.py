@@ -15,8 +15,19 @@ import numpy as np
 from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, Split, thinned
-from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+# factor by which effects may raise the force that a joint's measured motion needs beyond the simulator's
+MORE_FORCE = 1.5
+# factor on the product of the missing forces below which effects explain them, whatever the motion shows
+LESS_FORCE = 0.5
+HALF_WIDTH = 0.025  # half the length, in s, of the windows over which accelerations and forces are averaged
+MOST_ROWS = 1500  # largest number of rows in the regression
+# parts of a window, in the middle of each of which the simulator's force is computed; their mean counts
+PARTS_OF_WINDOW = 10
+RESTING_SHARE = 0.1  # share of a joint's usual speed below which it counts as resting
+LEAST_MOVING = 50  # smallest number of windows in which a joint moves in one direction for the others to be left out
+LEAST_ROWS = 200  # smallest number of rows
 
 SMALL = 0.02  # share of a missing force that the means over windows may make up
 LOWER = 0.95  # factor on a missing force below which it falls; chance alone changes it less
@@ -52,7 +63,6 @@ def measured_motion(
     simulation: Simulation,
     measured: Measured,
     split: Split,
-    settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
 ) -> Motion | None:
     """The motion in windows that reach ``half_width`` to both sides of a row, long enough to average out noise.
 
@@ -63,7 +73,6 @@ def measured_motion(
         simulation: the simulator, whose effects on sensors and actions are applied.
         measured: the data.
         split: part of the data.
-        settings: rows and smoothing.
 
     Returns:
         The motion in evenly spread windows; None if coordinates are unobserved, if actuators have a state of their own,
@@ -71,17 +80,17 @@ def measured_motion(
     """
     if simulation.model.na or not simulation.state_map.observe.any(0).all():
         return None
-    half = max(1, round(settings.half_width / simulation.control_step))
-    starts = thinned(measured.windows(2 * half + 1, split=split), settings.rows)
+    half = max(1, round(HALF_WIDTH / simulation.control_step))
+    starts = thinned(measured.windows(2 * half + 1, split=split), MOST_ROWS)
     states, model = start_states(simulation, measured), simulation.model
-    ends = np.linspace(0, 2 * half, min(2 * half, settings.parts_of_window) + 1).round().astype(int)
+    ends = np.linspace(0, 2 * half, min(2 * half, PARTS_OF_WINDOW) + 1).round().astype(int)
     rows = starts[:, None] + ends
     rows = rows[np.isfinite(states[rows]).all((1, 2))]
     rows = rows[_free_of_contacts(simulation, states[rows, : model.nq])]
-    if len(rows) < settings.least_rows:
+    if len(rows) < LEAST_ROWS:
         return None
     velocity, steps = states[rows, model.nq :], np.diff(ends)
-    slowest = settings.resting * velocity.std((0, 1))
+    slowest = RESTING_SHARE * velocity.std((0, 1))
     moving = (velocity > slowest).all(1) | (velocity < -slowest).all(1)
     middle = (velocity[:, 1:] + velocity[:, :-1]) / 2.0
     later = steps / 2.0 * simulation.control_step
@@ -93,7 +102,7 @@ def measured_motion(
         np.add.reduceat(actions, ends[:-1], axis=1) / steps[:, None],
         measured.time[rows[:, :-1]] + later,
         steps / steps.sum(),
-        moving | (moving.sum(0) < settings.least_moving),
+        moving | (moving.sum(0) < LEAST_MOVING),
     )
 
 
@@ -206,14 +215,13 @@ def missing_forces(
     mended: Simulation,
     measured: Measured,
     split: Split,
-    settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
 ) -> MissingForces | None:
     """The forces that a simulator lacks without and with effects; None if :func:`measured_motion` gives no motion."""
-    motion, same = (measured_motion(which, measured, split, settings) for which in (simulation, mended))
+    motion, same = (measured_motion(which, measured, split) for which in (simulation, mended))
     if motion is None or same is None:
         return None
     before, after = _usual_size(simulation, motion), _usual_size(mended, same)
-    return MissingForces(before, after, _by_noise(mended, measured, same, settings))
+    return MissingForces(before, after, _by_noise(mended, measured, same))
 
 
 def _usual_size(simulation: Simulation, motion: Motion) -> np.ndarray:
@@ -221,15 +229,13 @@ def _usual_size(simulation: Simulation, motion: Motion) -> np.ndarray:
     return np.nanmedian(np.abs(missing_force(simulation, motion)), axis=0)
 
 
-def _by_noise(
-    simulation: Simulation, measured: Measured, motion: Motion, settings: InverseDynamicsSettings
-) -> np.ndarray | float:
+def _by_noise(simulation: Simulation, measured: Measured, motion: Motion) -> np.ndarray | float:
     """Usual size of the force, (nv), that noise of the measured velocities makes missing."""
     if (std := sensor_noise(simulation, measured)) is None:
         return 0.0
     model, observe = simulation.model, simulation.state_map.observe
     of_velocity = np.abs(observe[:, model.nq :].T) @ std  # each velocity has one sensor
-    half = max(1, round(settings.half_width / simulation.control_step))
+    half = max(1, round(HALF_WIDTH / simulation.control_step))
     acceleration = np.sqrt(2.0) * of_velocity / (2.0 * half * simulation.control_step)
     data, inertia = mujoco.MjData(model), np.empty((model.nv, model.nv))
     sizes = []

@@ -17,11 +17,15 @@ from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+NOISE_ROWS = 2000  # transitions from which the sensors' noise is estimated
+# sensor noise, in spreads, up to which a dimension counts as free of noise; the bias of a fit is negligible
+NOISELESS = 1e-4
+
 
 def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
     """Standard deviation of each sensor's noise, (n), in its unit; None if all of them are negligible."""
     std = sensor_std(simulation, measured)
-    return std if (std > measured.settings.noiseless * measured.observation.std(0)).any() else None
+    return std if (std > NOISELESS * measured.observation.std(0)).any() else None
 
 
 def sensor_std(simulation: Simulation, measured: Measured) -> np.ndarray:
@@ -30,7 +34,7 @@ def sensor_std(simulation: Simulation, measured: Measured) -> np.ndarray:
     It is not less than the known error of columns that were estimated from others. Such errors are alike in successive
     rows, so the residuals alone would show too little of them.
     """
-    first = slice(0, measured.settings.noise_rows)
+    first = slice(0, NOISE_ROWS)
     std = measured.remembered(
         "noise of the sensors", simulation, lambda: noise_levels(simulation, measured.part(first)).sensor
     )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import SETTLING_STEPS, Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+SETTLED_ROWS = 50  # largest number of successive rows that share a simulation of the unobserved coordinates
 
 
 def settle(
@@ -26,12 +28,12 @@ def settle(
     Returns:
         The states, (T, nq + nv); ``states`` itself if the simulator has no such coordinates.
     """
-    hidden, settings = np.asarray(simulation.state_map.hidden, int), measured.settings
+    hidden = np.asarray(simulation.state_map.hidden, int)
     if not len(hidden) or not len(rows):
         return states
     begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])
-    first, last = _chains(np.unique(rows), begins, settings.settling_steps, settings.settled_rows)
-    steps = np.arange(-settings.settling_steps, (last - first).max())[:, None]
+    first, last = _chains(np.unique(rows), begins, SETTLING_STEPS, SETTLED_ROWS)
+    steps = np.arange(-SETTLING_STEPS, (last - first).max())[:, None]
     path = np.clip(first + steps, begins[first], last)
     before = activations(simulation, measured, actions)[path]
     after = simulation.follow(states[path], actions[path], measured.time[path], before)

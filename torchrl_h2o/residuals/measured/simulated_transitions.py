@@ -12,8 +12,9 @@ from torchrl_h2o.effects import ActionEffect, ObservationDelay, ObservationEffec
 from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+ACTION_MEMORY = 12  # first control steps of a run in which earlier actions count as unknown
 
 
 def simulate_transitions(simulation: Simulation, real: TensorDictBase, *, seed: int = 0) -> torch.Tensor:
@@ -74,5 +75,5 @@ def _without_history(simulation: Simulation, measured: Measured) -> np.ndarray:
     rows = np.zeros(len(measured), bool)
     if any(simulation.pipeline.of_kind(kind) for kind in (ActionEffect, ObservationDelay)):
         for run in measured.runs:
-            rows[run.start : run.start + DEFAULTS.measured.action_memory] = True
+            rows[run.start : run.start + ACTION_MEMORY] = True
     return rows

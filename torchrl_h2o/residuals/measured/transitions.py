@@ -15,8 +15,20 @@ from tensordict import TensorDictBase
 from torchrl_h2o.data import DataError
 from torchrl_h2o.data.readers.ted import require_ted
 from torchrl_h2o.residuals.measured.moving_rows import moving_rows
-from torchrl_h2o.residuals.settings import DEFAULTS, MeasuredSettings
+from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+# usable transitions below which no conclusion is drawn: no test could distinguish an effect from chance
+MIN_TRANSITIONS = 200
+# share of the transitions that are not reported on, by which effects are chosen; a fifth of all by default
+SELECTION_SHARE = 0.27
+BORDER_MOVES = 0.1  # share of the transitions by which a border between two parts of the data moves to the end of a run
+# ratio of an action's ranges (5th to 95th percentile) in two parts of several logs below which the logs differ in kind,
+# such as free and driven motion
+ALIKE_RANGES = 0.3
+SETTLING_STEPS = 64  # control steps after which the observed coordinates determine the unobserved ones
+# neighbouring windows that are kept together where there are unobserved coordinates, to share a simulation
+WINDOWS_IN_BLOCK = 25
 
 Result = TypeVar("Result")
 
@@ -53,7 +65,7 @@ class Measured:
         split: (T), the :class:`Split` of each transition.
         left_out: number of excluded rows by reason.
         source: name of the data in reports and errors.
-        settings: sampling of windows, noise estimation and state estimation.
+        max_windows: largest number of windows in a fit or a judgement.
         estimated_std: (n), standard deviation of the errors of columns that were estimated from others, such as
             velocities from positions, and 0 for measured ones; None if all were measured.
         block: neighbouring windows that are kept or left out together.
@@ -68,7 +80,7 @@ class Measured:
     split: np.ndarray
     left_out: dict[str, int]
     source: str
-    settings: MeasuredSettings = DEFAULTS.measured
+    max_windows: int = DEFAULTS.max_windows
     estimated_std: np.ndarray | None = None
     block: int = 1
     _results: OrderedDict[tuple[Hashable, Simulation | None], Any] = field(
@@ -83,7 +95,7 @@ class Measured:
         *,
         source: str = "transitions",
         held_out: float | Collection[int] = HELD_OUT,
-        settings: MeasuredSettings = DEFAULTS.measured,
+        max_windows: int = DEFAULTS.max_windows,
     ) -> Measured:
         """Converts a TED TensorDict, checks its widths against the simulation, and divides it into three parts.
 
@@ -98,8 +110,8 @@ class Measured:
             simulation: simulator that the data will be compared with.
             source: name of the data in reports and errors.
             held_out: share of the transitions, taken from the end, on which errors are reported; or the indices of
-                the logs on which they are. Of the rest, ``settings.selection`` is for the selection of effects.
-            settings: sampling of windows, noise estimation and state estimation.
+                the logs on which they are. Of the rest, ``SELECTION_SHARE`` is for the selection of effects.
+            max_windows: largest number of windows in a fit or a judgement.
 
         Raises:
             DataError: if observations or actions do not have the simulation's width, or no log is left for fits.
@@ -122,12 +134,12 @@ class Measured:
             run,
             _float64(data["time"]).flatten() if "time" in data.keys() else step,
             ~clipped,
-            divided(run, logs, held_out, observation, action, settings, source=str(source)),
+            divided(run, logs, held_out, observation, action, source=str(source)),
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
-            settings,
+            max_windows,
             _rms(_float64(data["observation_std"])) if "observation_std" in data.keys() else None,
-            settings.windows_in_block if simulation.state_map.hidden else 1,
+            WINDOWS_IN_BLOCK if simulation.state_map.hidden else 1,
         )
         if not simulation.state_map.hidden:
             return measured
@@ -162,10 +174,10 @@ class Measured:
         return self.time[0] + np.concatenate([[0.0], np.cumsum(np.where(anew, usual, steps))])
 
     def run_beginnings(self) -> np.ndarray:
-        """Mask, (T), of the first ``settings.settling_steps`` rows of each run, at most a quarter of the run."""
+        """Mask, (T), of the first ``SETTLING_STEPS`` rows of each run, at most a quarter of the run."""
         rows = np.zeros(len(self), bool)
         for run in self.runs:
-            rows[run.start : run.start + min(self.settings.settling_steps, (run.stop - run.start) // 4)] = True
+            rows[run.start : run.start + min(SETTLING_STEPS, (run.stop - run.start) // 4)] = True
         return rows
 
     def windows(self, horizon: int, stride: int = 1, *, split: Split | None = None) -> np.ndarray:
@@ -185,7 +197,7 @@ class Measured:
         return starts[whole & (self.run[starts] == self.run[starts + horizon - 1])]
 
     def fitted(self, horizon: int = 1) -> np.ndarray:
-        """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``settings.max_windows``."""
+        """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``max_windows``."""
         return self.spread_windows(Split.FIT, horizon)
 
     def selected_on(self, horizon: int = 1) -> np.ndarray:
@@ -197,8 +209,8 @@ class Measured:
         return self.spread_windows(Split.REPORT, horizon)
 
     def spread_windows(self, split: Split, horizon: int) -> np.ndarray:
-        """First rows, (W), of a part's windows: not overlapping, evenly thinned to ``settings.max_windows``."""
-        return thinned(self.windows(horizon, horizon, split=split), self.settings.max_windows, self.block)
+        """First rows, (W), of a part's windows: not overlapping, evenly thinned to ``max_windows``."""
+        return thinned(self.windows(horizon, horizon, split=split), self.max_windows, self.block)
 
     def part(self, rows: slice) -> Measured:
         """A contiguous piece of the transitions."""
@@ -229,10 +241,10 @@ class Measured:
 
     def why_no_conclusion(self) -> str | None:
         """Reason why these data allow no conclusion about a simulator; None if a conclusion is possible."""
-        if self.usable.sum() < self.settings.min_transitions:
+        if self.usable.sum() < MIN_TRANSITIONS:
             return (
                 f"{int(self.usable.sum())} usable transitions are too few to tell an effect from chance; record at "
-                f"least {self.settings.min_transitions}"
+                f"least {MIN_TRANSITIONS}"
             )
         still = np.flatnonzero(np.ptp(self.observation[self.usable], axis=0) == 0.0)
         if len(still) == self.observation.shape[1]:
@@ -251,7 +263,6 @@ def divided(
     held_out: float | Collection[int],
     observation: np.ndarray,
     action: np.ndarray,
-    settings: MeasuredSettings = DEFAULTS.measured,
     *,
     source: str = "transitions",
 ) -> np.ndarray:
@@ -267,7 +278,6 @@ def divided(
         held_out: share of the transitions, from the end, on which errors are reported, or the indices of these logs.
         observation: (T, n), by which it is judged whether something moves.
         action: (T, nu), by whose ranges logs differ in kind.
-        settings: share of the selection, how far a border moves to the end of a run, and which logs are alike.
         source: name of the data in errors.
 
     Returns:
@@ -283,7 +293,7 @@ def divided(
     """
     split = np.full(len(run), Split.FIT)
     if isinstance(held_out, float | int):
-        split[_border(run, 1.0 - held_out, settings) :] = Split.REPORT
+        split[_border(run, 1.0 - held_out) :] = Split.REPORT
     else:
         split[np.isin(logs, list(held_out))] = Split.REPORT
         if (split == split[0]).all():
@@ -293,36 +303,36 @@ def divided(
                 source=source,
             )
     rest = np.flatnonzero(split == Split.FIT)
-    border = _border(run[rest], 1.0 - settings.selection, settings)
-    if len(np.unique(logs[rest])) > 1 and not _alike(action[rest[:border]], action[rest[border:]], settings):
-        moves = moving_rows(observation, run, settings)
+    border = _border(run[rest], 1.0 - SELECTION_SHARE)
+    if len(np.unique(logs[rest])) > 1 and not _alike(action[rest[:border]], action[rest[border:]]):
+        moves = moving_rows(observation, run)
         for log in np.unique(logs[rest]):
             rows = rest[logs[rest] == log]
             passed = np.cumsum(moves[rows]) / max(1, moves[rows].sum())
-            selected = (passed > 1.0 - settings.selection) & ((passed < 1.0) | moves[rows])
+            selected = (passed > 1.0 - SELECTION_SHARE) & ((passed < 1.0) | moves[rows])
             split[rows[selected]] = Split.SELECTION
     else:
         split[rest[border:]] = Split.SELECTION
     return split
 
 
-def _alike(some: np.ndarray, others: np.ndarray, settings: MeasuredSettings) -> bool:
+def _alike(some: np.ndarray, others: np.ndarray) -> bool:
     """Whether each action has in some rows about the range that it has in the others."""
     if not len(some) or not len(others):
         return True
     ranges = [np.diff(np.quantile(rows, (0.05, 0.95), axis=0), axis=0)[0] for rows in (some, others)]
     low, high = np.sort(ranges, axis=0)
-    return bool((low >= settings.alike * high).all())
+    return bool((low >= ALIKE_RANGES * high).all())
 
 
-def _border(run: np.ndarray, share: float, settings: MeasuredSettings) -> int:
+def _border(run: np.ndarray, share: float) -> int:
     """Row at a share of the rows, or the nearest first row of a run, if one is near enough."""
     wanted = round(share * len(run))
     firsts = np.flatnonzero(np.diff(run)) + 1
     if not 0 < wanted < len(run) or not len(firsts):
         return wanted
     nearest = int(firsts[np.abs(firsts - wanted).argmin()])
-    return nearest if abs(nearest - wanted) <= settings.border_moves * len(run) else wanted
+    return nearest if abs(nearest - wanted) <= BORDER_MOVES * len(run) else wanted
 
 
 def thinned(starts: np.ndarray, most: int, block: int = 1) -> np.ndarray:

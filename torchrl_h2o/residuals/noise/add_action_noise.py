@@ -11,6 +11,8 @@ from torchrl_h2o.residuals.noise.estimate import estimate_noise
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
+
 
 def add_action_noise(
     simulation: Simulation,
@@ -35,9 +37,9 @@ def add_action_noise(
     own = [effect for effect in simulation.effects if isinstance(effect, ActionNoise) and effect.actuators is None]
     own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
     noise = estimate_noise(simulation.with_effects(*explanation.effects), measured, settings)
-    variance = noise.action_std**2 if noise.p_value < settings.significance.level else 0.0
+    variance = noise.action_std**2 if noise.p_value < settings.level else 0.0
     missing = variance - own_variance
-    if abs(missing) <= settings.noise.min_change * own_variance:
+    if abs(missing) <= MIN_CHANGE * own_variance:
         return explanation
     std = math.copysign(math.sqrt(abs(missing)), missing)
     half = noise.half_width if variance else 0.0

@@ -13,10 +13,17 @@ import numpy as np
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_std, stand_in
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.noise.scatter import Scatter
-from torchrl_h2o.residuals.noise.variances import fitted_variances, log_likelihood
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, NoiseSettings
+from torchrl_h2o.residuals.noise.variances import BLOCKS, fitted_variances, log_likelihood
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.significance import p_value
+
+MIN_SHARE = 1e-3  # smallest reported standard deviation, as a share of the control range
+# largest plausible standard deviation, in RMS of the actions; larger estimates come from filtered sensors
+MAX_SHARE = 2.0
+# number of half-widths that the estimate must exceed, because the interval omits errors that blocks share
+MIN_HALF_WIDTHS = 3.0
+BEYOND_SENSORS = 3.0  # required multiple of the estimate from synthetic data with sensor noise only
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,32 +59,29 @@ def estimate_noise(simulation: Simulation, measured: Measured, settings: LoopSet
     Returns:
         The estimate.
     """
-    rules = settings.noise
-    fitted = Scatter.of(simulation, measured, measured.fitted(), settings=rules)
-    judged = Scatter.of(simulation, measured, measured.selected_on(), fitted.scale, settings=rules)
+    fitted = Scatter.of(simulation, measured, measured.fitted())
+    judged = Scatter.of(simulation, measured, measured.selected_on(), fitted.scale)
     # noise with opposite signs in successive residuals is attributed to the sensors, even if action noise could fit it
     by_sensors = sensor_std(simulation, measured)
-    estimate, left_out = fitted_variances(fitted, by_sensors, rules)
-    silent, _ = fitted_variances(fitted.without_action(), by_sensors, rules)
+    estimate, left_out = fitted_variances(fitted, by_sensors)
+    silent, _ = fitted_variances(fitted.without_action(), by_sensors)
     std = float(np.sqrt(estimate[0]))
-    half_width = float(1.96 * np.sqrt(rules.blocks - 1) * np.std(np.sqrt(left_out)))
-    if not _plausible(simulation, measured, std, half_width, rules):
+    half_width = float(1.96 * np.sqrt(BLOCKS - 1) * np.std(np.sqrt(left_out)))
+    if not _plausible(simulation, measured, std, half_width):
         return NoiseEstimate(std, half_width, 1.0)
     sensors_alone = stand_in(simulation, measured, by_sensors, np.random.default_rng(0))
-    scatter_alone = Scatter.of(simulation, sensors_alone, measured.fitted(), settings=rules)
-    alone, _ = fitted_variances(scatter_alone, by_sensors, rules)
-    if std < rules.beyond_sensors * np.sqrt(alone[0]):
+    scatter_alone = Scatter.of(simulation, sensors_alone, measured.fitted())
+    alone, _ = fitted_variances(scatter_alone, by_sensors)
+    if std < BEYOND_SENSORS * np.sqrt(alone[0]):
         return NoiseEstimate(std, half_width, 1.0)
-    gain = log_likelihood(estimate, judged, rules) - log_likelihood(silent, judged.without_action(), rules)
-    return NoiseEstimate(std, half_width, p_value(gain, settings.significance))
+    gain = log_likelihood(estimate, judged) - log_likelihood(silent, judged.without_action())
+    return NoiseEstimate(std, half_width, p_value(gain, settings))
 
 
-def _plausible(
-    simulation: Simulation, measured: Measured, std: float, half_width: float, settings: NoiseSettings
-) -> bool:
+def _plausible(simulation: Simulation, measured: Measured, std: float, half_width: float) -> bool:
     """Whether an estimate exceeds its uncertainty and a minimum, and is not larger than the actions."""
     low, high = simulation.model.actuator_ctrlrange.T
     reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
     asked = float(np.sqrt((measured.action**2).mean()))
-    least = max(settings.min_share * reach, settings.min_half_widths * half_width)
-    return bool(least < std < settings.max_share * asked)
+    least = max(MIN_SHARE * reach, MIN_HALF_WIDTHS * half_width)
+    return bool(least < std < MAX_SHARE * asked)

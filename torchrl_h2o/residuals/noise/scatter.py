@@ -12,8 +12,9 @@ from torchrl_h2o.residuals.measured.linearised import one_step
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS, NoiseSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+NUDGE = 1e-4  # step of the finite differences, in spreads or in shares of the largest action
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +44,11 @@ class Scatter:
         measured: Measured,
         rows: np.ndarray,
         scale: np.ndarray | None = None,
-        *,
-        settings: NoiseSettings = DEFAULTS.noise,
     ) -> Scatter:
         """Residuals of some transitions; their scale is the mean absolute residual by default."""
         states = start_states(simulation, measured, rows)
         residual = residuals(simulation, measured, rows, states=states)[:, 0]
-        by_action, by_sensor = derivatives(simulation, measured, rows, states, settings.nudge)
+        by_action, by_sensor = derivatives(simulation, measured, rows, states, NUDGE)
         whole = np.isfinite(residual).all(1) & np.isfinite(by_action).all((1, 2)) & np.isfinite(by_sensor).all((1, 2))
         # keeps the half of the transitions in which noise grows least, because derivatives are invalid near contacts
         growth = np.where(whole, (by_sensor**2).sum((1, 2)), np.inf)
@@ -85,7 +84,7 @@ def derivatives(
     measured: Measured,
     rows: np.ndarray,
     states: np.ndarray,
-    nudge: float = DEFAULTS.noise.nudge,
+    nudge: float = NUDGE,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Differentiates the observation after one step by finite differences.
 

@@ -13,8 +13,10 @@ from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
 from torchrl_h2o.residuals.trace.outcome import Attempt
-from torchrl_h2o.residuals.trace.problem import matters
+from torchrl_h2o.residuals.trace.problem import MIN_GAIN, MIN_GAIN_UNDER_NOISE, matters
 from torchrl_h2o.residuals.trace.screening import (
+    LEADS_COMBINED,
+    SAME_CHANGE,
     Lead,
     are_possible_alone,
     free_parameters,
@@ -22,8 +24,18 @@ from torchrl_h2o.residuals.trace.screening import (
     promising_sets,
     unlike,
 )
-from torchrl_h2o.residuals.trace.settings import TraceSettings
-from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.significance import BEYOND_NOISE
+from torchrl_h2o.residuals.trace.state import MUCH_LOWER, SKETCH_EVALUATIONS, SearchState
+
+# share of the held-out loss; an addition that explains more passes without a test against synthetic noise
+SURELY_BEYOND_NOISE = 0.5
+# pairs (size of a set, number of sets of this size that are sketched); larger sets if no smaller one helps
+SET_SIZES = ((1, 16), (2, 4), (3, 4))
+FINALISTS = 3  # number of sketched sets of one size that are fitted on all windows of the search, at least
+CLOSE_SKETCH = 0.4  # share of the gain of the best sketch of one size from which further sets are fitted
+BEAM_WIDTH = 3  # largest number of lists of effects that the search grows side by side
+BEAM_LOSS = 1.25  # multiple of the lowest loss up to which another list is grown as well
+SAME_FIT = 1e-3  # relative difference up to which two losses count as equal
 
 Found = TypeVar("Found")
 Sketch = tuple[tuple[Lead, ...], Fit]  # a set of leads, and a quick fit with them
@@ -92,12 +104,11 @@ def additions(
     Returns:
         The additions of the smallest size of which one passes, or none.
     """
-    rules = state.settings.trace
-    among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
+    among = [lead for lead in leads[:LEADS_COMBINED] if lead.promise > 0.0]
     left = state.first.selection_loss(state.fit.effects)
-    for size, count in rules.set_sizes:
+    for size, count in SET_SIZES:
         enough_left = size == 1 or matters(state.first_loss, left, 0.0, size * state.min_share)
-        if len(among) < size or number_of_effects(state) + size > rules.max_effects or not enough_left:
+        if len(among) < size or number_of_effects(state) + size > state.settings.max_effects or not enough_left:
             break
         sketches = _sketches(state, leads, among, size, count, advance)
         if size == 1:
@@ -128,16 +139,14 @@ def tested(
     present = Addition(state.entries, state.fit, 0, before, state.first.selection_loss(state.fit.effects))
     fitted = _fitted(state, sketches, advance)
     passed = sorted((one for one in fitted if _pays(state, present, one)), key=_loss)
-    near = [
-        one for one in _close_to_best(passed, state.settings.trace) if _exceeds_noise(state, one, before.mean(), rng)
-    ]
+    near = [one for one in _close_to_best(passed) if _exceeds_noise(state, one, before.mean(), rng)]
     return Additions(state, leads, passed, near)
 
 
-def _close_to_best(found: Sequence[Addition], rules: TraceSettings) -> list[Addition]:
+def _close_to_best(found: Sequence[Addition]) -> list[Addition]:
     """The leading additions whose loss is close to the lowest, without duplicates; at most ``beam_width``."""
-    near = [one for one in found if one.loss <= rules.beam_loss * found[0].loss]
-    return distinct(near, _loss, rules.same_fit)[: rules.beam_width]
+    near = [one for one in found if one.loss <= BEAM_LOSS * found[0].loss]
+    return distinct(near, _loss, SAME_FIT)[:BEAM_WIDTH]
 
 
 def _loss(addition: Addition) -> float:
@@ -165,12 +174,12 @@ def distinct(found: Sequence[Found], loss: Callable[[Found], float], same: float
 def _exceeds_noise(state: SearchState, addition: Addition, before: float, rng: np.random.Generator) -> bool:
     """Whether an addition explains clearly more of the loss than it does in data with sensor noise alone."""
     gain = 1.0 - addition.loss / before
-    if gain > state.settings.trace.surely_beyond_noise:
+    if gain > SURELY_BEYOND_NOISE:
         return True
     effects, added = state.fit.effects, addition.entries[-addition.added :]
     free = [*(() for _ in effects), *map(free_parameters, added)]
     by_noise = explained_by_noise(state, (*effects, *addition.fit.effects[-addition.added :]), free, rng)
-    return gain > state.settings.trace.beyond_noise * by_noise
+    return gain > BEYOND_NOISE * by_noise
 
 
 def _sketches(
@@ -183,7 +192,7 @@ def _sketches(
 ) -> list[Sketch]:
     """Quick fits of the most promising sets of one size."""
     effects = state.fit.effects
-    sets = [(lead,) for lead in unlike(leads, state.settings.trace.same_change)[:count]]
+    sets = [(lead,) for lead in unlike(leads, SAME_CHANGE)[:count]]
     if size > 1:
         sets = promising_sets(state.problem, effects, among, size, state.windows.screened, count)
     sketches = []
@@ -206,7 +215,7 @@ def sketched_set(state: SearchState, start: Sequence[Effect], added: Sequence[Le
     if not is_possible(state.problem, start):
         return None
     free = [*map(free_parameters, state.entries), *(lead.free for lead in added)]
-    return state.sketched(start, free, state.settings.trace.sketch_evaluations)
+    return state.sketched(start, free, SKETCH_EVALUATIONS)
 
 
 def _remember(state: SearchState, sketches: Sequence[Sketch]) -> SearchState:
@@ -226,13 +235,12 @@ def _sketch_loss(sketch: Sketch) -> float:
 
 def _fitted(state: SearchState, sketches: Sequence[Sketch], advance: Callable[[], object]) -> list[Addition]:
     """The sketched sets that come close to the best one, after a full fit."""
-    rules = state.settings.trace
-    ranked = distinct(sorted(sketches, key=_sketch_loss), _sketch_loss, rules.same_fit)
+    ranked = distinct(sorted(sketches, key=_sketch_loss), _sketch_loss, SAME_FIT)
     without = state.screened_loss(state.fit.effects)
     candidates = []
     for tried, (chosen, start) in enumerate(ranked):
         gain, most = without - start.loss, without - ranked[0][1].loss
-        if tried >= rules.finalists and gain < rules.close_sketch * most:
+        if tried >= FINALISTS and gain < CLOSE_SKETCH * most:
             break
         advance()
         entries = (*state.entries, *(lead.entry for lead in chosen))
@@ -247,9 +255,8 @@ def _fitted(state: SearchState, sketches: Sequence[Sketch], advance: Callable[[]
 
 def _pays(state: SearchState, present: Addition, candidate: Addition) -> bool:
     """Whether a candidate lowers the loss by a minimum share, and significantly."""
-    rules = state.settings.trace
-    least = rules.min_gain if state.problem.sensor_std is None else rules.min_gain_under_noise
-    level = state.settings.significance.level / len(state.catalogue)
+    least = MIN_GAIN if state.problem.sensor_std is None else MIN_GAIN_UNDER_NOISE
+    level = state.settings.level / len(state.catalogue)
     return (
         candidate.loss < (1.0 - least) * present.loss
         and state.p_value(present.losses, candidate.losses) < level
@@ -259,7 +266,6 @@ def _pays(state: SearchState, present: Addition, candidate: Addition) -> bool:
 
 def _matters(state: SearchState, present: Addition, candidate: Addition) -> bool:
     """Whether the added effects contribute their required shares, or lower the present loss by a large factor."""
-    rules = state.settings.trace
-    much = candidate.loss < rules.much_lower * present.loss
+    much = candidate.loss < MUCH_LOWER * present.loss
     share = candidate.added * state.min_share
     return much or matters(state.first_loss, present.first_loss, candidate.first_loss, share)

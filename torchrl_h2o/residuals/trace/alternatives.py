@@ -9,12 +9,20 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
+from torchrl_h2o.residuals.trace.close_comparison import ALIKE_LOSS, SAME_LOSS
 from torchrl_h2o.residuals.trace.families import elements
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import Problem, matters
-from torchrl_h2o.residuals.trace.screening import Lead, are_possible_alone, free_parameters, is_possible
-from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.screening import SAME_CHANGE, Lead, are_possible_alone, free_parameters, is_possible
+from torchrl_h2o.residuals.trace.state import SKETCH_EVALUATIONS, SearchState
+
+# evaluations of the residual in a sketch of an alternative; the other parameters may change much
+RIVAL_EVALUATIONS = 20
+NEAREST_RIVALS = 12  # number of alternatives tried in an effect's place because their promise was closest to its own
+TOP_RIVALS = 6  # number of alternatives tried in an effect's place because their promise was highest
+# share of an effect's gain that an alternative must reach in ``sketch_evaluations``; else it is given up
+RIVAL_MIN_FIRST = 0.25
 
 
 def alternatives(
@@ -64,15 +72,15 @@ def _rivals(state: SearchState, index: int) -> list[Lead]:
     All of the screening after which the effect was added. A lead with the same change may have another promise, because
     the promise is limited by the size of the trials.
     """
-    rules, own = state.settings.trace, state.entries[index].name
+    own = state.entries[index].name
     leads = state.rivals[own]
     names = {entry.name for entry in state.entries}
     effect = next((lead for lead in leads if lead.entry.name == own), None)
     promise = 0.0 if effect is None else effect.promise
     others = [lead for lead in leads if lead.entry.name not in names and not _repeats(state, index, lead.entry)]
-    nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[: rules.nearest_rivals]
-    same = [] if effect is None else [lead for lead in others if _same_change(lead, effect, rules.same_change)]
-    chosen = (*nearest, *others[: rules.top_rivals], *same[: rules.top_rivals])
+    nearest = sorted(others, key=lambda lead: abs(lead.promise - promise))[:NEAREST_RIVALS]
+    same = [] if effect is None else [lead for lead in others if _same_change(lead, effect, SAME_CHANGE)]
+    chosen = (*nearest, *others[:TOP_RIVALS], *same[:TOP_RIVALS])
     return list({lead.entry.name: lead for lead in chosen}.values())
 
 
@@ -101,7 +109,7 @@ def _sketched_rivals(state: SearchState, index: int) -> Iterator[tuple[Lead, Fit
     A rival that is far from the required share after the first evaluations is given up. A rival with the parameters of
     the effect starts from the effect's values if they are better than those of the screening, which knew fewer effects.
     """
-    rules, effects = state.settings.trace, state.fit.effects
+    effects = state.fit.effects
     kept = [effect for i, effect in enumerate(effects) if i != index]
     few_with_it, few_without = map(state.screened_loss, (effects, kept))
     gain = few_without - few_with_it
@@ -116,9 +124,9 @@ def _sketched_rivals(state: SearchState, index: int) -> Iterator[tuple[Lead, Fit
             continue
         instead = min(starts, key=state.screened_loss) if len(starts) > 1 else starts[0]
         free = [free_parameters(entry) for entry in _entries_with(state, index, lead)]
-        sketch = state.sketched(instead, free, rules.sketch_evaluations)
-        if few_without - sketch.loss >= rules.rival_min_first * gain:
-            sketch = state.sketched(sketch.effects, free, rules.rival_evaluations)
+        sketch = state.sketched(instead, free, SKETCH_EVALUATIONS)
+        if few_without - sketch.loss >= RIVAL_MIN_FIRST * gain:
+            sketch = state.sketched(sketch.effects, free, RIVAL_EVALUATIONS)
         yield lead, sketch if few_without - sketch.loss >= state.rival_min_sketch * gain else None
 
 
@@ -143,7 +151,7 @@ def _attempt(state: SearchState, index: int, lead: Lead, sketch: Fit, with_it: n
     after = state.selection_losses(candidate.effects)
     p = state.p_value(after, with_it)
     simpler = len(lead.free) < len(free_parameters(state.entries[index]))
-    if p <= state.settings.significance.level and simpler:
+    if p <= state.settings.level and simpler:
         p = max(p, _p_value_of_loss_gap(state, candidate, state.fit))
     return Attempt(lead.entry, candidate, index, float(after.mean()), p)
 
@@ -156,12 +164,12 @@ def _is_equivalent(state: SearchState, attempt: Attempt, with_it: float, explain
     problem = state.problem
     if is_outside(attempt.effect, problem.simulation.model) or not are_possible_alone(problem, attempt.fit.effects):
         return False
-    rules, worse = state.settings.trace, (attempt.loss - with_it) / explained
-    if worse < rules.same_loss or worse >= rules.alike_loss:
-        return bool(worse < rules.same_loss)
+    worse = (attempt.loss - with_it) / explained
+    if worse < SAME_LOSS or worse >= ALIKE_LOSS:
+        return bool(worse < SAME_LOSS)
     if state.exact:
         return state.posed_at(attempt.fit.effects).within_rounding
-    return attempt.p_value > state.settings.significance.level
+    return attempt.p_value > state.settings.level
 
 
 def _p_value_of_loss_gap(state: SearchState, worse: Fit, better: Fit) -> float:

@@ -17,11 +17,12 @@ import numpy as np
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals.measured.constant_velocity import (
+    BETTER_THAN_GUESS,
     effects_on_unpredicted_joints,
     errors_ahead,
     explains_motion,
 )
-from torchrl_h2o.residuals.measured.missing_force import MissingForces, missing_forces
+from torchrl_h2o.residuals.measured.missing_force import LESS_FORCE, MORE_FORCE, MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
@@ -30,9 +31,16 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import comparable_losses
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
 from torchrl_h2o.residuals.trace.longer_windows import longer_windows
+from torchrl_h2o.residuals.trace.noise_free import NOISE_FREE_LOSS
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
+
+# replaces ``MORE_FORCE`` for effects that predict the motion, beyond a regression's proposal that takes their place
+MORE_FORCE_IF_STANDS = 3.0
+# share of each missing force that effects may leave and keep their place, if they predict the motion
+FORCE_LEFT_IF_STANDS = 0.05
+LEAST_SECONDS = 0.1  # length of the windows with which the search begins anew, in s, if the data hold enough of them
 
 PROPOSAL = 0.1  # share by which a regression, a screening, or the fit of a proposal brings the bar closer to the end
 
@@ -124,12 +132,12 @@ def begin_with_forces(
     proposed = _with_proposed(state, catalogue, rng, progress)
     if proposed is None or (forces := _missing_forces(proposed)) is None:
         return None
-    if not MissingForces(found.after, forces.after).fall_by(state.settings.verdict.less_force):
+    if not MissingForces(found.after, forces.after).fall_by(LESS_FORCE):
         return None
     same_windows = _refitted_at(state, SearchState.begin(proposed.problem, catalogue, rng, state.settings))
     proposed = proposed.rescaled(proposed.posed_at(proposed.fit.effects))
     mine, its = comparable_losses([same_windows, proposed])
-    if its.mean() > mine.mean() or proposed.p_value(mine, its) > state.settings.significance.level:
+    if its.mean() > mine.mean() or proposed.p_value(mine, its) > state.settings.level:
         return None
     return _with_rivals_shown(proposed, progress)
 
@@ -159,7 +167,7 @@ def replaced_by_forces(
     if found is None or found.hardly_any():
         return None
     stands = _stands(state, found)
-    if stands and found.hardly_any(state.settings.verdict.force_left_if_stands):
+    if stands and found.hardly_any(FORCE_LEFT_IF_STANDS):
         return None
     others = [index for index, effect in enumerate(state.fit.effects) if not isinstance(effect, PROPOSED)]
     proposed = [
@@ -168,30 +176,30 @@ def replaced_by_forces(
     possible = [(one, forces) for one in proposed if one is not None and (forces := _missing_forces(one)) is not None]
     if not possible:
         return None
-    rules, (best, forces) = state.settings.verdict, possible[0]
-    if MissingForces(possible[-1][1].after, forces.after).rise_by(rules.more_force):
+    (best, forces) = possible[0]
+    if MissingForces(possible[-1][1].after, forces.after).rise_by(MORE_FORCE):
         best, forces = possible[-1]
     without, with_them = (best.first.selection_loss(which) for which in ((), best.fit.effects))
-    explains = forces.fall_by(rules.less_force) and with_them < without
-    factor = rules.more_force_if_stands if stands else rules.more_force
+    explains = forces.fall_by(LESS_FORCE) and with_them < without
+    factor = MORE_FORCE_IF_STANDS if stands else MORE_FORCE
     return best if explains and MissingForces(forces.after, found.after).rise_by(factor) else None
 
 
 def _stands(state: SearchState, forces: MissingForces) -> bool:
     """Whether the effects found predict the motion of their joints, and do not raise the missing forces."""
-    effects, rules = state.fit.effects, state.settings.verdict
+    effects = state.fit.effects
     mended = state.first.simulation.with_effects(*effects)
-    errors = errors_ahead(mended, state.first.measured, Split.SELECTION, state.settings)
-    moves = explains_motion(errors, rules.better_than_guess)
-    unpredicted = effects_on_unpredicted_joints(mended, errors, effects, rules.better_than_guess)
-    return moves and not unpredicted and not forces.rise_by(rules.more_force)
+    errors = errors_ahead(mended, state.first.measured, Split.SELECTION)
+    moves = explains_motion(errors, BETTER_THAN_GUESS)
+    unpredicted = effects_on_unpredicted_joints(mended, errors, effects, BETTER_THAN_GUESS)
+    return moves and not unpredicted and not forces.rise_by(MORE_FORCE)
 
 
 def _missing_forces(state: SearchState) -> MissingForces | None:
     """The missing forces of the selection part without and with the effects found."""
-    simulation, measured, settings = state.first.simulation, state.first.measured, state.settings
+    simulation, measured = state.first.simulation, state.first.measured
     mended = simulation.with_effects(*state.fit.effects)
-    return missing_forces(simulation, mended, measured, Split.SELECTION, settings.inverse_dynamics)
+    return missing_forces(simulation, mended, measured, Split.SELECTION)
 
 
 def _with_proposed(
@@ -223,14 +231,13 @@ def _with_proposed(
         measured,
         catalogue,
         lambda: progress.closer(PROPOSAL / len(catalogue)),
-        settings.inverse_dynamics,
     )
     if not found.entries:
         return None
-    lengths = possible_horizons(simulation, measured, settings.horizon)
-    long_enough = [steps for steps in lengths if steps * simulation.control_step >= settings.inverse_dynamics.window]
+    lengths = possible_horizons(simulation, measured, state.settings)
+    long_enough = [steps for steps in lengths if steps * simulation.control_step >= LEAST_SECONDS]
     horizon = min(long_enough, default=lengths[-1])
-    problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+    problem = Problem.pose(simulation, measured, horizon)
     if not is_possible(problem, [*before.effects, *found.effects]):
         return None
     searched = [entry for entry in catalogue if entry in found.entries or type(entry.effect) not in left_out]
@@ -268,11 +275,10 @@ def begin_noise_free(
     estimated = measured.estimated_std is not None and bool(measured.estimated_std.any())
     if state.exact or noisy.sensor_std is None or estimated:
         return None
-    settings = state.settings.residual
-    problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=measured.no_noise, settings=settings)
+    problem = Problem.pose(noisy.simulation, measured, 1, sensor_std=measured.no_noise)
     silent = replace(SearchState.begin(problem, catalogue, rng, state.settings), noise_free=True)
     silent = _refitted_at(state, silent)
-    to_beat = state.settings.trace.noise_free_loss * silent.screened_loss(state.fit.effects)
+    to_beat = NOISE_FREE_LOSS * silent.screened_loss(state.fit.effects)
     refitted = silent.screened_loss(silent.fit.effects)
     advance = partial(progress.closer, PROPOSAL / (len(catalogue) * max(1, len(state.entries))))
     if refitted > to_beat and _loss_with_one_more(silent, advance) > to_beat:
@@ -319,10 +325,10 @@ def in_longer_windows(
     Returns:
         The state; None if nothing was found, if only rounding is left, or if there are no longer windows.
     """
-    steps = longer_windows(state.problem, state.settings)
+    steps = longer_windows(state.problem)
     if state.exact or not state.entries or steps is None:
         return None
-    problem = Problem.pose(state.first.simulation, state.first.measured, steps, settings=state.settings.residual)
+    problem = Problem.pose(state.first.simulation, state.first.measured, steps)
     return _refitted_at(state, SearchState.begin(problem, catalogue, rng, state.settings))
 
 
@@ -344,5 +350,5 @@ def _loss_with_one_more(state: SearchState, advance: Callable[[], object]) -> fl
 def _explains_motion(state: SearchState) -> bool:
     """Whether the effects found predict the selection windows better than the guess of constant velocities."""
     mended = state.first.simulation.with_effects(*state.fit.effects)
-    errors = errors_ahead(mended, state.first.measured, Split.SELECTION, state.settings)
-    return explains_motion(errors, state.settings.verdict.better_than_guess)
+    errors = errors_ahead(mended, state.first.measured, Split.SELECTION)
+    return explains_motion(errors, BETTER_THAN_GUESS)

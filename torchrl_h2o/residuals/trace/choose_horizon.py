@@ -8,8 +8,19 @@ from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, thinned
-from torchrl_h2o.residuals.settings import DEFAULTS, HorizonSettings, LoopSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+JUDGED_WINDOWS = 100  # largest number of windows by which a length is judged
+MIN_FITTED = 20  # smallest number of windows for fits that a length must leave
+# smallest number of windows for the selection of effects that a length must leave. With fewer windows, no gain is
+# significant after the level is divided by the number of effects tried
+MIN_SELECTED = 16
+# median error over the median error that sensor noise alone causes, beyond which no longer windows are tried
+STANDS_OUT = 10.0
+LEAST_RATIO = 1.5  # smallest such ratio of windows longer than one step; a smaller one is chance
+# factor by which this ratio must grow to justify longer windows, which cost more and amplify contact errors
+LONGER_GAIN = 1.2
 
 
 def choose_horizon(
@@ -36,26 +47,25 @@ def choose_horizon(
     sensor_std = sensor_noise(simulation, measured)
     if sensor_std is None:
         return 1
-    rules = settings.horizon
     best, most = 1, 0.0
-    for horizon in possible_horizons(simulation, measured, rules):
-        moving = in_motion(measured, measured.fitted(horizon), horizon, rules.min_fitted)
-        starts = thinned(moving, rules.windows)
+    for horizon in possible_horizons(simulation, measured, settings):
+        moving = in_motion(measured, measured.fitted(horizon), horizon, MIN_FITTED)
+        starts = thinned(moving, JUDGED_WINDOWS)
         ratio = float(error_over_noise(simulation, measured, starts, horizon, sensor_std, rng).max())
-        if horizon == 1 or ratio > max(rules.longer_gain * most, rules.least_ratio):
+        if horizon == 1 or ratio > max(LONGER_GAIN * most, LEAST_RATIO):
             best, most = horizon, ratio
-        if ratio > rules.stands_out:
+        if ratio > STANDS_OUT:
             break
     return best
 
 
-def possible_horizons(simulation: Simulation, measured: Measured, rules: HorizonSettings) -> list[int]:
+def possible_horizons(simulation: Simulation, measured: Measured, settings: LoopSettings) -> list[int]:
     """One control step and the lengths of the settings, in control steps, of which the data hold enough windows."""
-    steps = sorted({1, *(round(seconds / simulation.control_step) for seconds in rules.seconds)} - {0})
-    return [horizon for horizon in steps if horizon == 1 or enough_windows(measured, horizon, rules)]
+    steps = sorted({1, *(round(seconds / simulation.control_step) for seconds in settings.window_seconds)} - {0})
+    return [horizon for horizon in steps if horizon == 1 or enough_windows(measured, horizon)]
 
 
-def enough_windows(measured: Measured, horizon: int, rules: HorizonSettings) -> bool:
+def enough_windows(measured: Measured, horizon: int) -> bool:
     """Whether data hold enough windows of a length, in control steps, for a fit and for a choice."""
     fitted, selected_on = measured.fitted(horizon), measured.selected_on(horizon)
-    return len(fitted) >= rules.min_fitted and len(selected_on) >= rules.min_selected
+    return len(fitted) >= MIN_FITTED and len(selected_on) >= MIN_SELECTED

@@ -14,6 +14,9 @@ from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
 
+SAME_LOSS = 1e-6  # loss difference between alternatives, as a share of the effect's gain, that counts as rounding
+ALIKE_LOSS = 0.1  # loss difference, as a share of the effect's gain, beyond which an alternative is ruled out
+
 
 def refined(state: SearchState, entries: Sequence[CatalogueEntry], fitted: Fit) -> Fit:
     """The fit of an explanation, continued with residuals scaled by what it leaves."""
@@ -32,8 +35,8 @@ def worse_of(state: SearchState, one: Fit, other: Fit) -> Fit | None:
 def _is_worse(state: SearchState, one: Fit, by: Fit) -> bool:
     """Whether the loss of an explanation is significantly, and by more than a small share, higher than another's."""
     own, other = (_log_losses(state.problem, which) for which in (one, by))
-    far = own.mean() > (1.0 + state.settings.trace.alike_loss) * other.mean()
-    return bool(far and state.p_value(own, other) < state.settings.significance.level)
+    far = own.mean() > (1.0 + ALIKE_LOSS) * other.mean()
+    return bool(far and state.p_value(own, other) < state.settings.level)
 
 
 def _log_losses(problem: Problem, fitted: Fit) -> np.ndarray:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_h2o.residuals.trace.close_comparison import SAME_LOSS
 from torchrl_h2o.residuals.trace.fit import Fit
-from torchrl_h2o.residuals.trace.problem import matters
+from torchrl_h2o.residuals.trace.problem import MIN_GAIN, matters
 from torchrl_h2o.residuals.trace.screening import free_parameters, is_possible
-from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.state import SKETCH_EVALUATIONS, SearchState
+
+# multiple of the loss that a sketch without an effect must exceed for the effect to be kept without a full fit
+CLEARLY_NEEDED = 1.5
 
 
 def eliminate(state: SearchState) -> SearchState:
@@ -22,10 +26,10 @@ def eliminate(state: SearchState) -> SearchState:
 
 def _is_clearly_needed(state: SearchState, index: int) -> bool:
     """Whether a quick fit of the other effects leaves a much higher loss; spares most of the full fits."""
-    rules, effects = state.settings.trace, state.fit.effects
+    effects = state.fit.effects
     free = [free_parameters(entry) for i, entry in enumerate(state.entries) if i != index]
-    without = state.sketched([e for i, e in enumerate(effects) if i != index], free, rules.sketch_evaluations).loss
-    return without > rules.clearly_needed * state.screened_loss(effects)
+    without = state.sketched([e for i, e in enumerate(effects) if i != index], free, SKETCH_EVALUATIONS).loss
+    return without > CLEARLY_NEEDED * state.screened_loss(effects)
 
 
 def _without_one(state: SearchState) -> SearchState | None:
@@ -56,12 +60,12 @@ def is_worse(state: SearchState, smaller: Fit, before: np.ndarray, after: np.nda
         before: losses of the selection windows with the effects found, (W).
         after: those with fewer effects, (W).
     """
-    most = before.mean() / (1.0 - state.settings.trace.min_gain)
-    level = state.settings.significance.level
+    most = before.mean() / (1.0 - MIN_GAIN)
+    level = state.settings.level
     return bool(after.mean() > most and state.p_value(after, before) < level and _is_beyond_rounding(state, smaller))
 
 
 def _is_beyond_rounding(state: SearchState, smaller: Fit) -> bool:
     """Whether a smaller fit misses a share of the first loss that rounding does not explain."""
     without, with_it = (state.first.selection_loss(which.effects) for which in (smaller, state.fit))
-    return matters(state.first_loss, without, with_it, state.settings.trace.same_loss)
+    return matters(state.first_loss, without, with_it, SAME_LOSS)

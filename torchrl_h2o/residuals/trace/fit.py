@@ -16,9 +16,16 @@ import numpy as np
 from mujoco import sysid
 
 from torchrl_h2o.effects import Effect, Parameter
-from torchrl_h2o.residuals.settings import DEFAULTS, FitSettings
+from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.trace.model_bounds import lowest_value
-from torchrl_h2o.residuals.trace.problem import Problem, losses
+from torchrl_h2o.residuals.trace.problem import WORST, Problem, losses
+
+# start value of every scaled variable; it makes relative steps proportional to the parameter's typical size
+ORIGIN = 10.0
+MAX_MOVE = 50.0  # largest change of a parameter in one fit, in multiples of its typical size
+DIFFERENCE_STEP = 1e-5  # relative step of the finite differences: 1e-4 of a parameter's typical size
+LOSS_TOLERANCE = 1e-5  # relative change of the loss at which the optimiser stops
+VARIABLE_TOLERANCE = 1e-7  # relative change of the variables at which the optimiser stops
 
 Free = tuple[str, ...]  # names of the parameters of one effect that a fit may move
 
@@ -67,8 +74,8 @@ def fit(
     free: Sequence[Free],
     starts: np.ndarray,
     *,
-    max_evaluations: int | None = None,
-    settings: FitSettings = DEFAULTS.fit,
+    max_evaluations: int = DEFAULTS.max_evaluations,
+    difference_step: float = DIFFERENCE_STEP,
 ) -> Fit:
     """Minimises the robust loss over the free parameters of effects, starting from their present values.
 
@@ -77,28 +84,25 @@ def fit(
         effects: effects in the order of their composition.
         free: names of the parameters to move, for each effect.
         starts: (W), first rows of the windows to fit.
-        max_evaluations: evaluations of the residual, not counting finite differences; by default that of the settings.
-        settings: scaling of the variables and tolerances.
+        max_evaluations: evaluations of the residual, not counting finite differences.
+        difference_step: relative step of the finite differences.
 
     Returns:
         The fit.
     """
     allowed = [_allowed(problem, effects, index) for index in range(len(effects))]
-    variables = [
-        _Variable(index, name, allowed[index][name], settings) for index in range(len(effects)) for name in free[index]
-    ]
+    variables = [_Variable(index, name, allowed[index][name]) for index in range(len(effects)) for name in free[index]]
 
     def residual(z: np.ndarray, _: sysid.ParameterDict) -> tuple:
         try:
             scaled = problem.residual(_with_values(effects, variables, z), starts).ravel()
         except ValueError:  # the model rejects these values, for example negative damping
-            scaled = np.full(len(starts) * problem.horizon * problem.scale.shape[-1], problem.settings.worst)
+            scaled = np.full(len(starts) * problem.horizon * problem.scale.shape[-1], WORST)
         return [scaled], None, None
 
-    evaluations = settings.max_evaluations if max_evaluations is None else max_evaluations
     # rollouts that follow unobserved coordinates step by step are too small for MuJoCo's own threads
     in_threads = bool(problem.simulation.state_map.hidden)
-    best, result = _optimised(residual, variables, evaluations, settings, in_threads=in_threads)
+    best, result = _optimised(residual, variables, max_evaluations, difference_step, in_threads=in_threads)
     fitted = _with_values(effects, variables, best)
     widths = [{} for _ in effects]
     for variable, position, half in zip(variables, best, _half_widths(problem, result), strict=True):
@@ -132,13 +136,13 @@ def _optimised(
     residual: Callable[[np.ndarray, sysid.ParameterDict], tuple],
     variables: Sequence[_Variable],
     max_evaluations: int,
-    settings: FitSettings,
+    difference_step: float,
     *,
     in_threads: bool,
 ) -> tuple[np.ndarray, Any]:
     """Scaled variables at the least robust loss, and scipy's result; finite differences run in threads if wanted."""
     unknown = sysid.ParameterDict(
-        {str(i): sysid.Parameter(str(i), settings.origin, *variable.bounds) for i, variable in enumerate(variables)}
+        {str(i): sysid.Parameter(str(i), ORIGIN, *variable.bounds) for i, variable in enumerate(variables)}
     )
     with _quiet(), ThreadPoolExecutor(cpu_count()) as threads:  # starts threads when they are used
         best, result = sysid.optimize(
@@ -148,9 +152,9 @@ def _optimised(
             verbose=False,
             max_iters=max_evaluations,
             loss="soft_l1",
-            diff_step=settings.difference_step,
-            ftol=settings.loss_tolerance,
-            xtol=settings.variable_tolerance,
+            diff_step=difference_step,
+            ftol=LOSS_TOLERANCE,
+            xtol=VARIABLE_TOLERANCE,
             workers=threads.map if in_threads else None,
         )
     return best.as_vector(), result
@@ -183,12 +187,11 @@ def _half_widths(problem: Problem, result) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Variable:
-    """A parameter as a scaled variable: it starts at ``settings.origin``, and a step of 1 is one typical size."""
+    """A parameter as a scaled variable: it starts at ``ORIGIN``, and a step of 1 is one typical size."""
 
     effect: int
     name: str
     parameter: Parameter
-    settings: FitSettings
 
     @property
     def logarithmic(self) -> bool:
@@ -201,8 +204,8 @@ class _Variable:
     def value(self, z: float) -> float:
         low, high = self.parameter.bounds
         if self.logarithmic:
-            return float(np.clip(self.parameter.value * 2.0 ** (z - self.settings.origin), low, high))
-        return float(np.clip(self.parameter.value + self.size * (z - self.settings.origin), low, high))
+            return float(np.clip(self.parameter.value * 2.0 ** (z - ORIGIN), low, high))
+        return float(np.clip(self.parameter.value + self.size * (z - ORIGIN), low, high))
 
     def slope(self, z: float) -> float:
         return self.value(z) * math.log(2.0) if self.logarithmic else self.size
@@ -214,7 +217,7 @@ class _Variable:
             ends = np.log2(np.array([low, high]) / self.parameter.value)
         else:
             ends = (np.array([low, high]) - self.parameter.value) / self.size
-        return tuple(self.settings.origin + np.clip(ends, -self.settings.max_move, self.settings.max_move))
+        return tuple(ORIGIN + np.clip(ends, -MAX_MOVE, MAX_MOVE))
 
 
 def typical_size(parameter: Parameter) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.add import Additions, additions, distinct
+from torchrl_h2o.residuals.trace.add import BEAM_LOSS, BEAM_WIDTH, SAME_FIT, Additions, additions, distinct
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.order import reorder
@@ -89,7 +89,7 @@ class _Beam:
 
     def _with_one_more(self, state: SearchState) -> tuple[SearchState, list[SearchState]]:
         """The state with the entries that were tried, and those with one set of effects more, if any passes."""
-        if state.exact or number_of_effects(state) >= state.settings.trace.max_effects:
+        if state.exact or number_of_effects(state) >= state.settings.max_effects:
             return state, []
         one_more = partial(self.progress.closer, SCREENING / max(1, len(state.others)))
         leads = screen(state.problem, state.fit.effects, state.others, state.windows.screened, one_more)
@@ -127,12 +127,11 @@ def _closest(states: Sequence[SearchState]) -> list[SearchState]:
     effect, the residuals would hardly show what the last effect changes. Of lists with nearly equal losses, the one
     with the fewest parameters is kept: one friction for both joints, not the same friction for each.
     """
-    rules = states[0].settings.trace
     means = [float(losses.mean()) for losses in comparable_losses(states)]
-    near = [pair for pair in zip(means, states, strict=True) if pair[0] <= rules.beam_loss * min(means)]
+    near = [pair for pair in zip(means, states, strict=True) if pair[0] <= BEAM_LOSS * min(means)]
     near.sort(key=lambda pair: (_size(pair[1])[0], pair[0]))
-    kept = sorted(distinct(near, itemgetter(0), rules.same_fit), key=itemgetter(0))
-    return [state for _, state in kept[: rules.beam_width]]
+    kept = sorted(distinct(near, itemgetter(0), SAME_FIT), key=itemgetter(0))
+    return [state for _, state in kept[:BEAM_WIDTH]]
 
 
 def _simplest_of_best(states: Sequence[SearchState]) -> SearchState:
@@ -156,7 +155,7 @@ def _is_beaten(state: SearchState, loss: np.ndarray, best: SearchState, lowest: 
 
     If the best list has more parameters, each of them must also contribute the share that an added effect must.
     """
-    level = state.settings.significance.level
+    level = state.settings.level
     if state.p_value(loss, lowest) > level:
         return False
     more = _size(best)[0] - _size(state)[0]

@@ -31,11 +31,16 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.residuals.measured.missing_force import Motion, measured_motion, missing_force
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
-from torchrl_h2o.residuals.settings import DEFAULTS, InverseDynamicsSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.families import elements
 from torchrl_h2o.residuals.trace.force_regression import ForceRegression, robust_losses, usual_size
 from torchrl_h2o.residuals.trace.model_bounds import lowest_value
+
+ROUNDS = 3  # repetitions of the regression around the values found, because dry friction is soft in MuJoCo
+SAME_VALUE = 0.01  # change of all values, as a share, up to which the regression is not repeated any more
+BLOCKS = 20  # blocks of neighbouring windows by which intervals are computed
+MORE_LEFT = 1.2  # multiple of the mean loss with all entries up to which entries are left out
+MORE_LEFT_OF_ONE = 1.5  # the same for the force at each coordinate alone
 
 #: the properties of links and joints that are identified; the gain of a motor is not among them, because with a gain of
 #: zero and masses of zero no force would be missing
@@ -67,7 +72,6 @@ def propose_effects(
     measured: Measured,
     catalogue: Sequence[CatalogueEntry],
     advance: Callable[[], object] = lambda: None,
-    settings: InverseDynamicsSettings = DEFAULTS.inverse_dynamics,
 ) -> Proposal:
     """The properties of single links and joints that together explain the missing force.
 
@@ -79,13 +83,12 @@ def propose_effects(
         measured: the data, of which the part for fits is used.
         catalogue: effects that the simulator may lack.
         advance: called after each entry.
-        settings: rows, smoothing and the size of the set.
 
     Returns:
         The effects; none if coordinates are unobserved, if actuators have a state of their own, which is not measured,
         if the rows are too few, or if the model rejects them together.
     """
-    motion = measured_motion(simulation, measured, Split.FIT, settings)
+    motion = measured_motion(simulation, measured, Split.FIT)
     if motion is None:
         return Proposal()
     missing = missing_force(simulation, motion)
@@ -100,13 +103,13 @@ def propose_effects(
     if not entries:
         return Proposal()
     bounds, changes = np.array([_bounds(entry, simulation.model) for entry in entries]).T, np.stack(columns, axis=-1)
-    shares = _simplest(_needed(missing, changes, bounds, settings), changes, bounds, entries)
+    shares = _simplest(_needed(missing, changes, bounds), changes, bounds, entries)
     kept = np.flatnonzero(shares)
     while len(kept):
         chosen = [entries[index] for index in kept]
         try:
-            at = _repeated(simulation, motion, chosen, shares[kept], bounds[:, kept], settings, advance)
-            sure, half_widths = _sure(at, bounds[:, kept], settings.blocks, advance)
+            at = _repeated(simulation, motion, chosen, shares[kept], bounds[:, kept], advance)
+            sure, half_widths = _sure(at, bounds[:, kept], BLOCKS, advance)
         except ValueError:  # the model rejects the values together, or they leave no finite force
             break
         shares[kept] = at.shares
@@ -173,20 +176,19 @@ def _repeated(
     entries: Sequence[CatalogueEntry],
     shares: np.ndarray,
     bounds: np.ndarray,
-    settings: InverseDynamicsSettings,
     advance: Callable[[], object],
 ) -> _Linearised:
     """Regressions, each around the values of the one before, until no less force is missing or no value changes."""
     at = _linearised(simulation, motion, entries, shares, bounds)
     scale = usual_size(at.missing)
-    for _ in range(settings.rounds):
+    for _ in range(ROUNDS):
         advance()
         moved_by = ForceRegression.fit(at.missing, at.changes, bounds - at.shares).shares
         moved = _linearised(simulation, motion, entries, at.shares + moved_by, bounds)
         if np.nanmean(robust_losses(moved.missing, scale)) >= np.nanmean(robust_losses(at.missing, scale)):
             break
         at = moved
-        if (np.abs(moved_by) <= settings.same_value * np.abs(at.shares)).all():
+        if (np.abs(moved_by) <= SAME_VALUE * np.abs(at.shares)).all():
             break
     return at
 
@@ -272,9 +274,7 @@ def _heavy_rotor(model: mujoco.MjModel, joints: selection.Names) -> Armature:
     return Armature(_HEAVY * inertia, joints)
 
 
-def _needed(
-    missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray, settings: InverseDynamicsSettings
-) -> np.ndarray:
+def _needed(missing: np.ndarray, changes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """Share of each trial, (P), in the smallest set that explains the force nearly as well as all of them; else 0.
 
     The force at each coordinate counts for itself as well, so that one joint among many keeps its friction. In the
@@ -284,7 +284,6 @@ def _needed(
         missing: (W, nv), NaN where unknown.
         changes: (W, nv, P), of the trials.
         bounds: (2, P), smallest and largest share of each trial.
-        settings: how much more than the whole set a smaller one may leave.
     """
     kept = np.arange(changes.shape[-1])
     whole = found = ForceRegression.fit(missing, changes, bounds)
@@ -293,8 +292,8 @@ def _needed(
         fewer = np.delete(kept, found.least_needed)
         smaller = ForceRegression.fit(missing, changes[..., fewer], bounds[:, fewer])
         losses = smaller.losses(whole.scale)
-        one_is_worse = (losses > settings.more_left_of_one * least).any()
-        if one_is_worse or np.nanmean(losses) > settings.more_left * np.nanmean(least):
+        one_is_worse = (losses > MORE_LEFT_OF_ONE * least).any()
+        if one_is_worse or np.nanmean(losses) > MORE_LEFT * np.nanmean(least):
             break
         kept, found = fewer, smaller
     shares = np.zeros(changes.shape[-1])

@@ -34,8 +34,8 @@ def explained_by_noise(
         return 0.0
     mended = problem.simulation.with_effects(*state.fit.effects)
     data = stand_in(mended, problem.measured, problem.sensor_std, rng, problem.horizon, problem.states)
-    posed = Problem.pose(mended, data, problem.horizon, sensor_std=problem.sensor_std, settings=problem.settings)
+    posed = Problem.pose(mended, data, problem.horizon, sensor_std=problem.sensor_std)
     posed = replace(posed, simulation=problem.simulation)
-    fitted = fit(posed, effects, free, state.windows.fitted, settings=state.settings.fit)
+    fitted = fit(posed, effects, free, state.windows.fitted, max_evaluations=state.settings.max_evaluations)
     before, after = (posed.selection_loss(which) for which in (state.fit.effects, fitted.effects))
     return 1.0 - after / before

@@ -19,7 +19,7 @@ def reorder(state: SearchState) -> SearchState:
             swapped = tuple(state.entries[index] for index in order)
             fitted = state.refitted(swapped, [state.fit.effects[index] for index in order])
             after = state.selection_losses(fitted.effects)
-            significant = state.p_value(lowest, after) < state.settings.significance.level
+            significant = state.p_value(lowest, after) < state.settings.level
             if after.mean() < lowest.mean() and significant:
                 state, lowest = state.with_found(swapped, fitted), after
     return state

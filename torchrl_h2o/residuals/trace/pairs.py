@@ -8,7 +8,16 @@ from operator import itemgetter
 
 import numpy as np
 
-from torchrl_h2o.residuals.trace.add import Addition, Additions, distinct, sketched_set, tested
+from torchrl_h2o.residuals.trace.add import (
+    BEAM_LOSS,
+    SAME_FIT,
+    SET_SIZES,
+    Addition,
+    Additions,
+    distinct,
+    sketched_set,
+    tested,
+)
 from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.problem import losses
 from torchrl_h2o.residuals.trace.screening import Lead, along
@@ -39,16 +48,16 @@ def pairs_by_prediction(
     Returns:
         The pairs that pass the tests of an addition.
     """
-    state, rules = singles.state, singles.state.settings.trace
-    if number_of_effects(state) + PAIR > rules.max_effects:
+    state = singles.state
+    if number_of_effects(state) + PAIR > singles.state.settings.max_effects:
         return Additions(state, singles.leads)
     quick = (
         (leads, sketched_set(state, [*single.fit.effects, leads[-1].effect], leads))
         for single, leads in _predicted(singles, seen)
     )
     possible = ((leads, sketch) for leads, sketch in quick if sketch is not None)
-    sketches = islice(possible, dict(rules.set_sizes).get(PAIR, 0))
-    close = [(leads, sketch) for leads, sketch in sketches if sketch.loss <= rules.beam_loss * to_beat]
+    sketches = islice(possible, dict(SET_SIZES).get(PAIR, 0))
+    close = [(leads, sketch) for leads, sketch in sketches if sketch.loss <= BEAM_LOSS * to_beat]
     return tested(state, singles.leads, close, rng, advance)
 
 
@@ -66,7 +75,7 @@ def _predicted(singles: Additions, seen: Collection[frozenset[str]]) -> list[tup
             if new and second.promise > 0.0:
                 _, explained = along(left, second.change.reshape(left.shape))
                 predicted.append(((1.0 - explained) * float(losses(left).mean()), single, (first, second)))
-    ranked = distinct(sorted(predicted, key=itemgetter(0)), itemgetter(0), state.settings.trace.same_fit)
+    ranked = distinct(sorted(predicted, key=itemgetter(0)), itemgetter(0), SAME_FIT)
     pairs: dict[frozenset[str], tuple[Addition, tuple[Lead, Lead]]] = {}
     for _, single, leads in ranked:
         pairs.setdefault(frozenset(lead.entry.name for lead in leads), (single, leads))

@@ -10,8 +10,9 @@ import numpy as np
 from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
 from torchrl_h2o.residuals.trace.families import entries_of_elements
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
-from torchrl_h2o.residuals.trace.problem import matters
+from torchrl_h2o.residuals.trace.problem import MIN_GAIN, MIN_GAIN_UNDER_NOISE, matters
 from torchrl_h2o.residuals.trace.screening import are_possible_alone, free_parameters, is_possible
+from torchrl_h2o.residuals.trace.significance import BEYOND_NOISE
 from torchrl_h2o.residuals.trace.state import SearchState
 
 
@@ -82,17 +83,17 @@ def _composed(parameter: Parameter, other: float) -> float:
 
 def _pays(state: SearchState, divided: SearchState, rng: np.random.Generator) -> bool:
     """Whether a division lowers the loss significantly, and by more than rounding or noise would make it."""
-    rules, noisy = state.settings.trace, state.problem.sensor_std is not None
+    noisy = state.problem.sensor_std is not None
     before, after = (which.selection_losses(which.fit.effects) for which in (state, divided))
     if len(divided.entries) <= len(state.entries):  # as many values, in plainer words
-        return state.p_value(after, before) >= state.settings.significance.level
+        return state.p_value(after, before) >= state.settings.level
     gain = 1.0 - after.mean() / before.mean()
-    least = rules.min_gain_under_noise if noisy else rules.min_gain
-    if gain <= least or state.p_value(before, after) >= state.settings.significance.level:
+    least = MIN_GAIN_UNDER_NOISE if noisy else MIN_GAIN
+    if gain <= least or state.p_value(before, after) >= state.settings.level:
         return False
     if noisy:  # the total reduction includes the noise, so a share of it is no criterion
         free = [free_parameters(entry) for entry in divided.entries]
-        return gain > rules.beyond_noise * explained_by_noise(state, divided.fit.effects, free, rng)
+        return gain > BEYOND_NOISE * explained_by_noise(state, divided.fit.effects, free, rng)
     one, each = (state.first.selection_loss(which.fit.effects) for which in (state, divided))
     added = len(divided.entries) - len(state.entries)
     return matters(state.first_loss, one, each, added * state.min_share)

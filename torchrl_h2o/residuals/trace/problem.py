@@ -14,8 +14,19 @@ from torchrl_h2o.residuals.measured.residual import executed_actions, residuals,
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.settling import settle
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS, ResidualSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+WORST = 1e3  # bound on a scaled residual, also used where the simulation diverges
+ROUNDING = 2e-7  # relative rounding error of the data, which are single precision
+MOST_CUT_OFF = 0.05  # share of the residuals that may be cut off at ``worst``; if there are more, they set the scale
+# residual where coordinates are unobserved, in spreads of the change in a step, up to which it counts as zero. MuJoCo
+# solves contacts up to a tolerance, and begins with the solution of the step before, which is not known
+ROUNDING_UNOBSERVED = 2e-4
+SETTLED_SHARE = 0.9  # share of the residuals that must be this small
+NOISE_DRAWS = 4  # number of draws of sensor noise for the estimate of its effect on each window
+MIN_GAIN = 0.002  # share of the held-out loss that an addition must explain
+# the same share with noisy sensors, because noise in the start states may imitate an effect
+MIN_GAIN_UNDER_NOISE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +41,6 @@ class Problem:
         states: (T, nq + nv), start states of the windows.
         observer: simulation whose observation effects were undone to obtain ``states``.
         sensor_std: (n), standard deviation of the readings' noise, in their units; None where it is negligible.
-        settings: bounds and rounding of the residuals.
     """
 
     simulation: Simulation
@@ -40,7 +50,6 @@ class Problem:
     states: np.ndarray
     observer: Simulation
     sensor_std: np.ndarray | None = None
-    settings: ResidualSettings = DEFAULTS.residual
 
     @classmethod
     def pose(
@@ -50,7 +59,6 @@ class Problem:
         horizon: int = 1,
         *,
         sensor_std: np.ndarray | None = None,
-        settings: ResidualSettings = DEFAULTS.residual,
     ) -> Problem:
         """Builds the problem of a simulation: chooses start states and scales the residuals by their present size.
 
@@ -65,7 +73,6 @@ class Problem:
             horizon: control steps per window.
             sensor_std: (n), standard deviation of the readings' noise; estimated from the data by default, zeros for
                 sensors without noise.
-            settings: bounds and rounding of the residuals.
         """
         if sensor_std is None:
             sensor_std = sensor_noise(simulation, measured)
@@ -74,10 +81,10 @@ class Problem:
         fitted = measured.fitted(horizon)
         states = start_states(simulation, measured, np.concatenate([fitted, measured.selected_on(horizon)]))
         one = np.ones((1, 1, measured.observation.shape[1]))
-        problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std, settings)
+        problem = cls(simulation, measured, horizon, one, states, simulation, sensor_std)
         found = problem._missed((), fitted)
         rounding = problem._rounding(fitted, found)
-        size = _typical_size(np.abs(found), rounding, settings)
+        size = _typical_size(np.abs(found), rounding)
         if sensor_std is None:
             return replace(problem, scale=one * size)
         estimated = replace(problem, states=estimate_states(simulation, measured))
@@ -130,8 +137,8 @@ class Problem:
         if not self.simulation.state_map.hidden:
             return bool((np.nanmean(size, axis=(0, 1)) < rounding).all())
         change = (measured.following - measured.observation)[fitted].std(0)
-        rounding = np.maximum(rounding, self.settings.rounding_unobserved * change)
-        return bool((np.nanquantile(size, self.settings.settled_share, axis=(0, 1)) < rounding).all())
+        rounding = np.maximum(rounding, ROUNDING_UNOBSERVED * change)
+        return bool((np.nanquantile(size, SETTLED_SHARE, axis=(0, 1)) < rounding).all())
 
     def _missed(self, effects: Sequence[Effect], starts: np.ndarray) -> np.ndarray:
         """Residuals in units of the observations, (W, H, n); NaN where the simulation diverges."""
@@ -148,7 +155,7 @@ class Problem:
         return residuals(simulation, measured, starts, self.horizon, states=states)
 
     def _bounded(self, residual: np.ndarray) -> np.ndarray:
-        worst = self.settings.worst
+        worst = WORST
         return np.nan_to_num(np.clip(residual, -worst, worst), nan=worst)
 
     def _moved(self, observation: np.ndarray, starts: np.ndarray, unmoved: np.ndarray) -> np.ndarray:
@@ -163,30 +170,30 @@ class Problem:
         starts = np.concatenate([measured.fitted(self.horizon), measured.selected_on(self.horizon)])
         unmoved = self._missed((), starts)
         squares = np.zeros((len(measured), self.horizon, len(sensor_std)))
-        for _ in range(self.settings.noise_draws):
+        for _ in range(NOISE_DRAWS):
             noise = sensor_std * rng.standard_normal(measured.observation.shape)
-            moved = np.nan_to_num(self._moved(noise, starts, unmoved) ** 2, nan=self.settings.worst**2)
-            squares[starts] += moved / self.settings.noise_draws
+            moved = np.nan_to_num(self._moved(noise, starts, unmoved) ** 2, nan=WORST**2)
+            squares[starts] += moved / NOISE_DRAWS
         return squares + sensor_std**2
 
     def _rounding(self, starts: np.ndarray, unmoved: np.ndarray) -> np.ndarray:
         """Mean change, (n), of the residuals ``unmoved`` by single-precision rounding of the start states."""
         observation, rng = self.measured.observation, np.random.default_rng(0)
-        rounding = self.settings.rounding
+        rounding = ROUNDING
         rounded_by = rounding * rng.uniform(-1.0, 1.0, observation.shape) * observation
         made = np.nanmean(np.abs(self._moved(rounded_by, starts, unmoved)), axis=(0, 1))
         return made + rounding * np.abs(observation).max(0) + 1e-12
 
 
-def _typical_size(found: np.ndarray, rounding: np.ndarray, settings: ResidualSettings) -> np.ndarray:
+def _typical_size(found: np.ndarray, rounding: np.ndarray) -> np.ndarray:
     """Median of absolute residuals (W, H, n) in each dimension, (n), at least the rounding error.
 
     If fewer than half of the rows show the cause, such as a force that begins late, the median is rounding. If too many
-    residuals therefore exceed the bound ``settings.worst`` in this scale, the median of these larger ones is used.
+    residuals therefore exceed the bound ``WORST`` in this scale, the median of these larger ones is used.
     """
     typical = np.maximum(np.nanmedian(found, axis=(0, 1)), rounding)
-    cut_off = found > settings.worst * typical
-    for dimension in np.flatnonzero(cut_off.mean((0, 1)) > settings.most_cut_off):
+    cut_off = found > WORST * typical
+    for dimension in np.flatnonzero(cut_off.mean((0, 1)) > MOST_CUT_OFF):
         typical[dimension] = np.median(found[..., dimension][cut_off[..., dimension]])
     return typical
 

@@ -10,7 +10,12 @@ from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.state import MUCH_LOWER, SearchState
+
+# relative step in a second fit, where the first one gained little: 1e-2 of a parameter's typical size
+COARSE_STEP = 1e-3
+# ratio of the residuals' scales, after and before an addition, below which the effects are fitted once more
+MUCH_FINER = 0.2
 
 
 def rescale(state: SearchState) -> SearchState:
@@ -23,7 +28,7 @@ def rescale(state: SearchState) -> SearchState:
     rescaled, observed = state.rescaled(posed), posed.simulation.state_map.observations
     within_rounding = posed.within_rounding
     moved = not np.array_equal(observed(state.problem.states), observed(posed.states))
-    sharper = _is_sharper(posed, state.problem, state.settings.trace.much_finer)
+    sharper = _is_sharper(posed, state.problem, MUCH_FINER)
     if state.entries and not within_rounding and (moved or sharper):
         kept = eliminate(rescaled.with_found(state.entries, _refitted(rescaled, again=sharper)))
         posed = kept.posed_at(kept.fit.effects)
@@ -40,13 +45,13 @@ def _refitted(state: SearchState, *, again: bool) -> Fit:
         state: effects found.
         again: whether a first fit that gains little without sensor noise is repeated with larger differences.
     """
-    start, settings = state.fit.effects, state.settings
+    start = state.fit.effects
     fitted = state.refitted(state.entries, start)
-    gained = state.screened_loss(fitted.effects) < settings.trace.much_lower * state.screened_loss(start)
+    gained = state.screened_loss(fitted.effects) < MUCH_LOWER * state.screened_loss(start)
     if gained or not again or state.problem.sensor_std is not None:
         return fitted
-    coarse = replace(settings.fit, difference_step=settings.fit.coarse_step)
-    return min(fitted, state.refitted(state.entries, start, settings=coarse), key=lambda one: one.loss)
+    coarse = state.refitted(state.entries, start, difference_step=COARSE_STEP)
+    return min(fitted, coarse, key=lambda one: one.loss)
 
 
 def _is_sharper(posed: Problem, before: Problem, much_finer: float) -> bool:

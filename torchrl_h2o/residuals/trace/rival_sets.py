@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 
 from torchrl_h2o.effects import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
-from torchrl_h2o.residuals.trace.close_comparison import worse_of
+from torchrl_h2o.residuals.trace.close_comparison import ALIKE_LOSS, SAME_LOSS, worse_of
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.outcome import RivalSet
 from torchrl_h2o.residuals.trace.screening import (
+    LEADS_COMBINED,
     Lead,
     are_possible_alone,
     free_parameters,
@@ -17,7 +18,11 @@ from torchrl_h2o.residuals.trace.screening import (
     promising_sets,
     screen,
 )
-from torchrl_h2o.residuals.trace.state import SearchState
+from torchrl_h2o.residuals.trace.state import SKETCH_EVALUATIONS, SearchState
+
+RIVAL_SET_SIZE = 3  # largest number of effects in another set that may explain the data as well
+RIVAL_SETS = 8  # number of such sets of each size that get a quick fit
+RIVAL_FINALISTS = 3  # number of such sets of each size that are fitted on all windows of the search
 
 
 def with_most_usual_set(
@@ -56,7 +61,6 @@ def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None)
     quantity may hide a difference in another. A set is therefore also ruled out if it is worse both with residuals
     scaled by what the effects found leave and with residuals scaled by what the set itself leaves.
     """
-    rules = state.settings.trace
     state = state.rescaled(state.posed_instead(()))
     with_it, without = (state.selection_losses(effects) for effects in (state.fit.effects, ()))
     explained = float(without.mean() - with_it.mean())
@@ -69,10 +73,10 @@ def rival_sets(state: SearchState, advance: Callable[[], object] = lambda: None)
         after = state.selection_losses(fitted.effects)
         missed = (after.mean() - with_it.mean()) / explained
         if state.exact:
-            alike = missed < rules.same_loss
+            alike = missed < SAME_LOSS
         else:
-            close = missed < rules.alike_loss
-            alike = close and state.p_value(after, with_it) > state.settings.significance.level
+            close = missed < ALIKE_LOSS
+            alike = close and state.p_value(after, with_it) > state.settings.level
             alike = alike and worse_of(state, fitted, state.fit) is not fitted
         if alike and _is_plausible(state, fitted):
             found.append(RivalSet(tuple(entries), fitted, float(after.mean())))
@@ -87,25 +91,25 @@ def _is_plausible(state: SearchState, fitted: Fit) -> bool:
 
 def _sketched_sets(state: SearchState, advance: Callable[[], object]) -> list[tuple[list[CatalogueEntry], Fit]]:
     """The most promising sets of each size whose quick fit reaches the required share of the gain, with these fits."""
-    rules, screened = state.settings.trace, state.windows.screened
+    screened = state.windows.screened
     leads = screen(state.problem, (), state.catalogue, screened)
-    among = [lead for lead in leads[: rules.leads_combined] if lead.promise > 0.0]
+    among = [lead for lead in leads[:LEADS_COMBINED] if lead.promise > 0.0]
     few_with_it, few_without = map(state.screened_loss, (state.fit.effects, ()))
     needed = state.rival_min_sketch * (few_without - few_with_it)
     chosen = []
-    for size in range(1, rules.rival_set_size + 1):
+    for size in range(1, RIVAL_SET_SIZE + 1):
         if len(among) < size:
             break
         sketches = []
-        for leads_of_set in promising_sets(state.problem, (), among, size, screened, rules.rival_sets):
+        for leads_of_set in promising_sets(state.problem, (), among, size, screened, RIVAL_SETS):
             entries = [lead.entry for lead in leads_of_set]
             if _is_new(state, leads_of_set) and is_possible(state.problem, [lead.effect for lead in leads_of_set]):
                 free = [free_parameters(entry) for entry in entries]
-                sketch = state.sketched([lead.effect for lead in leads_of_set], free, rules.sketch_evaluations)
+                sketch = state.sketched([lead.effect for lead in leads_of_set], free, SKETCH_EVALUATIONS)
                 advance()
                 if few_without - sketch.loss >= needed:
                     sketches.append((entries, sketch))
-        chosen += sorted(sketches, key=lambda one: one[1].loss)[: rules.rival_finalists]
+        chosen += sorted(sketches, key=lambda one: one[1].loss)[:RIVAL_FINALISTS]
     return chosen
 
 

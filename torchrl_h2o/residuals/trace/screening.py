@@ -12,6 +12,10 @@ from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.trace.fit import Free
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 
+LEADS_COMBINED = 60  # number of most promising leads from which sets are formed
+# cosine of the angle between two entries' changes of the residual beyond which only the first one is sketched
+SAME_CHANGE = 0.999
+
 
 @dataclass(frozen=True)
 class Lead:

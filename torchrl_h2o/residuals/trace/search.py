@@ -70,7 +70,7 @@ def trace_effects(
     """
     progress.stage(EFFECTS)
     horizon = choose_horizon(simulation, measured, rng, settings)
-    problem = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+    problem = Problem.pose(simulation, measured, horizon)
     best = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
     found(_outcome(best))
 
@@ -104,7 +104,7 @@ def _searched(
     found: Callable[[SearchState], object],
 ) -> SearchState:
     """What rounds of growing and simplifying find; ``found`` is called with each better state."""
-    for attempt in range(state.settings.trace.rounds):
+    for attempt in range(state.settings.rounds):
         state = grow(state, rng, progress, found)
         if attempt == 0:
             state = _from_another_beginning(state, catalogue, rng, progress, found)

@@ -8,22 +8,25 @@ import numpy as np
 from scipy.stats import t as student
 from scipy.stats import wilcoxon
 
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings, SignificanceSettings
+from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+
+MAX_RATIO = 100.0  # largest factor that a single block may contribute to the third test's likelihood ratio
+LOSS_FLOOR = 1e-6  # smallest typical loss of a block, as a share of the mean loss
+BEYOND_NOISE = 4.0  # required multiple of the gain of the same addition in synthetic data with sensor noise only
 
 
 def stop_test(settings: LoopSettings) -> str:
     """Description of the test by which the search for effects stops."""
-    test = settings.significance
     return (
         "one-sided tests (Student's t, Wilcoxon's signed ranks, and a likelihood ratio for heavy-tailed residuals) on "
-        f"the held-out loss, paired over {test.blocks} blocks of neighbouring windows, at a nominal level of "
-        f"{100.0 * test.level:g} % divided by the number of effects tried; where sensors are noisy, an effect must "
-        f"also explain {settings.trace.beyond_noise:g} times the share of the loss that it explains in data with "
+        f"the held-out loss, paired over {settings.blocks} blocks of neighbouring windows, at a nominal level of "
+        f"{100.0 * settings.level:g} % divided by the number of effects tried; where sensors are noisy, an effect must "
+        f"also explain {BEYOND_NOISE:g} times the share of the loss that it explains in data with "
         "sensor noise alone"
     )
 
 
-def p_value(gain: np.ndarray, settings: SignificanceSettings = DEFAULTS.significance) -> float:
+def p_value(gain: np.ndarray, settings: LoopSettings = DEFAULTS) -> float:
     """Tests whether the mean gain exceeds zero.
 
     Args:
@@ -43,9 +46,7 @@ def p_value(gain: np.ndarray, settings: SignificanceSettings = DEFAULTS.signific
     return float(min(1.0, 2.0 * min(by_size, by_rank)))
 
 
-def p_value_of_losses(
-    before: np.ndarray, after: np.ndarray, settings: SignificanceSettings = DEFAULTS.significance
-) -> float:
+def p_value_of_losses(before: np.ndarray, after: np.ndarray, settings: LoopSettings = DEFAULTS) -> float:
     """Tests whether losses decrease from one explanation to another.
 
     An effect that acts rarely, such as a joint limit, may change three blocks of thirty, too few for a test on means.
@@ -69,8 +70,8 @@ def p_value_of_losses(
     """
     blocks = [part for part in np.array_split(np.arange(len(before)), min(settings.blocks, len(before))) if len(part)]
     b, a = (np.array([loss[part].mean() for part in blocks]) for loss in (before, after))
-    usual = max(np.median(a), settings.loss_floor * b.mean())
+    usual = max(np.median(a), LOSS_FLOOR * b.mean())
     if usual == 0.0:
         return 1.0
-    log_ratio = np.minimum(0.5 * np.log((usual + b) / (usual + a)), np.log(settings.max_ratio)).sum()
+    log_ratio = np.minimum(0.5 * np.log((usual + b) / (usual + a)), np.log(MAX_RATIO)).sum()
     return float(min(1.0, 1.5 * p_value(before - after, settings), 3.0 * np.exp(-max(log_ratio, 0.0))))

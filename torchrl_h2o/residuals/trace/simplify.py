@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.trace.alternatives import alternatives, p_value_between
-from torchrl_h2o.residuals.trace.close_comparison import refined, worse_of
+from torchrl_h2o.residuals.trace.close_comparison import SAME_LOSS, refined, worse_of
 from torchrl_h2o.residuals.trace.outcome import Attempt, Question
 from torchrl_h2o.residuals.trace.rescale import rescale
 from torchrl_h2o.residuals.trace.screening import free_parameters
@@ -105,7 +105,7 @@ def _compared_closely(
     equal, differing = _divided_by_rounding(state, index, as_good)
     if state.exact or not differing:
         return state, tuple(as_good), []
-    level = state.settings.significance.level
+    level = state.settings.level
     better = [a for a in differing if p_value_between(state, state.problem, state.fit, a.fit) < level]
     if better:
         return state, tuple(as_good), better
@@ -124,7 +124,7 @@ def _divided_by_rounding(
     with_it, without = (
         state.selection_losses(which).mean() for which in (effects, [*effects[:index], *effects[index + 1 :]])
     )
-    negligible = state.settings.trace.same_loss * (without - with_it)
+    negligible = SAME_LOSS * (without - with_it)
     equal = [attempt for attempt in attempts if abs(attempt.loss - with_it) <= negligible]
     return equal, [attempt for attempt in attempts if attempt not in equal]
 

@@ -15,12 +15,22 @@ from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import thinned
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
-from torchrl_h2o.residuals.trace.fit import Fit, Free, fit
+from torchrl_h2o.residuals.trace.fit import DIFFERENCE_STEP, Fit, Free, fit
 from torchrl_h2o.residuals.trace.outcome import Attempt, Question
 from torchrl_h2o.residuals.trace.problem import Problem, losses
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters
-from torchrl_h2o.residuals.trace.settings import FitSettings
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+
+MIN_SHARE = 0.003  # share of the whole reduction of the loss that each added effect must contribute
+# the same share if some coordinates are unobserved: an effect may also make up for errors of their estimates
+MIN_SHARE_UNOBSERVED = 0.005
+# share of the present loss below which an addition counts, however small its part of the whole reduction is
+MUCH_LOWER = 0.5
+MIN_SCREENED = 60  # smallest number of windows on which entries are screened
+MIN_FITTED = 120  # smallest number of windows in a fit during the search
+SKETCH_EVALUATIONS = 6  # evaluations of the residual in a sketch (quick fit) of an addition
+RIVAL_MIN_SKETCH = 0.5  # share of an effect's gain that an alternative must reach in its sketch to be fitted
+RIVAL_MIN_EXACT = 0.9  # value in the place of ``rival_min_sketch`` if the effects found explain the data up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +50,11 @@ class SearchWindows:
     @classmethod
     def draw(cls, problem: Problem, rng: np.random.Generator, settings: LoopSettings) -> SearchWindows:
         """Chooses the windows of a problem; the screened ones are drawn at random."""
-        rules, horizon = settings.trace, problem.horizon
+        horizon = problem.horizon
         every = problem.measured.fitted(horizon)
         block = problem.measured.block
-        fitted = thinned(every, max(rules.min_fitted, rules.fitted_steps // horizon), block)
-        few = min(max(rules.min_screened, rules.screened_steps // horizon), len(fitted))
+        fitted = thinned(every, max(MIN_FITTED, settings.fitted_steps // horizon), block)
+        few = min(max(MIN_SCREENED, settings.screened_steps // horizon), len(fitted))
         blocks = [fitted[first : first + block] for first in range(0, len(fitted), block)]
         chosen = rng.choice(len(blocks), min(-(-few // block), len(blocks)), replace=False)
         return cls(every, fitted, np.concatenate([blocks[index] for index in np.sort(chosen)]))
@@ -111,14 +121,13 @@ class SearchState:
     @property
     def min_share(self) -> float:
         """Share of the whole reduction of the loss that each added effect must contribute."""
-        rules, hidden = self.settings.trace, self.problem.simulation.state_map.hidden
-        return rules.min_share_unobserved if hidden else rules.min_share
+        hidden = self.problem.simulation.state_map.hidden
+        return MIN_SHARE_UNOBSERVED if hidden else MIN_SHARE
 
     @property
     def rival_min_sketch(self) -> float:
         """Share of a gain that another explanation must reach in a quick fit to be fitted."""
-        rules = self.settings.trace
-        return rules.rival_min_exact if self.exact else rules.rival_min_sketch
+        return RIVAL_MIN_EXACT if self.exact else RIVAL_MIN_SKETCH
 
     def with_found(self, entries: Sequence[CatalogueEntry], fitted: Fit) -> SearchState:
         """The state with other effects found; without groups, unless the entries are the same."""
@@ -131,7 +140,7 @@ class SearchState:
         start: Sequence[Effect],
         rows: np.ndarray | None = None,
         *,
-        settings: FitSettings | None = None,
+        difference_step: float = DIFFERENCE_STEP,
     ) -> Fit:
         """Joint fit of entries from given values, on the windows of the search or on others.
 
@@ -139,14 +148,14 @@ class SearchState:
             entries: the entries to fit.
             start: their effects, with the values from which the fit starts.
             rows: first rows of the windows; by default those of the search.
-            settings: of the fit; by default those of the search.
+            difference_step: relative step of the finite differences.
         """
         rows = self.windows.fitted if rows is None else rows
         if not entries:
             return _no_effects(self.problem, rows)
-        settings = settings or self.settings.fit
         free = [free_parameters(entry) for entry in entries]
-        return fit(self.problem, start, free, rows, settings=settings)
+        budget = self.settings.max_evaluations
+        return fit(self.problem, start, free, rows, max_evaluations=budget, difference_step=difference_step)
 
     def sketched(self, effects: Sequence[Effect], free: Sequence[Free], max_evaluations: int) -> Fit:
         """Quick fit of some parameters on the screened windows."""
@@ -156,7 +165,6 @@ class SearchState:
             free,
             self.windows.screened,
             max_evaluations=max_evaluations,
-            settings=self.settings.fit,
         )
 
     def screened_loss(self, effects: Sequence[Effect]) -> float:
@@ -170,7 +178,7 @@ class SearchState:
 
     def p_value(self, before: np.ndarray, after: np.ndarray) -> float:
         """p-value of a decrease of losses on the selection windows, (W) each."""
-        return p_value_of_losses(before, after, self.settings.significance)
+        return p_value_of_losses(before, after, self.settings)
 
     def posed_at(self, effects: Sequence[Effect], *, sensor_std: np.ndarray | None = None) -> Problem:
         """The problem of the simulation with effects put in: start states and scales of the residuals anew.
@@ -186,7 +194,7 @@ class SearchState:
         if sensor_std is None and self.noise_free:
             sensor_std = base.measured.no_noise
         mended = base.simulation.with_effects(*effects)
-        return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std, settings=base.settings)
+        return Problem.pose(mended, base.measured, base.horizon, sensor_std=sensor_std)
 
     def posed_instead(self, effects: Sequence[Effect]) -> Problem:
         """The problem with other effects in the place of those found, and without noise if these leave none.

@@ -18,8 +18,11 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.problem import Problem, matters
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 from torchrl_h2o.residuals.undeclared.by_catalogue import by_catalogue
-from torchrl_h2o.residuals.undeclared.find_force import Undeclared, find_undeclared
-from torchrl_h2o.residuals.undeclared.needed import needed_parts
+from torchrl_h2o.residuals.undeclared.find_force import FURTHER_STEPS, Undeclared, find_undeclared
+from torchrl_h2o.residuals.undeclared.needed import MIN_GAIN_OVER_CATALOGUE, needed_parts
+
+MIN_SHARE = 0.01  # share of the whole reduction of the loss that the force must contribute
+BEYOND_NOISE = 2.0  # required multiple of the gain of a force found in synthetic data with sensor noise only
 
 Parts = tuple[Part, ...]
 
@@ -68,16 +71,16 @@ def add_undeclared_force(
     """
     if explanation.trace.exact or explanation.trace.by_forces:
         return explanation
-    parts, horizon = explanation.parts, _horizon(explanation, settings)
-    first = Problem.pose(simulation, measured, horizon, settings=settings.residual)
+    parts, horizon = explanation.parts, _horizon(explanation)
+    first = Problem.pose(simulation, measured, horizon)
     nothing, present = (first.selection_loss(effects) for effects in ((), explanation.effects))
-    if not matters(nothing, present, 0.0, settings.undeclared.min_share):
+    if not matters(nothing, present, 0.0, MIN_SHARE):
         return explanation  # not even a force that left no residual would be added
     candidates = _candidates(simulation, measured, explanation, settings)
     if not candidates:
         return explanation
     compared = [parts, *(candidate.parts for candidate in candidates)]
-    problem = _with_least_noise(simulation, measured, compared, horizon, settings)
+    problem = _with_least_noise(simulation, measured, compared, horizon)
     before = problem.selection_losses(_effects_of(parts))
     paying = []
     for candidate in candidates:
@@ -87,7 +90,7 @@ def add_undeclared_force(
             paying.append((candidate.parts, after.mean()))
     if not paying:
         return explanation
-    with_force = _shortest(paying, settings)
+    with_force = _shortest(paying)
     chosen = by_catalogue(problem, with_force, catalogue, settings)
     if not _pays(first, before, problem.selection_losses(_effects_of(chosen)), parts, chosen, settings):
         chosen = with_force
@@ -98,20 +101,20 @@ def add_undeclared_force(
     return replace(explanation, parts=chosen, trace=replace(explanation.trace, attempts=attempts, others=()))
 
 
-def _horizon(explanation: Explanation, settings: LoopSettings) -> int:
+def _horizon(explanation: Explanation) -> int:
     """Control steps per window on which a force is fitted and judged: one, or those of the search if it needs many.
 
     Where the search needs long windows, the noise of the sensors hides a force one step ahead.
     """
     horizon = explanation.trace.horizon
-    return horizon if horizon > settings.undeclared.further_steps else 1
+    return horizon if horizon > FURTHER_STEPS else 1
 
 
 def _candidates(
     simulation: Simulation, measured: Measured, explanation: Explanation, settings: LoopSettings
 ) -> list[_Candidate]:
     """Candidates with a force beside the effects found and with a force instead of them, as far as forces are found."""
-    parts, candidates, horizon = explanation.parts, [], _horizon(explanation, settings)
+    parts, candidates, horizon = explanation.parts, [], _horizon(explanation)
     mended = simulation.with_effects(*explanation.effects)
     if (beside := find_undeclared(mended, measured, horizon, settings=settings)) is not None:
         together = _beside(simulation, measured, explanation, beside, settings)
@@ -126,12 +129,12 @@ def _beside(
     simulation: Simulation, measured: Measured, explanation: Explanation, force: Undeclared, settings: LoopSettings
 ) -> Parts:
     """The effects that are needed beside a force, and the force from a new search beside these effects."""
-    parts, horizon = explanation.parts, _horizon(explanation, settings)
+    parts, horizon = explanation.parts, _horizon(explanation)
     candidate = (*parts, Part(force.effect, False, force.ci95))
     if not parts:
         return candidate
     mended = simulation.with_effects(*_effects_of(parts))
-    posed = Problem.pose(mended, measured, horizon, settings=settings.residual)
+    posed = Problem.pose(mended, measured, horizon)
     needed = needed_parts(replace(posed, simulation=simulation), explanation.trace, candidate, settings)
     known = needed[:-1]
     again = find_undeclared(
@@ -141,7 +144,7 @@ def _beside(
 
 
 def _with_least_noise(
-    simulation: Simulation, measured: Measured, explanations: Sequence[Parts], horizon: int, settings: LoopSettings
+    simulation: Simulation, measured: Measured, explanations: Sequence[Parts], horizon: int
 ) -> Problem:
     """The problem in which explanations are compared, posed with the explanation that leaves the least sensor noise.
 
@@ -155,7 +158,7 @@ def _with_least_noise(
         std = sensor_noise(candidate, measured)
         return 0.0 if std is None else float(((std / spread) ** 2).mean())
 
-    posed = Problem.pose(min(mended, key=noise), measured, horizon, settings=settings.residual)
+    posed = Problem.pose(min(mended, key=noise), measured, horizon)
     return replace(posed, simulation=simulation)
 
 
@@ -167,12 +170,11 @@ def _pays(
     first: Problem, before: np.ndarray, after: np.ndarray, parts: Parts, candidate: Parts, settings: LoopSettings
 ) -> bool:
     """Whether a candidate lowers the held-out loss enough, significantly, and by a share of the whole reduction."""
-    rules, test = settings.undeclared, settings.significance
-    gains = after.mean() < (1.0 - rules.min_gain_over_catalogue) * before.mean()
-    if not (gains and p_value_of_losses(before, after, test) < test.level):
+    gains = after.mean() < (1.0 - MIN_GAIN_OVER_CATALOGUE) * before.mean()
+    if not (gains and p_value_of_losses(before, after, settings) < settings.level):
         return False
     none, present, proposed = (first.selection_loss(_effects_of(some)) for some in ((), parts, candidate))
-    return matters(none, present, proposed, rules.min_share)
+    return matters(none, present, proposed, MIN_SHARE)
 
 
 def _beyond_noise(
@@ -186,7 +188,7 @@ def _beyond_noise(
     by_chance = find_undeclared(candidate.base, data, horizon, settings=settings)
     if by_chance is None:
         return True
-    return _explained(candidate.force) > settings.undeclared.beyond_noise * _explained(by_chance)
+    return _explained(candidate.force) > BEYOND_NOISE * _explained(by_chance)
 
 
 def _explained(force: Undeclared) -> float:
@@ -194,10 +196,10 @@ def _explained(force: Undeclared) -> float:
     return float(np.mean(1.0 - force.error_after / np.maximum(force.error_before, 1e-300)))
 
 
-def _shortest(paying: Sequence[tuple[Parts, float]], settings: LoopSettings) -> Parts:
+def _shortest(paying: Sequence[tuple[Parts, float]]) -> Parts:
     """The shortest explanation whose loss is close to the lowest; on a tie, the one with the catalogue's effects."""
     least = min(loss for _, loss in paying)
-    limit = least / (1.0 - settings.undeclared.min_gain_over_catalogue)
+    limit = least / (1.0 - MIN_GAIN_OVER_CATALOGUE)
     return min((parts for parts, loss in paying if loss <= limit), key=_description_length)
 
 

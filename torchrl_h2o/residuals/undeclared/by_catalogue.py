@@ -27,6 +27,7 @@ from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
+from torchrl_h2o.residuals.undeclared.needed import MIN_GAIN_OVER_CATALOGUE
 
 Parts = tuple[Part, ...]
 
@@ -58,10 +59,10 @@ def by_catalogue(
     starts = problem.measured.fitted(problem.horizon)
     if not is_possible(problem, effects):
         return parts
-    result = fit(problem, effects, free, starts, settings=settings.fit)
+    result = fit(problem, effects, free, starts, max_evaluations=settings.max_evaluations)
     before, after = (problem.selection_losses(some) for some in ([part.effect for part in parts], result.effects))
-    worse = after.mean() > before.mean() / (1.0 - settings.undeclared.min_gain_over_catalogue)
-    if worse and p_value_of_losses(after, before, settings.significance) < settings.significance.level:
+    worse = after.mean() > before.mean() / (1.0 - MIN_GAIN_OVER_CATALOGUE)
+    if worse and p_value_of_losses(after, before, settings) < settings.level:
         return parts
     result = fitted_in_longer_windows(problem, result, settings)
     # alternatives of the effects were found without the force

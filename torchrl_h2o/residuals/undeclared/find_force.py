@@ -22,6 +22,16 @@ from torchrl_h2o.residuals.undeclared.inverse_force import StepPath, force_respo
 from torchrl_h2o.residuals.undeclared.sparse_force import SparseForce, sparse_force
 from torchrl_h2o.residuals.undeclared.terms import TermLibrary
 
+MIN_GAIN = 0.01  # share of the held-out loss that all terms of the force must explain
+# share of the loss that a round must explain; removing a term may cost this share of the explained loss
+MIN_TERM_GAIN = 0.002
+ROUNDS = 6  # largest number of rounds of adding terms
+FURTHER_STEPS = 5  # control steps ahead at which the force must also lower the loss; a fit to sensor noise does not
+MAX_TERMS = 6  # largest number of terms of the whole force
+# largest phase, in rad, that a wave runs through over the measured positions for a line to be tried instead
+STRAIGHT = 1.0
+NEGLIGIBLE = 1e-6  # residual, in spreads, that counts as rounding
+
 
 @dataclass(frozen=True, eq=False)
 class Undeclared:
@@ -68,8 +78,8 @@ def find_undeclared(
     Returns:
         The force; None if none passes the tests.
     """
-    problem = Problem.pose(simulation, measured, settings=settings.residual)
-    if _nothing_to_explain(problem, measured.fitted(), settings):
+    problem = Problem.pose(simulation, measured)
+    if _nothing_to_explain(problem, measured.fitted()):
         return None
     regression = _Regression.of(problem, horizon, settings)
     found = _grown(regression, progress or (lambda words: None))
@@ -78,9 +88,9 @@ def find_undeclared(
     objective, judged = regression.objective, measured.selected_on(horizon)
     before, after = objective.residual((), judged), objective.residual(found.effects, judged)
     gain = losses(before) - losses(after)
-    p_of_windows = p_value_of_losses(losses(before), losses(after), settings.significance)
+    p_of_windows = p_value_of_losses(losses(before), losses(after), settings)
     p = max(p_of_windows, _p_value_further(regression, (), found.effects, held_out=True))
-    if p > settings.significance.level or gain.mean() < settings.undeclared.min_gain * losses(before).mean():
+    if p > settings.level or gain.mean() < MIN_GAIN * losses(before).mean():
         return None
     size = objective.scale_of(judged)
     error_before, error_after = (np.sqrt(((size * residual)[:, -1] ** 2).mean(0)) for residual in (before, after))
@@ -115,24 +125,24 @@ class _Regression:
     def of(cls, problem: Problem, horizon: int, settings: LoopSettings) -> _Regression:
         simulation, measured, states = problem.simulation, problem.measured, problem.states
         starts, std = measured.fitted(), problem.sensor_std
-        pose = partial(Problem.pose, simulation, measured, sensor_std=std, settings=settings.residual)
+        pose = partial(Problem.pose, simulation, measured, sensor_std=std)
         objective = problem if horizon == 1 else pose(horizon)
         return cls(
             problem,
             objective,
-            pose(settings.undeclared.further_steps),
+            pose(FURTHER_STEPS),
             starts,
             step_path(simulation, measured, starts, states=states),
-            force_response(simulation, measured, starts, states=states, settings=settings.regression),
+            force_response(simulation, measured, starts, states=states),
             losses(objective.residual((), measured.fitted(horizon))).mean(),
             settings,
         )
 
 
-def _nothing_to_explain(problem: Problem, starts: np.ndarray, settings: LoopSettings) -> bool:
+def _nothing_to_explain(problem: Problem, starts: np.ndarray) -> bool:
     """Whether the residual is within rounding."""
     spread = np.maximum(problem.measured.observation.std(0), 1e-12)
-    return bool((problem.scale_of(starts).mean((0, 1)) < settings.undeclared.negligible * spread).all())
+    return bool((problem.scale_of(starts).mean((0, 1)) < NEGLIGIBLE * spread).all())
 
 
 def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | None:
@@ -140,18 +150,18 @@ def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | 
 
     After each addition, all terms are fitted again. Redundant ones are removed, nearly straight waves become lines.
     """
-    rules, level = regression.settings.undeclared, regression.settings.significance.level
+    level = regression.settings.level
     best, left = None, regression.before
     barred = set()  # degrees of freedom on which a new term did not lower the loss enough
-    for _ in range(rules.rounds):
+    for _ in range(ROUNDS):
         effect = _force_of(best) if best else ResidualForce()
         added = _best_terms(regression, effect, barred)
-        exhausted = left < rules.min_term_gain * regression.before
-        if exhausted or not added.terms or len(effect.terms) >= rules.max_terms:
+        exhausted = left < MIN_TERM_GAIN * regression.before
+        if exhausted or not added.terms or len(effect.terms) >= MAX_TERMS:
             break
         candidate = _pruned(regression, _fitted(regression, ResidualForce((*effect.terms, *map(str, added.terms)))))
         candidate = _straightened(regression, candidate)
-        pays = left - candidate.loss > rules.min_term_gain * regression.before
+        pays = left - candidate.loss > MIN_TERM_GAIN * regression.before
         if pays and _p_value_further(regression, (effect,), candidate.effects, held_out=False) < level:
             best, left = candidate, candidate.loss
             progress(best.effects[0].describe())
@@ -164,25 +174,23 @@ def _p_value_further(
     regression: _Regression, before: Sequence[Effect], after: Sequence[Effect], *, held_out: bool
 ) -> float:
     """p-value of the decrease of the loss several steps ahead, from one force to another."""
-    measured, steps = regression.problem.measured, regression.settings.undeclared.further_steps
+    measured, steps = regression.problem.measured, FURTHER_STEPS
     starts = measured.selected_on(steps) if held_out else measured.fitted(steps)
     loss_before, loss_after = (losses(regression.further.residual(forces, starts)) for forces in (before, after))
-    return p_value_of_losses(loss_before, loss_after, regression.settings.significance)
+    return p_value_of_losses(loss_before, loss_after, regression.settings)
 
 
 def _best_terms(regression: _Regression, effect: ResidualForce, barred: set[str]) -> SparseForce:
     """The terms on one degree of freedom that explain most of the residual that remains with a force."""
-    problem, starts, settings = regression.problem, regression.starts, regression.settings.regression
+    problem, starts = regression.problem, regression.starts
     simulation = problem.simulation
     residual = (problem.residual((effect,), starts) * problem.scale_of(starts))[:, 0]
-    forces = residual_forces(
-        simulation, problem.measured, starts, residual=residual, response=regression.response, settings=settings
-    )
+    forces = residual_forces(simulation, problem.measured, starts, residual=residual, response=regression.response)
     observed = cast("np.ndarray", simulation.state_map.restore.any(1))
     bent = _bent_controls(simulation, problem.measured.action[starts])
     found = [
         sparse_force(
-            TermLibrary(freedom, regression.path, observed, bent, settings),
+            TermLibrary(freedom, regression.path, observed, bent),
             forces.force[:, freedom.velocity],
             forces.weight[:, freedom.velocity],
         )
@@ -216,7 +224,7 @@ def _fitted(regression: _Regression, effect: ResidualForce) -> Fit:
     free = tuple(name for name in effect.parameters if not name.startswith("start"))
     objective = regression.objective
     starts = objective.measured.fitted(objective.horizon)
-    return fit(objective, (effect,), (free,), starts, settings=regression.settings.fit)
+    return fit(objective, (effect,), (free,), starts, max_evaluations=regression.settings.max_evaluations)
 
 
 def _pruned(regression: _Regression, best: Fit) -> Fit:
@@ -228,7 +236,7 @@ def _pruned(regression: _Regression, best: Fit) -> Fit:
         alone = [losses(problem.residual((effect,), starts)).mean() for effect in rest]
         candidate = _fitted(regression, rest[int(np.argmin(alone))])
         cost = candidate.loss - best.loss
-        if cost > regression.settings.undeclared.min_term_gain * (regression.before - best.loss):
+        if cost > MIN_TERM_GAIN * (regression.before - best.loss):
             break
         best = candidate
     return best
@@ -249,9 +257,9 @@ def _straightened(regression: _Regression, best: Fit) -> Fit:
         return best
     candidate = _pruned(regression, _fitted(regression, effect))
     cost = candidate.loss - best.loss
-    if len(_force_of(candidate).terms) > max(len(_force_of(best).terms), regression.settings.undeclared.max_terms):
+    if len(_force_of(candidate).terms) > max(len(_force_of(best).terms), MAX_TERMS):
         return best
-    return best if cost > regression.settings.undeclared.min_term_gain * (regression.before - best.loss) else candidate
+    return best if cost > MIN_TERM_GAIN * (regression.before - best.loss) else candidate
 
 
 def _line_of(term: ForceTerm, regression: _Regression) -> tuple[ForceTerm, ...]:
@@ -263,7 +271,7 @@ def _line_of(term: ForceTerm, regression: _Regression) -> tuple[ForceTerm, ...]:
     freedom = next(one for one in freedoms if one.name == term.joint)
     position = coordinate("q", freedom, path.qpos, path.qvel, path.ctrl, path.time)
     frequency, phase = last.numbers
-    if abs(frequency) * np.ptp(position) > regression.settings.undeclared.straight:
+    if abs(frequency) * np.ptp(position) > STRAIGHT:
         return (term,)
     constant = replace(term, coefficient=term.coefficient * np.sin(phase), factors=tuple(carrier))
     slope = term.coefficient * frequency * np.cos(phase)

@@ -10,8 +10,12 @@ import numpy as np
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.settings import DEFAULTS, RegressionSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+TAILS = 4.0  # degrees of freedom of the residuals' t-distribution; contacts and outliers make its tails heavy
+SCATTER_ITERATIONS = 15  # iterations of the scatter estimate
+SHRINKAGE = 0.01  # shrinkage of the scatter towards its diagonal, so that it can be inverted without noise
+FORCE_NUDGE = 0.1  # step of the finite differences by the force, as a share of the typical force
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +40,6 @@ def residual_forces(
     *,
     residual: np.ndarray | None = None,
     response: np.ndarray | None = None,
-    settings: RegressionSettings = DEFAULTS.regression,
 ) -> ResidualForces:
     """Computes the force that makes the simulator reproduce the measured step, for each degree of freedom alone.
 
@@ -50,7 +53,6 @@ def residual_forces(
         starts: (W), the transitions.
         residual: (W, n), residual to convert; that of the simulation by default.
         response: (W, n, nv), derivative of the observation by the forces; :func:`force_response` by default.
-        settings: scatter of the residuals and finite differences.
 
     Returns:
         The forces and their weights.
@@ -58,10 +60,10 @@ def residual_forces(
     if residual is None:
         residual = residuals(simulation, measured, starts)[:, 0]
     if response is None:
-        response = force_response(simulation, measured, starts, settings=settings)
+        response = force_response(simulation, measured, starts)
     finite = cast("np.ndarray", np.isfinite(residual).all(1) & np.isfinite(response).all((1, 2)))
     residual, response = np.where(finite[:, None], residual, 0.0), np.where(finite[:, None, None], response, 0.0)
-    precision, rows = _precision(residual, finite, settings)
+    precision, rows = _precision(residual, finite)
     towards = np.einsum("wnv,nm->wmv", response, precision)
     weight = np.einsum("wmv,wmv->wv", towards, response)
     force = np.einsum("wmv,wm->wv", towards, residual) / np.where(weight > 0.0, weight, 1.0)
@@ -74,11 +76,10 @@ def force_response(
     starts: np.ndarray,
     *,
     states: np.ndarray | None = None,
-    settings: RegressionSettings = DEFAULTS.regression,
 ) -> np.ndarray:
     """Derivative of the observation after a control step by the generalised forces, (W, n, nv), per N or N·m.
 
-    Computed by finite differences with steps of a fixed share of the typical force (``settings.force_nudge``), because
+    Computed by finite differences with steps of a fixed share of the typical force (``FORCE_NUDGE``), because
     the derivative at a point would be misleading near dry friction and soft contacts.
     """
     model, state_map = simulation.model, simulation.state_map
@@ -89,7 +90,7 @@ def force_response(
     at = {"time": measured.time[starts], "activations": activations(simulation, measured, executed)[starts]}
     change = np.nanstd(missed @ state_map.restore.T, axis=0)[model.nq :]
     change = np.maximum(change, 1e-6 + 1e-4 * np.nanstd(states[:, model.nq :], axis=0))
-    size = settings.force_nudge * model.dof_M0 * change / simulation.control_step
+    size = FORCE_NUDGE * model.dof_M0 * change / simulation.control_step
     columns = []
     for dof in range(model.nv):
         push = np.zeros((len(starts), 1, model.nv))
@@ -137,14 +138,14 @@ def step_path(
     return StepPath(path[..., : model.nq], path[..., model.nq :], actions, moments)
 
 
-def _precision(residual: np.ndarray, finite: np.ndarray, settings: RegressionSettings) -> tuple[np.ndarray, np.ndarray]:
+def _precision(residual: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Inverse scatter of the residuals, (n, n), and weight of each row, (W), under a multivariate t-distribution."""
     size = residual.shape[1]
     rows = finite.astype(float)
-    for _ in range(settings.scatter_iterations):
+    for _ in range(SCATTER_ITERATIONS):
         scatter = (rows[:, None] * residual).T @ residual / max(finite.sum(), 1)
         floor = np.maximum(np.diag(scatter), 1e-12 * scatter.trace() + 1e-30)
-        precision = np.linalg.inv((1.0 - settings.shrinkage) * scatter + settings.shrinkage * np.diag(floor))
+        precision = np.linalg.inv((1.0 - SHRINKAGE) * scatter + SHRINKAGE * np.diag(floor))
         distance = np.einsum("wn,nm,wm->w", residual, precision, residual)
-        rows = finite * (settings.tails + size) / (settings.tails + distance)
+        rows = finite * (TAILS + size) / (TAILS + distance)
     return precision, rows

@@ -14,6 +14,9 @@ from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import free_parameters
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
+# share of the held-out loss that a force must explain beside or instead of the catalogue's effects
+MIN_GAIN_OVER_CATALOGUE = 0.05
+
 
 def needed_parts(
     problem: Problem, trace: Trace, parts: Sequence[Part], settings: LoopSettings = DEFAULTS
@@ -29,14 +32,13 @@ def needed_parts(
     Returns:
         The remaining parts, fitted together.
     """
-    rules, test = settings.undeclared, settings.significance
     chosen = list(range(len(parts)))
     best, lowest = _refitted(problem, trace, parts, chosen, settings)
     for index in range(len(parts) - 1):
         rest = [i for i in chosen if i != index]
         candidate, after = _refitted(problem, trace, parts, rest, settings)
-        close = after.mean() < lowest.mean() / (1.0 - rules.min_gain_over_catalogue)
-        if close or p_value_of_losses(after, lowest, test) > test.level:
+        close = after.mean() < lowest.mean() / (1.0 - MIN_GAIN_OVER_CATALOGUE)
+        if close or p_value_of_losses(after, lowest, settings) > settings.level:
             chosen, best, lowest = rest, candidate, after
     return best
 
@@ -47,9 +49,8 @@ def _refitted(
     """Some of the parts, fitted together, and their held-out losses, (W)."""
     free = [free_parameters(trace.entries[i]) if parts[i].declared else tuple(parts[i].ci95) for i in range(len(parts))]
     effects = [parts[i].effect for i in chosen]
-    result = fit(
-        problem, effects, [free[i] for i in chosen], problem.measured.fitted(problem.horizon), settings=settings.fit
-    )
+    free, starts = [free[i] for i in chosen], problem.measured.fitted(problem.horizon)
+    result = fit(problem, effects, free, starts, max_evaluations=settings.max_evaluations)
     refitted = tuple(
         Part(effect, parts[i].declared, result.ci95(position), parts[i].alike)
         for position, (i, effect) in enumerate(zip(chosen, result.effects, strict=True))

@@ -9,8 +9,13 @@ from pysindy.optimizers import FROLS
 from scipy.stats import f
 
 from torchrl_h2o.effects.force.term import ForceTerm
-from torchrl_h2o.residuals.settings import RegressionSettings
-from torchrl_h2o.residuals.undeclared.terms import Factors, TermLibrary
+from torchrl_h2o.residuals.undeclared.terms import NEGLIGIBLE, Factors, TermLibrary
+
+MAX_TERMS = 3  # largest number of terms on one degree of freedom per round
+BLOCKS = 10  # blocks of neighbouring rows that are held back together
+FOLDS = 5  # folds of the cross-validation
+TERM_LEVEL = 1e-4  # significance level of the F-test of a term, for a whole library
+MIN_GAIN = 0.01  # share of the unexplained sum of squares that a term must explain
 
 
 @dataclass(frozen=True)
@@ -41,45 +46,44 @@ def sparse_force(library: TermLibrary, force: np.ndarray, weight: np.ndarray) ->
     Returns:
         The terms; none if none passes.
     """
-    settings = library.settings
     known = weight > 0.0
-    if known.sum() < 10 * settings.blocks or not force[known].any():
+    if known.sum() < 10 * BLOCKS or not force[known].any():
         return SparseForce()
     candidates = list(dict.fromkeys([*library.fixed(), *library.scanned(force, weight)]))
     columns = np.stack([library.column(factors) for factors in candidates], axis=1)
     root = np.sqrt(weight[known])
     design, target = root[:, None] * columns[known], root * force[known]
     size = np.linalg.norm(design, axis=0)
-    moving = np.flatnonzero(size > settings.negligible * size.max())
+    moving = np.flatnonzero(size > NEGLIGIBLE * size.max())
     candidates, design = [candidates[i] for i in moving], design[:, moving] / size[moving]
-    chosen, gain = _chosen(design, target, settings)
+    chosen, gain = _chosen(design, target)
     values = np.linalg.lstsq(design[:, chosen], target, rcond=None)[0] / size[moving][chosen]
     return SparseForce(
         tuple(_term(library, candidates[i], value) for i, value in zip(chosen, values, strict=True)), gain
     )
 
 
-def _chosen(design: np.ndarray, target: np.ndarray, settings: RegressionSettings) -> tuple[list[int], float]:
+def _chosen(design: np.ndarray, target: np.ndarray) -> tuple[list[int], float]:
     """Indices of the selected columns, and the decrease of the sum of squares on blocks held back."""
     rows, choices = design.shape
-    chance = f.isf(settings.level / choices, 1, rows)
+    chance = f.isf(TERM_LEVEL / choices, 1, rows)
     before = left = float(target @ target)
     chosen = []
-    regression = FROLS(max_iter=settings.max_terms, alpha=1e-9, unbias=False).fit(design, target[:, None])
+    regression = FROLS(max_iter=MAX_TERMS, alpha=1e-9, unbias=False).fit(design, target[:, None])
     for coefficients in regression.history_[1:]:
         support = np.flatnonzero(coefficients).tolist()
-        loss = _held_back_loss(design[:, support], target, settings)
-        if left - loss < max(settings.min_gain * before, chance * loss / rows):
+        loss = _held_back_loss(design[:, support], target)
+        if left - loss < max(MIN_GAIN * before, chance * loss / rows):
             break
         chosen, left = support, loss
     return chosen, before - left
 
 
-def _held_back_loss(design: np.ndarray, target: np.ndarray, settings: RegressionSettings) -> float:
+def _held_back_loss(design: np.ndarray, target: np.ndarray) -> float:
     """Cross-validated sum of squares: each fold is predicted by a regression on the others."""
-    fold = np.arange(len(target)) * settings.blocks // len(target) % settings.folds
+    fold = np.arange(len(target)) * BLOCKS // len(target) % FOLDS
     loss = 0.0
-    for k in range(settings.folds):
+    for k in range(FOLDS):
         seen = fold != k
         solution = np.linalg.lstsq(design[seen], target[seen], rcond=None)[0]
         loss += float(((target[~seen] - design[~seen] @ solution) ** 2).sum())

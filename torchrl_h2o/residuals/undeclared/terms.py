@@ -14,8 +14,19 @@ from scipy.optimize import minimize_scalar
 
 from torchrl_h2o.effects.force.residual_force import DegreeOfFreedom, coordinate
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
-from torchrl_h2o.residuals.settings import DEFAULTS, RegressionSettings
 from torchrl_h2o.residuals.undeclared.inverse_force import StepPath
+
+NEGLIGIBLE = 1e-9  # relative spread or norm at which a coordinate or column counts as constant
+# largest number of periods over the range of a position; faster waves cannot be distinguished from noise
+MAX_WAVES = 15.0
+# largest number of periods per turn of a hinge, such as the torque ripple of a motor with many poles
+MAX_HARMONIC = 30.0
+SCAN_SPACING = 0.8  # spacing of scanned frequencies, in rad over the range
+MAX_SCANNED = 1500  # largest number of scanned frequencies
+# number of positions on which frequencies are scanned; the best one is then refined on all positions
+SCANNED_VALUES = 5000
+MIN_PERIODS = 1.5  # smallest number of periods of a wave in time; fewer cannot be distinguished from a trend
+MIN_STEP_SHARE = 0.03  # smallest share of the rows on either side of a step in time
 
 Factors = tuple[Factor, ...]
 
@@ -29,19 +40,17 @@ class TermLibrary:
         path: states and controls within the transitions.
         observed: (nq + nv), True for observed coordinates of the state.
         bent: indices of the controls whose powers are left out, because an effect of the simulator imitates them.
-        settings: range and resolution of the scans.
     """
 
     freedom: DegreeOfFreedom
     path: StepPath
     observed: np.ndarray
     bent: Collection[int] = ()
-    settings: RegressionSettings = DEFAULTS.regression
 
     @property
     def _coordinates(self) -> tuple[bool, bool]:
         """Whether position and velocity are scalar, observed and not constant."""
-        still = self.settings.negligible
+        still = NEGLIGIBLE
         position, nq = self.freedom.position, self.path.qpos.shape[-1]
         has_q = position is not None and bool(self.observed[position]) and np.ptp(self._values("q")) > still
         return has_q, bool(self.observed[nq + self.freedom.velocity]) and np.ptp(self._values("v")) > still
@@ -97,11 +106,10 @@ class TermLibrary:
         q = self._values("q")
         scale = np.broadcast_to(ForceTerm(self.freedom.name, 1.0, carrier).shape(self._values), q.shape)
         span = np.ptp(q)
-        rules = self.settings
-        most = 2.0 * np.pi * rules.max_waves / span
-        least, most = np.pi / span, most if self.freedom.sliding else max(most, rules.max_harmonic)
-        spacing = max(rules.scan_spacing / span, (most - least) / rules.max_scanned)
-        k, phase = _best_wave(force, weight, q, scale, np.arange(least, most, spacing), rules.scanned_values)
+        most = 2.0 * np.pi * MAX_WAVES / span
+        least, most = np.pi / span, most if self.freedom.sliding else max(most, MAX_HARMONIC)
+        spacing = max(SCAN_SPACING / span, (most - least) / MAX_SCANNED)
+        k, phase = _best_wave(force, weight, q, scale, np.arange(least, most, spacing), SCANNED_VALUES)
         return (*carrier, Factor("sin", "q", numbers=(k, phase)))
 
     def _wave_in_time(self, force: np.ndarray, weight: np.ndarray) -> Iterator[Factors]:
@@ -114,12 +122,12 @@ class TermLibrary:
             return
         power = np.abs(np.fft.rfft(np.bincount(place, weight * force), 4 * (place.max() + 1))) ** 2
         omega = 2.0 * np.pi * np.arange(len(power)) / (4 * (place.max() + 1) * step)
-        legal = (omega >= 2.0 * np.pi * self.settings.min_periods / span) & (omega < 0.9 * np.pi / step)
+        legal = (omega >= 2.0 * np.pi * MIN_PERIODS / span) & (omega < 0.9 * np.pi / step)
         if not legal.any():
             return
         peak = omega[legal][power[legal].argmax()]
-        grid = peak + np.array([-1.0, 0.0, 1.0]) * self.settings.scan_spacing / span
-        moments, values = self.path.time - time.min(), self.settings.scanned_values
+        grid = peak + np.array([-1.0, 0.0, 1.0]) * SCAN_SPACING / span
+        moments, values = self.path.time - time.min(), SCANNED_VALUES
         found = _best_wave(force, weight, moments, np.ones_like(moments), grid, values)
         frequency, phase = found[0], found[1] - found[0] * time.min()
         yield (Factor("sin", "t", numbers=(frequency, _wrapped(phase))),)
@@ -129,7 +137,7 @@ class TermLibrary:
         time = self.path.time[:, 0]
         order = np.argsort(time, kind="stable")
         mass, moment = np.cumsum(weight[order]), np.cumsum((weight * force)[order])
-        few = max(1, int(self.settings.min_step_share * len(order)))
+        few = max(1, int(MIN_STEP_SHARE * len(order)))
         before, total = mass[few:-few], mass[-1]
         if len(before) == 0 or before[0] <= 0.0 or before[-1] >= total:
             return
