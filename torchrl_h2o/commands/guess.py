@@ -10,6 +10,7 @@ import mujoco
 
 from torchrl_h2o.commands.column_names import as_key
 from torchrl_h2o.data import DataError, sources_of
+from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
 from torchrl_h2o.data.readers.guess.layout_text import guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
@@ -29,7 +30,8 @@ def guess_columns(arguments: Sequence[str]) -> None:
 
     Raises:
         ValueError: for missing or other arguments, or a file that is not a model.
-        torchrl_h2o.data.DataError: if the log cannot be read as a table, or the file to write exists.
+        torchrl_h2o.data.DataError: if the log cannot be read as a table, several logs are columns of one run, or the
+            file to write exists or cannot be written.
     """
     given = {name: value for name, _, value in (argument.partition("=") for argument in arguments if argument != GUESS)}
     unknown = [name for name in given if name not in ("data", "simulator", "columns")]
@@ -38,13 +40,19 @@ def guess_columns(arguments: Sequence[str]) -> None:
         raise ValueError(
             f"{problem}; write close-the-loop --guess data=log.csv [simulator=robot.xml] [columns=log.yaml]"
         )
-    log = Path(sources_of(given["data"].strip("[]").split(","))[0])
+    logs = sources_of([part.strip() for part in given["data"].strip("[]").split(",")])
+    require_several_runs(logs)
+    log = Path(logs[0])
     path = Path(given.get("columns", f"{log.stem}.yaml"))
     guessed = guess_layout(log, _coordinates_of(given["simulator"]) if "simulator" in given else None)
     if path.exists():
         problem = "the file exists and is not overwritten"
         raise DataError(problem, "remove it, or choose another name with columns=", source=path)
-    write_text(path, guessed.text)
+    try:
+        write_text(path, guessed.text)
+    except OSError as error:
+        problem = f"the file cannot be written: {error.strerror or error}"
+        raise DataError(problem, "choose another name with columns=", source=path) from error
     print(
         f"{path} describes the columns of {log}; correct it, then run\n\n{_command(given, path, guessed.coordinates)}"
     )

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_h2o.data import Column, DataError, LogColumns, load, read_robot_log
-from torchrl_h2o.data.readers.settings import ReaderSettings
+from torchrl_h2o.data.readers.file_kind import LARGEST_EXPANSION
 
 ROWS = 40
 T = 0.01 * np.arange(ROWS)
@@ -255,7 +255,7 @@ def test_a_small_file_of_very_many_values_is_refused(tmp_path, name):
         from pyarrow import parquet
 
         parquet.write_table(pyarrow.table({"q": np.zeros(rows)}), path)
-    assert path.stat().st_size < 96e6 / ReaderSettings().largest_expansion
+    assert path.stat().st_size < 96e6 / LARGEST_EXPANSION
     with pytest.raises(DataError, match=r"it states 96\d+ bytes of values, but the file has \d+"):
         load(path, columns=layout())
 

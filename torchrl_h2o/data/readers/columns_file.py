@@ -6,6 +6,7 @@ counts. Aliases need one as well: nine lines can stand for a billion entries, an
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from importlib import resources
 from pathlib import Path
@@ -14,18 +15,20 @@ from typing import Any, TypeVar
 import yaml
 
 from torchrl_h2o.data.readers.error import DataError
-from torchrl_h2o.data.readers.settings import READER_SETTINGS
 
 Layout = TypeVar("Layout")
 
+LARGEST_FILE = 2**20  # bytes of a column description
+MOST_ENTRIES = 20_000  # entries of a column description after its aliases are expanded
 
-def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layout:
-    """Read a YAML file into a dataclass whose field ``columns`` is a tuple of another dataclass.
+
+def read_layout(source: str | Path | Mapping[str, Any], layout: type[Layout], column: type) -> Layout:
+    """Read a YAML file, or its entries, into a dataclass whose field ``columns`` is a tuple of another dataclass.
 
     Both classes are arguments, so that :class:`LogColumns` can call this function without a circular import.
 
     Args:
-        source: a YAML file, or the name of a layout in the package.
+        source: a YAML file, the name of a layout in the package, or the entries of such a file.
         layout: the class of the layout, :class:`LogColumns`.
         column: the class of a column, :class:`Column`, with the field ``name``.
 
@@ -38,18 +41,13 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
         >>> read_layout("simple_pendulum", LogColumns, Column).action
         ('torque',)
     """
-    path = _find(source)
-    if path.stat().st_size > READER_SETTINGS.layout_bytes:
-        raise DataError(f"the file has {path.stat().st_size} bytes", "give a column description", source=source)
-    try:
-        entries = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except RecursionError as error:
-        raise DataError("the entries are nested too deeply", "correct the file", source=source) from error
-    except yaml.constructor.ConstructorError as error:
-        line = None if error.problem_mark is None else error.problem_mark.line + 1
-        raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, no such day, a number of 5,000 digits
-        raise DataError(f"invalid YAML: {error}", "correct the file", source=source) from error
+    if isinstance(source, Mapping):
+        entries, source = dict(source), "columns"
+    elif isinstance(source, str | Path):
+        entries = _entries_of(source)
+    else:
+        problem = f"columns={source!r} describes no columns"
+        raise DataError(problem, "give LogColumns, the path of a YAML file, or its entries as a mapping")
     known = _known_entries(layout, entries, source)
     if not isinstance(known.get("columns"), list) or not known["columns"]:
         raise DataError("'columns' is not a list", "list the file's columns", source=source)
@@ -58,6 +56,21 @@ def read_layout(source: str | Path, layout: type[Layout], column: type) -> Layou
         for number, entry in enumerate(known["columns"], start=1)
     )
     return _build(layout, {**known, "columns": columns}, source)
+
+
+def _entries_of(source: str | Path) -> Any:
+    path = _find(source)
+    if path.stat().st_size > LARGEST_FILE:
+        raise DataError(f"the file has {path.stat().st_size} bytes", "give a column description", source=source)
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
+    except RecursionError as error:
+        raise DataError("the entries are nested too deeply", "correct the file", source=source) from error
+    except yaml.constructor.ConstructorError as error:
+        line = None if error.problem_mark is None else error.problem_mark.line + 1
+        raise DataError(str(error.problem), "correct the column description", source=source, row=line) from error
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: not UTF-8, no such day, a number of 5,000 digits
+        raise DataError(f"invalid YAML: {error}", "correct the file", source=source) from error
 
 
 class _Loader(yaml.SafeLoader):
@@ -94,7 +107,7 @@ def _expanded_size(node: yaml.Node, sizes: dict[int, int | None]) -> int:
         is_scalar = isinstance(node, yaml.ScalarNode)
         sizes[id(node)] = 1 + (0 if is_scalar else sum(_expanded_size(part, sizes) for part in inner))
     size = sizes[id(node)]
-    if size is None or size > READER_SETTINGS.layout_entries:
+    if size is None or size > MOST_ENTRIES:
         problem = "an anchor contains itself" if size is None else "the aliases expand to too many entries"
         raise yaml.constructor.ConstructorError(problem=problem, problem_mark=node.start_mark)
     return size

@@ -8,12 +8,12 @@ import numpy as np
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 
-from torchrl_h2o.data.readers.error import DataError, require_finite, require_flags, require_real
+from torchrl_h2o.data.readers.error import DataError, require_finite, require_flags, require_real, unreadable
 from torchrl_h2o.data.readers.file_kind import require_file
-from torchrl_h2o.data.readers.own_data import require_own_data
+from torchrl_h2o.data.readers.own_data import own_arrays
 from torchrl_h2o.data.readers.ted import to_ted
 
-_REQUIRED = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "timeouts": 1}
+_DIMENSIONS = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "timeouts": 1, "next_observations": 2}
 _FLAGS = ("terminals", "timeouts")
 
 
@@ -21,7 +21,8 @@ def read_d4rl(path: str | Path) -> TensorDict:
     """Read a D4RL file.
 
     In a file with ``next_observations`` every row is a transition. A row whose next observation differs from the
-    following row, although neither flag is set, is marked truncated; the number of these rows is logged.
+    following row, although neither flag is set, is marked truncated; the number of these rows is logged. Such a file
+    needs no ``timeouts``.
 
     In a file without ``next_observations`` the next observation is the observation of the following row. The last row
     of an episode then has no next observation and is dropped; the row before it becomes the end of the episode, marked
@@ -29,8 +30,8 @@ def read_d4rl(path: str | Path) -> TensorDict:
     ``next_observations`` (D4RL's MuJoCo files from v1 on) for tasks that terminate.
 
     Args:
-        path: an HDF5 file with observations, actions, rewards, terminals and timeouts, the last three of shape (N,)
-            or (N, 1).
+        path: an HDF5 file with observations, actions, rewards, terminals, and timeouts or next_observations. Rewards,
+            terminals and timeouts have the shape (N,) or (N, 1).
 
     Returns:
         TensorDict of batch size [T] in TED.
@@ -97,35 +98,31 @@ def read_d4rl(path: str | Path) -> TensorDict:
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     import h5py  # imported here, because the replay buffer does not need it
 
-    try:
-        with h5py.File(path, "r") as file:
-            missing = [name for name in _REQUIRED if name not in file]
-            if missing:
-                raise DataError(
-                    f"the file has no {', '.join(missing)}; it has {', '.join(file)}",
-                    f"a D4RL file contains {', '.join(_REQUIRED)}",
-                    source=path,
-                    column=missing[0],
-                )
-            names = [*_REQUIRED, *(["next_observations"] if "next_observations" in file else [])]
-            require_own_data(file, names, source=path)
-            arrays = {name: np.asarray(file[name]) for name in names}
-    except DataError:
-        raise
-    except Exception as error:  # h5py raises errors of all kinds for damaged files
-        raise DataError(
-            f"the file cannot be read as HDF5: {error}",
-            "the file is truncated or of another format: copy or download it again",
-            source=path,
-        ) from error
+    remedy = "the file is truncated or of another format: copy or download it again"
+    with unreadable("the file cannot be read as HDF5", remedy, source=path), h5py.File(path, "r") as file:
+        names = [name for name in _DIMENSIONS if name in file]
+        given = "timeouts or next_observations"
+        required = [name for name in _DIMENSIONS if name not in ("timeouts", "next_observations")]
+        missing = [name for name in required if name not in file]
+        if "timeouts" not in file and "next_observations" not in file:
+            missing.append(given)
+        if missing:
+            raise DataError(
+                f"the file has no {', '.join(missing)}; it has {', '.join(file)}",
+                f"a D4RL file contains {', '.join(required)}, and {given}",
+                source=path,
+                column=missing[0],
+            )
+        arrays = {name: np.asarray(array) for name, array in own_arrays(file, names, source=path).items()}
+    arrays.setdefault("timeouts", np.zeros(len(arrays["terminals"]), bool))
     for name, values in arrays.items():
-        if _REQUIRED.get(name) == 1 and values.ndim == 2 and values.shape[1] == 1:
+        if _DIMENSIONS[name] == 1 and values.ndim == 2 and values.shape[1] == 1:
             arrays[name] = values = values[:, 0]
         require_real(values, name, source=path)
-        if values.ndim != _REQUIRED.get(name, 2):
+        if values.ndim != _DIMENSIONS[name]:
             raise DataError(
                 f"it has {values.ndim} dimensions",
-                f"expected {_REQUIRED.get(name, 2)} dimensions",
+                f"expected {_DIMENSIONS[name]} dimensions",
                 source=path,
                 column=name,
             )

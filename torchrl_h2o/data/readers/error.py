@@ -6,7 +6,8 @@ invalid value and a remedy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +57,38 @@ class DataError(ValueError):
         super().__init__(f"{begin}{problem}; {remedy}")
 
 
+@contextmanager
+def unreadable(
+    problem: str, remedy: str = "copy or write it again", *, source: str | Path, column: str | None = None
+) -> Iterator[None]:
+    """Turn any error of the block into a DataError: the packages of file formats raise all kinds for damaged files.
+
+    Args:
+        problem: what cannot be done; the error follows.
+        remedy: how to correct it.
+        source: the file.
+        column: the part of the file that is read.
+
+    Raises:
+        DataError: for any error of the block; its own DataErrors pass.
+
+    Example:
+        >>> from torchrl_h2o.data.readers.error import unreadable
+        >>> with unreadable("the file cannot be read", source="a.csv"):
+        ...     float("x")
+        Traceback (most recent call last):
+        ...
+        torchrl_h2o.data.readers.error.DataError: a.csv: the file cannot be read: could not convert string to float: ...
+    """
+    try:
+        yield
+    except DataError:
+        raise
+    except Exception as error:
+        cause = str(error) or type(error).__name__
+        raise DataError(f"{problem}: {cause}", remedy, source=source, column=column) from error
+
+
 def _one_line(text: str, most: int) -> str:
     """The text without line breaks and invisible characters, cut in the middle to a number of characters."""
     text = " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
@@ -69,14 +102,16 @@ def require_finite(
     *,
     source: str | Path,
     row_of: Callable[[int], int] = lambda index: index + 1,
+    largest: float = float(np.finfo(np.float32).max),
 ) -> None:
-    """Raise DataError at the first value, row by row, that is NaN or infinite in float32.
+    """Raise DataError at the first value, row by row, that is NaN, or beyond the largest plausible one.
 
     Args:
         values: values of shape (rows, columns).
         columns: one name per column.
         source: the file of the values.
         row_of: converts an index to the row number for the message.
+        largest: the largest plausible size of a value; by default, that of float32.
 
     Raises:
         DataError: with file, column and row.
@@ -89,14 +124,14 @@ def require_finite(
         ...
         torchrl_h2o.data.readers.error.DataError: a.csv, column 'v', row 1: the value is nan; ...
     """
-    with np.errstate(over="ignore"):  # 1e300 is finite in float64 and infinite in float32
-        bad = ~np.isfinite(values.astype(np.float32))
-    if not bad.any():
+    plausible = np.abs(values) <= largest  # false for NaN
+    if plausible.all():
         return
-    index, position = np.argwhere(bad)[0]
+    index, position = np.argwhere(~plausible)[0]
     raise DataError(
         f"the value is {values[index, position]}",
-        "every value must be finite in float32: remove the row and the rows that depend on it, or ignore the column",
+        f"every value must be finite and at most {largest:.3g}: correct it or its unit, remove the row and those that "
+        "depend on it, or ignore the column",
         source=source,
         column=columns[int(position)],
         row=row_of(int(index)),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from tensordict import TensorDict
@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from torchrl_h2o.data.readers.d4rl import read_d4rl
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.file_kind import require_file
+from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.log_columns import LogColumns
 from torchrl_h2o.data.readers.memory_map import read_ted
 from torchrl_h2o.data.readers.minari_dataset import read_minari
@@ -24,12 +25,14 @@ from torchrl_h2o.data.readers.ted import entry_name
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
+Columns = LogColumns | str | Path | Mapping[str, Any]
+
 
 def load(
     source: Source,
     *,
     env: EnvBase | None = None,
-    columns: LogColumns | str | Path | None = None,
+    columns: Columns | None = None,
     reward: Reward | None = None,
     task: str | None = None,
 ) -> TensorDict:
@@ -64,7 +67,12 @@ def load(
         torch.Size([1, 3])
     """
     parts = sources_of(source)
-    tds = [_read(one, columns, reward, task) for one in parts]
+    try:
+        tds = [_read(one, columns, reward, task) for one in parts]
+    except DataError:
+        if columns is not None:
+            require_several_runs(parts)
+        raise
     td = tds[0] if len(tds) == 1 else _joined(tds, parts)
     if env is not None:
         check_specs(td, env, source=words_of(source))
@@ -72,7 +80,7 @@ def load(
 
 
 def _read(
-    source: str | Path, columns: LogColumns | str | Path | None, reward: Reward | None, task: str | None
+    source: str | Path, columns: Columns | None, reward: Reward | None, task: str | None
 ) -> TensorDict:
     path = Path(source).expanduser()
     if path.is_dir():
@@ -103,7 +111,7 @@ def _joined(tds: Sequence[TensorDict], sources: Sequence[str | Path]) -> TensorD
     return cast("TensorDict", torch.cat(list(tds)))
 
 
-def _require_no_columns(columns: LogColumns | str | Path | None, source: str | Path) -> None:
+def _require_no_columns(columns: Columns | None, source: str | Path) -> None:
     if columns is not None:
         raise DataError(
             "columns were given, but the source is not a log: its entries have names",
@@ -121,7 +129,7 @@ def _read_folder(path: Path, task: str | None) -> TensorDict:
 
 def _read_file(
     path: Path,
-    columns: LogColumns | str | Path | None,
+    columns: Columns | None,
     reward: Reward | None,
     task: str | None,
 ) -> TensorDict:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from torchrl_h2o.data.readers.units import to_si
 
 _MOST_JUMPS = 0.3  # share of rows that may differ from the row before by more than half a turn of the angle
-ROLES = ("observation", "action", "reward", "done", "time", "ignore")
+ROLES = ("observation", "action", "reward", "done", "time", "run", "ignore")
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,9 @@ class Column:
 
     Args:
         name: the column's name; in a file with a header, the name in the header.
-        role: one of observation, action, reward, done, time, ignore. ``done`` is 1 in rows in which the task has
-            ended. The ``reward`` of a row is the reward of that row's action.
+        role: one of observation, action, reward, done, time, run, ignore. ``done`` is 1 in rows in which the task has
+            ended. The ``reward`` of a row is the reward of that row's action. ``run`` is the number of an episode; a run
+            ends where it changes.
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
         scale: a factor in addition to the unit's, such as a gear ratio or a sign.
         offset: a constant in SI that is added after unit and scale, such as the zero of an angle.
@@ -46,7 +48,7 @@ class Column:
     """
 
     name: str
-    role: Literal["observation", "action", "reward", "done", "time", "ignore"]
+    role: Literal["observation", "action", "reward", "done", "time", "run", "ignore"]
     unit: str = "1"
     scale: float = 1.0
     offset: float = 0.0
@@ -133,8 +135,8 @@ class LogColumns:
         action: names in the order of the action vector; the file's order by default.
         outside_bounds: treatment of actions outside their bounds: ``"error"`` or ``"clip"``.
         time_tolerance: largest deviation of a time step from dt, as a share of dt.
-        on_time_jump: treatment of larger deviations: ``"error"``, or ``"split"``, which starts a new run there.
-            Decreasing time is always an error.
+        on_time_jump: treatment of larger deviations: ``"error"``, or ``"split"``, which starts a new run there, also
+            where time begins again. Rows out of order are always an error.
         after_done: treatment of rows with done = 0 after a row with done = 1: ``"error"``, ``"drop"``, which drops the
             rest of the file, or ``"new_episode"``.
         drop_trailing_zero_rows: whether to drop rows at the end of the file that are all zero.
@@ -188,7 +190,7 @@ class LogColumns:
         if self.free_motion and self.action:
             raise ValueError(f"free_motion: true, but {', '.join(self.action)} has the role action")
         self._check_places()
-        for role in ("reward", "done", "time"):
+        for role in ("reward", "done", "time", "run"):
             if len(self._names(role)) > 1:
                 raise ValueError(f"several columns have the role {role!r}; at most one is allowed")
         if self.dt is None and not self._names("time"):
@@ -268,11 +270,12 @@ class LogColumns:
         return tuple(column.name for column in self.columns if column.role == role)
 
     @classmethod
-    def load(cls, source: str | Path) -> LogColumns:
-        """Read a layout from a YAML file, or a layout of the package by its name.
+    def load(cls, source: str | Path | Mapping[str, Any]) -> LogColumns:
+        """Read a layout from a YAML file or from its entries, or a layout of the package by its name.
 
         Args:
-            source: a path, or ``"wheel_legged_standing_still"``, ``"wheel_legged_moving_forward"``,
+            source: a path, a mapping such as ``{"dt": 0.01, "columns": [{"name": "q", "role": "observation"}, ...]}``,
+                or ``"wheel_legged_standing_still"``, ``"wheel_legged_moving_forward"``,
                 ``"simple_pendulum"`` or ``"double_pendulum"``.
 
         Raises:

@@ -10,7 +10,10 @@ import numpy as np
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 from torchrl_h2o.data.readers.log_table import LogTable
-from torchrl_h2o.data.readers.settings import ReaderSettings
+
+CLOCK_TOLERANCE = 0.02  # share of dt by which the usual step of a log may differ: clocks drift less, lost rows do more
+LONGEST_REGULAR_STEP = 2.0  # median steps; longer ones are gaps, which the mean step does not count
+RESTART = 10.0  # median steps by which time falls back where another run begins; by less, rows are out of order
 
 
 @dataclass(frozen=True)
@@ -58,13 +61,12 @@ class Links:
         return Links.of(linked, done, self.dt)
 
 
-def link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> Links:
+def link_rows(table: LogTable, layout: LogColumns) -> Links:
     """Link the rows of a log into transitions.
 
     Args:
         table: the numbers of the log.
         layout: the columns of time and done, dt, and what to do at a jump in time and after done.
-        settings: the tolerance of the clock.
 
     Raises:
         DataError: for time that does not increase, a time step or a restart that the layout does not allow, a done
@@ -72,7 +74,7 @@ def link_rows(table: LogTable, layout: LogColumns, settings: ReaderSettings) -> 
     """
     done = done_rows(table, layout)
     linked = same_episode(table, layout, done)
-    jumps, dt = _jumps(table, layout, linked, settings)
+    jumps, dt = _jumps(table, layout, linked)
     linked &= ~jumps
     if not linked.any():
         raise DataError(
@@ -111,27 +113,41 @@ def same_episode(table: LogTable, layout: LogColumns, done: np.ndarray) -> np.nd
     Raises:
         DataError: for a restart that the layout does not allow.
     """
-    _require_declared_restart(table, layout, done)
-    linked = ~done[:-1]
+    others = _other_runs(table, layout)
+    _require_declared_restart(table, layout, done[:-1] & ~done[1:] & ~others)
+    linked = ~done[:-1] & ~others
     if layout.after_done == "drop" and done.any():
         linked[np.argmax(done) :] = False
     return linked
 
 
-def _require_declared_restart(table: LogTable, layout: LogColumns, done: np.ndarray) -> None:
-    column, restarts = layout.named("done"), np.flatnonzero(done[:-1] & ~done[1:])
-    if column is not None and len(restarts) and layout.after_done == "error":
+def _other_runs(table: LogTable, layout: LogColumns) -> np.ndarray:
+    """Whether a row and the next one are of different runs by their number, or, where a layout splits, by their time."""
+    others = np.zeros(len(table.rows) - 1, bool)
+    if (run := layout.named("run")) is not None:
+        others |= np.diff(table.columns([run.name])[:, 0]) != 0
+    if (column := layout.named("time")) is not None and layout.on_time_jump == "split":
+        time = table.columns([column.name])[:, 0]
+        steps = np.diff(time)
+        usual = float(np.median(steps))
+        others |= (steps < -RESTART * usual) | ((steps < 0) & (time[1:] <= time[0] + usual))
+    return others
+
+
+def _require_declared_restart(table: LogTable, layout: LogColumns, restarts: np.ndarray) -> None:
+    column = layout.named("done")
+    if column is not None and restarts.any() and layout.after_done == "error":
         raise DataError(
             "done falls back to 0 after the run has ended",
             "state how to treat these rows: after_done: drop, or after_done: new_episode",
             source=table.source,
             column=column.name,
-            row=int(table.rows[restarts[0] + 1]),
+            row=int(table.rows[np.argmax(restarts) + 1]),
         )
 
 
 def _jumps(
-    table: LogTable, layout: LogColumns, linked: np.ndarray, settings: ReaderSettings
+    table: LogTable, layout: LogColumns, linked: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return a mask of the linked pairs of rows whose time step is not dt, and dt.
 
@@ -143,7 +159,7 @@ def _jumps(
         return np.zeros(len(linked), bool), cast("float", layout.dt)  # a layout has dt or a time column
     steps = require_increasing(table, layout, linked)
     place: dict[str, Any] = {"source": table.source, "column": column.name}
-    dt = _dt(steps[linked], layout, place, settings)
+    dt = _dt(steps[linked], layout, place)
     jumps = linked & (np.abs(steps - dt) > layout.time_tolerance * dt)
     if jumps.any() and layout.on_time_jump == "error":
         index = np.argmax(jumps)
@@ -175,8 +191,8 @@ def require_increasing(table: LogTable, layout: LogColumns, linked: np.ndarray) 
         index = backwards[0]
         raise DataError(
             f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
-            "time must increase: split the file into its runs, or set drop_trailing_zero_rows if the logger pads the "
-            "end of the file with zeros",
+            "time must increase: set on_time_jump: split or give a column of role run if another run begins here, or set "
+            "drop_trailing_zero_rows if the logger pads the end with zeros",
             source=table.source,
             column=name,
             row=int(table.rows[index + 1]),
@@ -184,15 +200,15 @@ def require_increasing(table: LogTable, layout: LogColumns, linked: np.ndarray) 
     return steps
 
 
-def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any], settings: ReaderSettings) -> float:
+def _dt(steps: np.ndarray, layout: LogColumns, place: dict[str, Any]) -> float:
     """Return the layout's dt after comparing it with the steps between linked rows; without it, their median."""
     if layout.dt is None or not len(steps):
         return float(np.median(steps)) if len(steps) else 0.0
     median = float(np.median(steps))
     # at 300 Hz a clock with a resolution of 1 ms gives steps of 3, 3, 4 ms; then the mean without gaps is accurate
-    mean = float(np.mean(steps[steps <= settings.longest_regular_step * median]))
+    mean = float(np.mean(steps[steps <= LONGEST_REGULAR_STEP * median]))
     # time_tolerance is for single late rows and would accept a dt that is wrong throughout
-    if min(abs(median - layout.dt), abs(mean - layout.dt)) > settings.clock_tolerance * layout.dt:
+    if min(abs(median - layout.dt), abs(mean - layout.dt)) > CLOCK_TOLERANCE * layout.dt:
         raise DataError(
             f"the median time step is {median:.9g} s, dt is {layout.dt:.9g} s",
             "correct dt or the unit of time, or omit dt to use the median",

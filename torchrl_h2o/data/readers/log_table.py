@@ -15,6 +15,10 @@ from torchrl_h2o.data.readers.formats import read_raw
 from torchrl_h2o.data.readers.formats.raw_table import RawTable
 from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 
+# the largest plausible value in SI: beyond 2³² counts of an encoder and the seconds since 1970, below what a lost
+# decimal point makes of 15 digits
+LARGEST = 1e12
+
 
 @dataclass(frozen=True)
 class LogTable:
@@ -54,7 +58,7 @@ def read_table(path: str | Path, layout: LogColumns) -> LogTable:
 
     Raises:
         DataError: for a missing, binary, empty or truncated file, missing or extra columns, a cell that is not a
-            number, NaN or infinity.
+            number, NaN, or a value beyond :data:`LARGEST`.
 
     Example:
         >>> import pathlib, tempfile
@@ -83,7 +87,7 @@ def read_table(path: str | Path, layout: LogColumns) -> LogTable:
         values = np.stack([column.in_si(values[:, index]) for index, (_, column) in enumerate(chosen)], axis=1)
     except ValueError as error:
         raise DataError(str(error), "correct the column description", source=raw.source) from error
-    require_finite(values, names, source=raw.source, row_of=lambda index: int(numbers[index]))
+    require_finite(values, names, source=raw.source, row_of=lambda index: int(numbers[index]), largest=LARGEST)
     return LogTable(str(raw.source), tuple(names), values, numbers, int(zero_rows))
 
 

@@ -17,7 +17,7 @@ from typing import cast
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.error import DataError, unreadable
 from torchrl_h2o.data.readers.file_kind import is_pickle
 from torchrl_h2o.data.readers.ted import entry_name, require_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
@@ -131,35 +131,26 @@ def load_memory_map(folder: str | Path) -> TensorDict:
                 "write the data again with write_ted, which stores only tensors",
                 source=path,
             )
-    try:
+    with unreadable("unreadable", "write it again", source=folder):
         _require_whole_files(folder)
         return TensorDict.load_memmap(folder, allow_pickle=False)
-    except DataError:
-        raise
-    except Exception as error:  # tensordict raises errors of all kinds for damaged descriptions
-        raise DataError(f"unreadable: {error}", "write it again", source=folder) from error
 
 
 def _require_whole_files(folder: Path) -> None:
-    try:
-        meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+    description = folder / "meta.json"
+    with unreadable("the description cannot be read", "copy or write the folder again", source=description):
+        meta = json.loads(description.read_text(encoding="utf-8"))
+        entries = {key: entry for key, entry in meta.items() if isinstance(entry, dict)}
         sizes = {
             folder / f"{key}.memmap": math.prod(map(index, entry["shape"]))  # not numpy's, which overflows
             * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
-            for key, entry in meta.items()
-            if isinstance(entry, dict) and "dtype" in entry
+            for key, entry in entries.items()
+            if "dtype" in entry
         }
-        nested = [key for key, entry in meta.items() if isinstance(entry, dict) and entry.get("is_nested")]
-        inner = [key for key, entry in meta.items() if isinstance(entry, dict) and "type" in entry]
-    except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
-        raise DataError(
-            f"the description cannot be read: {error}",
-            "copy or write the folder again",
-            source=folder / "meta.json",
-        ) from error
+        nested = [key for key, entry in entries.items() if entry.get("is_nested")]
     if nested:
         problem = "the entry is a nested tensor, whose rows differ in length"
-        raise DataError(problem, "write rows of one length", source=folder / "meta.json", column=nested[0])
+        raise DataError(problem, "write rows of one length", source=description, column=nested[0])
     for path, size in sizes.items():
         found = path.stat().st_size if path.is_file() else 0
         if found != size:
@@ -168,7 +159,7 @@ def _require_whole_files(folder: Path) -> None:
                 "the file is truncated or belongs to other data: copy or write the folder again",
                 source=path,
             )
-    for key in inner:
+    for key in (key for key, entry in entries.items() if "type" in entry):
         _require_whole_files(folder / key)
 
 

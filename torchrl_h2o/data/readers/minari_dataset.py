@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from tensordict import TensorDict, TensorDictBase
 
-from torchrl_h2o.data.readers.error import DataError, require_finite, require_flags, require_real
+from torchrl_h2o.data.readers.error import DataError, require_finite, require_flags, require_real, unreadable
 from torchrl_h2o.data.readers.file_kind import require_file
-from torchrl_h2o.data.readers.own_data import require_own_file
+from torchrl_h2o.data.readers.own_data import own_arrays
 from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.readers.ted import episodes, require_continuous, require_ted, to_ted
 from torchrl_h2o.data.readers.whole_folder import whole_folder
@@ -135,7 +135,8 @@ def write_minari(
             "use name-v0 or namespace/name-v0, each of at least two letters, digits, _ or -",
             source=dataset_id,
         ) from error
-    folder = (get_dataset_path() if root is None else Path(root)) / dataset_id
+    # absolute, because minari's writer changes the meaning of a relative folder
+    folder = (get_dataset_path() if root is None else Path(root).expanduser().absolute()) / dataset_id
     _require_recordable(td, source=dataset_id)
     if env is not None:
         check_specs(td, env, source=dataset_id)
@@ -178,21 +179,15 @@ def _open(source: str | Path) -> MinariDataset:
     for name in ("metadata.json", _MAIN_FILE):
         if (data / name).exists():
             require_file(data / name)
-    try:
+    remedy = (
+        "give the folder that contains data/metadata.json, or a name that is in MINARI_DATASETS_PATH or can be downloaded"
+    )
+    with unreadable("no Minari dataset can be opened", remedy, source=source):
         if data.is_dir():
             _require_plausible_count(data)
         dataset = minari.MinariDataset(data) if data.is_dir() else minari.load_dataset(str(source), download=True)
         _ = int(dataset.total_steps), dataset.spec  # minari checks these entries when they are asked for
         return dataset
-    except DataError:
-        raise
-    except Exception as error:  # each hosting service raises its own network errors
-        raise DataError(
-            f"no Minari dataset can be opened: {error}",
-            "give the folder that contains data/metadata.json, or a name that is in "
-            "MINARI_DATASETS_PATH or can be downloaded",
-            source=source,
-        ) from error
 
 
 def _require_plausible_count(data: Path) -> None:
@@ -229,35 +224,31 @@ def _read_episodes(dataset: MinariDataset, source: str | Path) -> dict[str, list
                 column=name,
             )
     main = dataset.storage.data_path / _MAIN_FILE
+    remedy = "the file is truncated or of another format: copy or download it again"
     if main.exists():  # absent from a dataset in Arrow's format
-        require_own_file(main)
+        import h5py
+
+        with unreadable("the file cannot be read as HDF5", remedy, source=main), h5py.File(main, "r") as file:
+            own_arrays(file, list(file), source=main)
     parts = {field: [] for field in _FIELDS}
     sizes = {"observations": dataset.observation_space.shape, "actions": dataset.action_space.shape}
-    bar = tqdm(dataset.iterate_episodes(), total=dataset.total_episodes, desc=str(source), delay=5)
-    try:
-        for number, episode in enumerate(bar):
+    read = iter(dataset.iterate_episodes())
+    for number in tqdm(range(dataset.total_episodes), desc=str(source), delay=5):
+        with unreadable(f"episode {number} cannot be read", remedy, source=source):
+            episode = next(read)
             steps = len(episode.rewards)
-            for field in _FIELDS:
-                values = getattr(episode, field)
-                shape = (steps + (field == "observations"), *sizes.get(field, ()))
-                if values.shape != shape:
-                    raise DataError(
-                        f"the shape is {list(values.shape)}, expected {list(shape)}",
-                        "the episode is truncated or does not match its space: write it again",
-                        source=source,
-                        column=f"episode_{number}/{field}",
-                    )
-                place = {"column": f"episode_{number}/{field}", "source": source}
-                require_real(values, **place)
-                parts[field].append(require_flags(values, **place) if field in _FLAGS else values)
-    except DataError:
-        raise
-    except Exception as error:  # h5py and minari raise errors of all kinds for damaged files
-        raise DataError(
-            f"episode {len(parts['truncations'])} cannot be read: {error}",
-            "the file is truncated: copy or download it again",
-            source=source,
-        ) from error
+        for field in _FIELDS:
+            values = getattr(episode, field)
+            shape = (steps + (field == "observations"), *sizes.get(field, ()))
+            place = {"column": f"episode_{number}/{field}", "source": source}
+            if values.shape != shape:
+                raise DataError(
+                    f"the shape is {list(values.shape)}, expected {list(shape)}",
+                    "the episode is truncated or does not match its space: write it again",
+                    **place,
+                )
+            require_real(values, **place)
+            parts[field].append(require_flags(values, **place) if field in _FLAGS else values)
     return parts
 
 

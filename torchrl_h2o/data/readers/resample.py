@@ -12,33 +12,34 @@ from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 from torchrl_h2o.data.readers.log_links import done_rows, require_increasing, same_episode
 from torchrl_h2o.data.readers.log_table import LogTable
-from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.units import to_si
 from torchrl_h2o.data.readers.velocity import estimate_velocity
 
 TURN = 2.01 * np.pi  # rad, range of an angle that wraps, with some tolerance
 _ROUNDING = 1e-6  # share of a step by which the last row may be too early for it
+STALE_ROWS = 10  # successive rows with the readings of the row before that may be lost packets; for longer, it rests
+MOST_NEW_ROWS = 50  # rows of the new clock for each row of the log: more take memory and hold no information
 
 
-def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = READER_SETTINGS) -> LogTable:
+def resample(table: LogTable, layout: LogColumns) -> LogTable:
     """Resample the rows of a log to the clock of ``layout.resample``.
 
     Observations are interpolated linearly between two rows. An angle that stays within one turn may jump by 2π between
     them. Each action of the file holds until the next row; a resampled action is the mean of what was held during its
     step. After a lost packet, all sensors show the readings of the row before; such rows are not used for observations.
-    If more than ``settings.stale_rows`` successive rows are equal, the robot rests, and they are used. A run ends with
+    If more than :data:`STALE_ROWS` successive rows are equal, the robot rests, and they are used. A run ends with
     the last step before its ``done`` is 1, or at a gap that is longer than ``time_tolerance`` allows.
 
     Args:
         table: the numbers of the log.
         layout: its columns, with ``resample``.
-        settings: the largest number of successive equal rows that counts as lost packets.
 
     Returns:
         The table with the new clock as its time; ``rows`` are those at or before each step.
 
     Raises:
-        DataError: for time that does not increase, a gap where the layout does not split, or no two steps.
+        DataError: for time that does not increase, a gap where the layout does not split, no two steps, or a step far
+            below the log's own.
 
     Example:
         >>> import pathlib, tempfile
@@ -55,9 +56,10 @@ def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = REA
     linked = same_episode(table, layout, done)
     steps = require_increasing(table, layout, linked)
     measured = [name for name in layout.observation if name in table.names]  # estimated velocities are not in the file
-    stale = _stale(table.columns(measured), settings.stale_rows)
+    stale = _stale(table.columns(measured))
     step = cast("float", layout.resample)
     runs = _up_to_fresh(_runs(steps, linked, table, layout), stale)
+    _require_plausible_step(step, sum(time[run.stop - 1] - time[run.start] for run in runs), table)
     parts = [
         _resampled(table, layout, _Run(time[run], step, stale[run], run, bool(done[run.stop - 1])))
         for run in runs
@@ -73,6 +75,16 @@ def resample(table: LogTable, layout: LogColumns, settings: ReaderSettings = REA
         "repeat the row before in every sensor and were not used"
     )
     return LogTable(table.source, table.names, values, rows, table.zero_rows, _noise(table, layout, runs, steps))
+
+
+def _require_plausible_step(step: float, duration: float, table: LogTable) -> None:
+    least = duration / (MOST_NEW_ROWS * len(table.rows))
+    if step < least:
+        raise DataError(
+            f"resample: {step:g} s gives {duration / step:.3g} rows from {len(table.rows)}",
+            f"give at least {least:.2g} s, a step near the log's own",
+            source=table.source,
+        )
 
 
 def _noise(table: LogTable, layout: LogColumns, runs: list[slice], steps: np.ndarray) -> dict[str, float]:
@@ -150,12 +162,12 @@ def _up_to_fresh(runs: list[slice], stale: np.ndarray) -> list[slice]:
     return [slice(run.start, int(np.flatnonzero(~stale[run])[-1]) + 1 + run.start) for run in runs]
 
 
-def _stale(observation: np.ndarray, longest: int) -> np.ndarray:
-    """Rows that repeat the row before in every sensor, in stretches of at most ``longest`` rows; longer ones rest."""
+def _stale(observation: np.ndarray) -> np.ndarray:
+    """Rows that repeat the row before in every sensor, in stretches of at most STALE_ROWS; longer ones rest."""
     same = np.concatenate([[False], (observation[1:] == observation[:-1]).all(1), [False]])
     stale = np.zeros(len(observation), bool)
     for first, last in np.flatnonzero(np.diff(same.astype(int))).reshape(-1, 2) + 1:
-        stale[first:last] = last - first <= longest
+        stale[first:last] = last - first <= STALE_ROWS
     return stale
 
 
@@ -171,6 +183,8 @@ def _column(column: Column, values: np.ndarray, run: _Run) -> np.ndarray:
         return run.clock
     if column.role == "action":
         return _mean_action(values, run)
+    if column.role == "run":
+        return values[run.before]
     if column.role == "done":
         return np.append(np.zeros(len(run.clock) - 1), float(run.ends))
     return _interpolated(values, run, angle=to_si(column.unit)[0] == "rad" and not column.unwrap)

@@ -5,10 +5,10 @@ Rows t and t + 1 form a transition, so the last row of a run is used only as a n
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from torchrl_h2o.data.readers.log_links import link_rows
 from torchrl_h2o.data.readers.log_table import LogTable, read_table
 from torchrl_h2o.data.readers.observed import observe
 from torchrl_h2o.data.readers.resample import resample
-from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.ted import to_ted
 
 Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -29,10 +28,9 @@ Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 def read_robot_log(
     path: str | Path,
-    columns: LogColumns | str | Path,
+    columns: LogColumns | str | Path | Mapping[str, Any],
     *,
     reward: Reward | None = None,
-    settings: ReaderSettings = READER_SETTINGS,
 ) -> TensorDict:
     """Read a log whose columns are described by a layout.
 
@@ -41,11 +39,10 @@ def read_robot_log(
 
     Args:
         path: the log.
-        columns: its layout, or a YAML file with it, or the name of a layout of the package.
+        columns: its layout, a YAML file with it, the entries of such a file, or the name of a layout of the package.
         reward: ``reward(observation (T, n), action (T, m), next_observation (T, n)) -> (T,)`` on float64 arrays in
             SI. Without it and without a reward column, the result has no ("next", "reward"), which system
             identification does not need.
-        settings: tolerances of the clock.
 
     Returns:
         TensorDict of batch size [T] in TED, with a float64 ``time`` in s of shape [T, 1]. If the layout has velocities
@@ -69,9 +66,9 @@ def read_robot_log(
     layout = columns if isinstance(columns, LogColumns) else LogColumns.load(columns)
     table = read_table(path, layout)
     if layout.resample is not None:
-        table = resample(table, layout, settings)
+        table = resample(table, layout)
         layout = replace(layout, dt=layout.resample, resample=None)
-    links = link_rows(table, layout, settings)
+    links = link_rows(table, layout)
     observation, stds, links = observe(table, layout, links)
     action = table.columns(layout.action)
     action, clipped = _bounded(action, links.start, table, layout)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import glob
+import json
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.error import DataError, unreadable
 from torchrl_h2o.data.readers.formats import FORMATS
 
 Source = str | Path | Sequence[str | Path]
 
 _HDF5_SUFFIXES = {".hdf5", ".h5", ".hdf"}
+_LEROBOT = "meta/info.json"
 _HDF5_START = b"\x89HDF\r\n\x1a\n"
 
 
@@ -26,7 +28,7 @@ def sources_of(source: Source) -> tuple[str | Path, ...]:
             ``"logs/*.csv"``; or a list of all these.
 
     Raises:
-        DataError: for an empty list, a glob without matches, or a folder without data.
+        DataError: for an empty list, a glob without matches, a folder without data, or what is no path.
 
     Example:
         >>> import pathlib, tempfile
@@ -38,6 +40,9 @@ def sources_of(source: Source) -> tuple[str | Path, ...]:
         ['a.csv', 'b.csv']
     """
     if not isinstance(source, str | Path):
+        if not isinstance(source, Sequence):
+            problem = f"{source!r} is neither a path nor a list of paths"
+            raise DataError(problem, "give a file, a folder, a glob or a Minari name", source="data")
         if not len(source):
             raise DataError("the list of data is empty", "name at least one file", source="data")
         return unique([one for part in source for one in sources_of(part)])
@@ -108,6 +113,8 @@ def words_of(source: Source) -> str:
 def _in_folder(folder: Path) -> tuple[Path, ...]:
     if is_data_set(folder):
         return (folder,)
+    if (folder / _LEROBOT).is_file():
+        raise _lerobot_error(folder)
     logs = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
     if not logs:
         raise DataError(
@@ -117,3 +124,18 @@ def _in_folder(folder: Path) -> tuple[Path, ...]:
             source=folder,
         )
     return tuple(logs)
+
+
+def _lerobot_error(folder: Path) -> DataError:
+    """What a LeRobot dataset holds, and how its tables are read."""
+    with unreadable("it looks like a LeRobot dataset, but its description cannot be read", source=folder / _LEROBOT):
+        info = json.loads((folder / _LEROBOT).read_text(encoding="utf-8"))
+        features = {name: info["features"][name]["names"] for name in ("action", "observation.state")}
+        version, rate, episodes = (info[name] for name in ("codebase_version", "fps", "total_episodes"))
+        names = "; ".join(f"{name}: {', '.join(map(str, of))}" for name, of in features.items())
+    return DataError(
+        f"it is a LeRobot dataset ({version}, {episodes} episodes at {rate} Hz; {names})",
+        f"give its tables, {folder.name}/data/*/*.parquet, with columns action[0], observation.state[0], ..., and "
+        "episode_index with role: run; positions may be normalised",
+        source=folder,
+    )

@@ -10,20 +10,19 @@ from tensordict import TensorDictBase
 from torchrl import torchrl_logger
 
 from torchrl_h2o.data.readers.error import DataError
-from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 from torchrl_h2o.data.readers.ted import require_ted
 
 if TYPE_CHECKING:
     from torchrl.data import TensorSpec
     from torchrl.envs import EnvBase
 
+# share of an action bound by which an action may exceed it: a recording in float64 that is rounded to float32 exceeds
+# it by about 1e-7
+BOUND_ROUNDING = 1e-6
+
 
 def check_specs(
-    td: TensorDictBase,
-    env: EnvBase,
-    *,
-    source: str | Path = "transitions",
-    settings: ReaderSettings = READER_SETTINGS,
+    td: TensorDictBase, env: EnvBase, *, source: str | Path = "transitions"
 ) -> None:
     """Check that transitions match the specs of an environment.
 
@@ -31,7 +30,6 @@ def check_specs(
         td: flat TED transitions of batch size [T].
         env: a TorchRL environment with the entries ``observation`` and ``action``.
         source: name of the data in errors.
-        settings: the tolerance of the action bounds.
 
     Raises:
         DataError: for a different number of dimensions, a different kind of number, or an action outside the
@@ -79,7 +77,7 @@ def check_specs(
                 source=source,
                 column=key,
             )
-    _require_bounds(td["action"], specs["action"]["action"], source, settings.bound_rounding)
+    _require_bounds(td["action"], specs["action"]["action"], source)
 
 
 def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
@@ -95,12 +93,12 @@ def warn_of_unknown_task(task: str | None, source: str | Path) -> None:
         )
 
 
-def _require_bounds(action: torch.Tensor, spec: TensorSpec, source: str | Path, rounding: float) -> None:
+def _require_bounds(action: torch.Tensor, spec: TensorSpec, source: str | Path) -> None:
     low, high = getattr(spec.space, "low", None), getattr(spec.space, "high", None)
     if low is None or high is None:  # unbounded or discrete
         return
     low, high = low.to(action.dtype), high.to(action.dtype)
-    outside = (action < low - rounding * low.abs()) | (action > high + rounding * high.abs())
+    outside = (action < low - BOUND_ROUNDING * low.abs()) | (action > high + BOUND_ROUNDING * high.abs())
     if not outside.any():
         return
     row, *position = outside.nonzero()[0].tolist()

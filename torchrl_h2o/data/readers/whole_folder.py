@@ -23,7 +23,8 @@ def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]
         replace: whether to replace an existing folder of that name, at the end of the block.
 
     Raises:
-        DataError: if the folder exists and ``replace`` is false, or another process has made it in the meantime.
+        DataError: if the folder exists and ``replace`` is false, another process has made it in the meantime, or it
+            cannot be made, as in a folder that is read-only.
 
     Example:
         >>> import pathlib, tempfile
@@ -36,9 +37,13 @@ def whole_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]
     """
     folder = Path(folder).expanduser()
     _require_absent(folder, replace)
-    partial = partial_name(folder)  # of this process, because several may make the same folder at once
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    try:
+        partial = partial_name(folder)  # of this process, because several may make the same folder at once
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+    except OSError as error:
+        problem = f"the folder cannot be made: {error.strerror or error}"
+        raise DataError(problem, "choose another place", source=folder) from error
     try:
         yield partial
         _require_absent(folder, replace)

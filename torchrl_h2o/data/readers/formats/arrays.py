@@ -6,44 +6,48 @@ Arrays whose length is not that of the longest array, such as a scalar dt, are n
 from __future__ import annotations
 
 import math
+import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_h2o.data.readers.error import DataError
-from torchrl_h2o.data.readers.formats.raw_table import RawTable, require_package, require_plausible_size, table_of
-from torchrl_h2o.data.readers.own_data import require_own_data
+from torchrl_h2o.data.readers.error import DataError, unreadable
+from torchrl_h2o.data.readers.file_kind import require_plausible_size
+from torchrl_h2o.data.readers.formats.raw_table import RawTable, columns_of, require_package, table_of
+from torchrl_h2o.data.readers.own_data import own_arrays
 
 if TYPE_CHECKING:
     from torchrl_h2o.data.readers.log_columns import LogColumns
 
 _HDF5_START = b"\x89HDF\r\n\x1a\n"
 _HEADER = 512  # bytes before the HDF5 part of a MATLAB 7.3 file
+_MAT_HEADER, _COMPRESSED = 128, 15  # bytes before the first variable of a MATLAB 5 file; its mark of a compressed one
+_VARIABLE_START = 512  # bytes of a variable that hold its name and class
 
 
 def read_npz(path: Path, layout: LogColumns | None) -> RawTable:
     """Read the arrays of an .npz file; objects in them, which are pickles, are refused.
 
     Raises:
-        DataError: for a damaged file, an object array, or an array that states another size than the file stores.
+        DataError: for a damaged or encrypted file, an object array, two arrays of one name, or an array that states
+            another size than the file stores.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            require_plausible_size(sum(member.file_size for member in archive.infolist()), path)
-            for member in archive.infolist():
-                _require_stored(archive, member, path)
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except DataError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        problem = f"the file cannot be read as .npz: {error}"
-        raise DataError(problem, "copy or write it again", source=path) from error
+    arrays: dict[str, np.ndarray] = {}
+    with unreadable("the file cannot be read as .npz", source=path), zipfile.ZipFile(path) as archive:
+        require_plausible_size(sum(member.file_size for member in archive.infolist()), path)
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if name in arrays:
+                raise DataError("two arrays have this name", "write the file again", source=path, column=name)
+            _require_stored(archive, member, name, path)
+            with archive.open(member) as file:
+                arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+                file.read()  # to the end, where zipfile compares the checksum
     return _columns(arrays, path, layout)
 
 
@@ -53,28 +57,25 @@ def read_mat(path: Path, layout: LogColumns | None) -> RawTable:
     Files up to version 7 need scipy; files of version 7.3 are HDF5.
 
     Raises:
-        DataError: for a damaged file, or sizes far beyond the file's own.
+        DataError: for a damaged file, sizes far beyond the file's own, or objects such as timeseries.
     """
     with path.open("rb") as file:
         start = file.read(_HEADER + len(_HDF5_START))
     if _HDF5_START in (start[: len(_HDF5_START)], start[_HEADER:]):
-        return _columns(dict(_hdf5_arrays(path)), path, layout)
+        return _columns(_hdf5_arrays(path), path, layout)
     require_package("scipy", path)
     from scipy.io import loadmat, whosmat
 
-    try:
+    with unreadable("the file cannot be read as .mat", source=path):
+        for name, kind in _objects(path):
+            raise _object_error(name, kind, path)
         require_plausible_size(sum(8 * math.prod(shape) for _, shape, _ in whosmat(path)), path)
         content = loadmat(path, chars_as_strings=False)
-    except DataError:
-        raise
-    except Exception as error:  # scipy raises errors of all kinds for damaged files
-        problem = f"the file cannot be read as .mat: {error}"
-        raise DataError(problem, "copy or write it again", source=path) from error
     arrays = {name: values for name, values in content.items() if not name.startswith("__")}
     return _columns(dict(_with_fields(arrays)), path, layout)
 
 
-def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> None:
+def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, path: Path) -> None:
     """Raise DataError if the header of an array states another size: numpy would allocate it before it reads."""
     with archive.open(member) as file:
         version = np.lib.format.read_magic(file)
@@ -86,7 +87,7 @@ def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Pat
             "this is a pickle: it holds objects, and reading it could execute arbitrary code",
             "write the array again as numbers",
             source=path,
-            column=member.filename.removesuffix(".npy"),
+            column=name,
         )
     stated = math.prod(shape) * dtype.itemsize
     if stated != stored:
@@ -94,28 +95,44 @@ def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Pat
             f"it states {stated} bytes {list(shape)}, but the file stores {stored}",
             "the file is damaged: copy or write it again",
             source=path,
-            column=member.filename.removesuffix(".npy"),
+            column=name,
         )
 
 
-def _hdf5_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+def _hdf5_arrays(path: Path) -> dict[str, np.ndarray]:
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            names = [name for name in map(str, file) if not name.startswith("#")]
-            require_own_data(file, names, source=path)
-            stack: list[tuple[str, Any]] = [(name, file[name]) for name in names]
-            while stack:
-                name, entry = stack.pop(0)
-                if isinstance(entry, h5py.Group):
-                    stack = [(f"{name}.{inner}", entry[inner]) for inner in entry] + stack
-                elif isinstance(entry, h5py.Dataset) and entry.dtype.kind in "fiub":
-                    yield name, entry[()].T  # MATLAB stores columns first
-    except DataError:
-        raise
-    except Exception as error:  # h5py raises errors of all kinds for damaged files
-        raise DataError(f"the file cannot be read: {error}", "copy or write it again", source=path) from error
+    with unreadable("the file cannot be read", source=path), h5py.File(path, "r") as file:
+        names = [name for name in map(str, file) if not name.startswith("#")]
+        found = {name.replace("/", "."): each for name, each in own_arrays(file, names, source=path).items()}
+        for name, each in found.items():
+            if "MATLAB_object_decode" in each.attrs:
+                raise _object_error(name, bytes(each.attrs["MATLAB_class"]).decode(errors="replace"), path)
+        # MATLAB stores columns first
+        return {name: each[()].T for name, each in found.items() if each.dtype.kind in "fiub"}
+
+
+def _objects(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield name and class of each variable of a MATLAB 5 file that is an object, of which scipy reads no values."""
+    content, place = path.read_bytes(), _MAT_HEADER
+    while place + 8 <= len(content):
+        kind, size = struct.unpack_from("<II", content, place)
+        start = content[place + 8 : place + 8 + size]
+        if kind == _COMPRESSED:
+            start = zlib.decompressobj().decompress(start, _VARIABLE_START)
+        named = re.search(rb"(\w+)\W+MCOS\W+(\w+)", start[:_VARIABLE_START])
+        if named is not None:
+            yield named[1].decode(errors="replace"), named[2].decode(errors="replace")
+        place += 8 + size
+
+
+def _object_error(name: str, kind: str, path: Path) -> DataError:
+    return DataError(
+        f"it is a {kind}, a MATLAB object whose values only MATLAB can read",
+        f"save its arrays: t = {name}.Time; x = {name}.Data; save('log.mat', 't', 'x')",
+        source=path,
+        column=name,
+    )
 
 
 def _with_fields(arrays: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -141,11 +158,6 @@ def _columns(arrays: dict[str, np.ndarray], path: Path, layout: LogColumns | Non
         )
     columns: dict[str, Callable[[], np.ndarray]] = {}
     for name, values in known.items():
-        if length not in values.shape:
-            continue
-        by_row = values if len(values) == length else values.T
-        if by_row.ndim == 1:
-            columns[name] = partial(np.asarray, by_row)
-        else:
-            columns |= {f"{name}[{i}]": partial(np.asarray, by_row[:, i]) for i in range(by_row.shape[1])}
+        if length in values.shape:
+            columns |= columns_of(name, values if len(values) == length else values.T)
     return table_of(columns, length, path, layout)

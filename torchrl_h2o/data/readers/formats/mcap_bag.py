@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from torchrl_h2o.data.readers.error import DataError
-from torchrl_h2o.data.readers.formats.raw_table import RawTable, require_package, require_plausible_size, table_of
+from torchrl_h2o.data.readers.error import DataError, unreadable
+from torchrl_h2o.data.readers.file_kind import require_plausible_size
+from torchrl_h2o.data.readers.formats.raw_table import RawTable, require_package, table_of
 
 if TYPE_CHECKING:
     from torchrl_h2o.data.readers.log_columns import LogColumns
@@ -61,7 +62,7 @@ def read_mcap(path: Path, layout: LogColumns | None) -> RawTable:
             a layout, the rows are those of the topic with most messages.
 
     Raises:
-        DataError: for a damaged bag, a bag without joint states, or an unknown or missing topic.
+        DataError: for a bag whose checksums do not agree with its bytes, a bag without joint states, or an unknown or missing topic.
     """
     topics = _topics(path)
     name = _main_topic(topics, layout, path)
@@ -116,28 +117,21 @@ def _topics(path: Path) -> dict[str, _Topic]:
     from mcap_ros2.decoder import DecoderFactory
 
     topics: dict[str, _Topic] = {}
-    try:
-        with path.open("rb") as file:
-            reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            summary = reader.get_summary()
-            if summary is None:
-                raise DataError("the bag has no summary", "it is truncated: mcap recover repairs it", source=path)
-            require_plausible_size(sum(chunk.uncompressed_size for chunk in summary.chunk_indexes), path)
-            kinds = {channel.topic: summary.schemas.get(channel.schema_id) for channel in summary.channels.values()}
-            wanted = [topic for topic, kind in kinds.items() if kind and kind.name in (_JOINTS, _NUMBERS)]
-            messages = reader.iter_decoded_messages(topics=wanted) if wanted else []
-            for schema, channel, message, content in messages:
-                topic = topics.setdefault(channel.topic, _Topic(schema.name if schema else ""))
-                topic.received.append(message.log_time)
-                topic.stamps.append(_stamp(content, message.log_time))
-                topic.rows.append(_values(content, topic.kind, channel.topic, len(topic.rows) + 1, path))
-    except DataError:
-        raise
-    except Exception as error:  # the packages of the format raise errors of all kinds for damaged bags
-        problem = f"the bag cannot be read: {type(error).__name__} {error}"
-        raise DataError(
-            problem, "copy or record it again; mcap recover repairs a truncated bag", source=path
-        ) from error
+    remedy = "copy or record it again; mcap recover repairs a truncated bag"
+    with unreadable("the bag cannot be read", remedy, source=path), path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        if summary is None:
+            raise DataError("the bag has no summary", "it is truncated: mcap recover repairs it", source=path)
+        require_plausible_size(sum(chunk.uncompressed_size for chunk in summary.chunk_indexes), path)
+        kinds = {channel.topic: summary.schemas.get(channel.schema_id) for channel in summary.channels.values()}
+        wanted = [topic for topic, kind in kinds.items() if kind and kind.name in (_JOINTS, _NUMBERS)]
+        messages = reader.iter_decoded_messages(topics=wanted) if wanted else []
+        for schema, channel, message, content in messages:
+            topic = topics.setdefault(channel.topic, _Topic(schema.name if schema else ""))
+            topic.received.append(message.log_time)
+            topic.stamps.append(_stamp(content, message.log_time))
+            topic.rows.append(_values(content, topic.kind, channel.topic, len(topic.rows) + 1, path))
     return topics
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchrl_h2o.data.readers.error import DataError, require_real
-from torchrl_h2o.data.readers.settings import READER_SETTINGS, ReaderSettings
 
 if TYPE_CHECKING:
     from torchrl_h2o.data.readers.log_columns import LogColumns
@@ -61,6 +61,18 @@ def table_of(
     return RawTable(path, names, len(names), np.arange(1, length + 1), numbers)
 
 
+def columns_of(name: str, values: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
+    """Return the columns of an array by name: itself, or ``name[0]`` and so on for an array of two dimensions.
+
+    Args:
+        name: the array's name.
+        values: the array, (rows,) or (rows, n).
+    """
+    if values.ndim == 1:
+        return {name: partial(np.asarray, values)}
+    return {f"{name}[{i}]": partial(np.asarray, values[:, i]) for i in range(values.shape[1])}
+
+
 def require_names(names: Sequence[str], layout: LogColumns | None, path: Path, row: int | None = None) -> None:
     """Raise DataError unless the names of a file's columns are those of a layout.
 
@@ -104,23 +116,6 @@ def as_numbers(values: np.ndarray, column: str, path: Path) -> np.ndarray:
         return (values - values[0]) / np.timedelta64(1, "s") if values.dtype.kind == "M" else values / _SECOND
     require_real(values, column, source=path)
     return values.astype(np.float64)
-
-
-def require_plausible_size(stated: int, path: Path, settings: ReaderSettings = READER_SETTINGS) -> None:
-    """Raise DataError if the values would take far more memory than the file has bytes.
-
-    Args:
-        stated: bytes of the unpacked values, as the file states them.
-        path: the file.
-        settings: the largest ratio.
-    """
-    size = path.stat().st_size
-    if stated > max(settings.unsuspicious_bytes, settings.largest_expansion * size):
-        raise DataError(
-            f"it states {stated} bytes of values, but the file has {size}",
-            "if this is right, write the file again without compression",
-            source=path,
-        )
 
 
 def require_package(name: str, path: Path) -> None:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.error import DataError, unreadable
 from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats import FORMATS, read_raw
-from torchrl_h2o.data.readers.formats.text import number_of, read_text
+from torchrl_h2o.data.readers.formats.raw_table import RawTable
+from torchrl_h2o.data.readers.formats.text import number_of, read_text, split_rows, with_lists
+from torchrl_h2o.data.readers.guess.roles import guess_columns
+from torchrl_h2o.data.readers.sources import is_hdf5
 
 _LINES = 50_000  # lines of a text file that are looked at, to find gaps and jumps behind its beginning
+_SHARED = 0.9  # share of the longest duration that files of one run have in common
+_INSIDE = re.compile(r"\"[^\"]*\"|\[[^\]]*\]")  # quoted cells and lists, which may hold the separator
 
 
 @dataclass(frozen=True)
@@ -53,15 +60,45 @@ def read_contents(path: str | Path) -> Contents:
         values = {name: _numbers(raw, index, name) for index, name in enumerate(raw.names or ())}
         topic = {"topic": f'"{raw.topic}"'} if raw.topic else {}
         return Contents(values, {"header": "true", **topic})
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            lines = [line for line, _ in zip(file, range(_LINES), strict=False) if line.strip()]
-    except UnicodeDecodeError as error:
-        raise DataError("the file is not text", "give a log", source=path) from error
+    if is_hdf5(path):
+        raise DataError("an HDF5 data set names its arrays", "use it without a description of columns", source=path)
+    with unreadable("the file is not text", "give a log", source=path), path.open(encoding="utf-8-sig") as file:
+        lines = [line for line, _ in zip(file, range(_LINES), strict=False)]
     return _text(lines, path)
 
 
-def _numbers(raw, index: int, name: str) -> np.ndarray | None:
+def require_several_runs(paths: Sequence[str | Path]) -> None:
+    """Raise DataError if files hold different columns of one run: other names, and the same times.
+
+    Args:
+        paths: sources of data, of which only logs are compared.
+    """
+    logs = [Path(path) for path in paths if Path(path).is_file() and not is_hdf5(Path(path))]
+    if len(logs) < 2 or len(logs) < len(paths):
+        return
+    contents = [read_contents(path) for path in logs]
+    times = [_time(each) for each in contents]
+    first, begin = contents[0], times[0]
+    for path, each, time in zip(logs[1:], contents[1:], times[1:], strict=True):
+        if begin is None or time is None or set(each.values) == set(first.values):
+            return
+        shared = min(begin[-1], time[-1]) - max(begin[0], time[0])
+        if shared < _SHARED * max(np.ptp(begin), np.ptp(time)):
+            return
+    raise DataError(
+        f"{', '.join(path.name for path in logs)} have the same times and other columns: they are one run in {len(logs)} "
+        "files",
+        "join them on time, for example with pandas.merge_asof, and give the joined file",
+        source=logs[0].parent,
+    )
+
+
+def _time(contents: Contents) -> np.ndarray | None:
+    found = [guess.name for guess in guess_columns(contents.values) if guess.kind == "time"]
+    return contents.values[found[0]] if found else None
+
+
+def _numbers(raw: RawTable, index: int, name: str) -> np.ndarray | None:
     try:
         return raw.numbers([index], [name])[:, 0]
     except DataError:
@@ -69,43 +106,40 @@ def _numbers(raw, index: int, name: str) -> np.ndarray | None:
 
 
 def _text(lines: list[str], path: Path) -> Contents:
-    marks = [mark for mark in ("#", "%") if lines and lines[0].startswith(mark)]
-    rows = [line for line in lines if not (marks and line.lstrip().startswith(marks[0]))]
-    separator = _separator(rows)
-    cells = [_split(line, separator) for line in rows]
-    decimal = "," if separator != "," and any("," in cell for row in cells[1:3] for cell in row) else "."
-    header = bool(cells) and not any(_is_number(cell, decimal) for cell in cells[0])
-    names, body = (cells[0], cells[1:]) if header else ([], cells)
-    body = [row for row in body if len(row) == len(body[0])]
+    first = next((line for line in lines if line.strip()), "")
+    mark = next((mark for mark in "#%" if first.startswith(mark)), None)
+    separator = _separator([line for line in lines if line.strip() and not (mark and line.lstrip().startswith(mark))])
+    rows = split_rows(lines, separator, mark, path)
+    decimal = "," if separator != "," and any("," in cell for _, row in rows[1:3] for cell in row) else "."
+    header = bool(rows) and not any(_is_number(cell, decimal) for cell in rows[0][1])
+    names, body = ([cell.strip("\"'") for cell in rows[0][1]], rows[1:]) if header else (None, rows)
+    body = [row for row in body if len(row[1]) == len(body[0][1])]
+    names, body = with_lists(names, body)
     if len(body) < 2:
         raise DataError("no two rows of numbers were found", "give a log, one row per time step", source=path)
-    options = {"separator": "whitespace" if separator is None else f'"{separator}"'.replace("\t", "\\t")}
+    width = len(body[0][1])
+    options = {"separator": "whitespace" if separator == "whitespace" else f'"{separator}"'.replace("\t", "\\t")}
     options |= {"header": str(header).lower()} | ({"decimal": '","'} if decimal == "," else {})
-    if marks:
-        options["comment"] = f'"{marks[0]}"'
-        said = _split(lines[0].lstrip(marks[0]).strip(), separator)  # as numpy.savetxt writes names
-        names = names or (said if len(said) == len(body[0]) and len(set(said)) == len(said) else [])
-    unnamed = not names
-    names = [f"column_{i}" for i in range(len(body[0]))] if unnamed else names
-    columns = zip(*body, strict=True)
-    values = {name: _column(column, decimal) for name, column in zip(names, columns, strict=False)}
+    if mark:
+        options["comment"] = f'"{mark}"'
+        ((_, said),) = split_rows([first.lstrip(mark).strip() or "-"], separator, None, path)
+        if names is None and len(set(said)) == len(said) == width:  # as numpy.savetxt writes names
+            names = said
+    columns = zip(*(cells for _, cells in body), strict=True)
+    called = names or [f"column_{i}" for i in range(width)]
+    values = {name: _column(column, decimal) for name, column in zip(called, columns, strict=False)}
     if not any(column is not None for column in values.values()):
         raise DataError("no column of numbers was found", "give a log, one row per time step", source=path)
-    return Contents(values, options, not unnamed)
+    return Contents(values, options, names is not None)
 
 
-def _separator(rows: list[str]) -> str | None:
-    """The sign that splits all of the first rows into the same number of cells, of at least two; None for blanks."""
+def _separator(rows: list[str]) -> str:
+    """The sign that splits all of the first rows into the same number of cells, of at least two, or "whitespace"."""
     for sign in ("\t", ";", ","):
-        counts = {row.count(sign) for row in rows[:50]}
+        counts = {_INSIDE.sub("", row).count(sign) for row in rows[:50]}
         if len(counts) == 1 and counts != {0}:
             return sign
-    return None
-
-
-def _split(line: str, separator: str | None) -> list[str]:
-    cells = line.split() if separator is None else line.strip("\r\n").split(separator)
-    return [cell.strip().strip("\"'") for cell in cells]
+    return "whitespace"
 
 
 def _is_number(cell: str, decimal: str) -> bool:
@@ -117,6 +151,7 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 
 def _column(cells: tuple[str, ...], decimal: str) -> np.ndarray | None:
-    return (
-        np.array([number_of(cell, decimal) for cell in cells]) if all(_is_number(c, decimal) for c in cells) else None
-    )
+    try:
+        return np.array([number_of(cell, decimal) for cell in cells])
+    except ValueError:
+        return None

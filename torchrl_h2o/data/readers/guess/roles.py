@@ -19,6 +19,7 @@ _WORDS = {
     "time": ("t", "time", "timestamp", "stamp", "secs", "seconds", "millis", "clock"),
     "done": ("done", "terminal", "terminated", "fallen"),
     "reward": ("reward",),
+    "run": ("run", "episode", "trial", "rollout", "trajectory"),
     "command": ("cmd", "command", "commanded"),
     "desired": ("des", "desired", "ref", "reference", "target", "goal", "setpoint", "sp"),
     "velocity": (
@@ -54,6 +55,9 @@ _COMPUTED = ("cos", "sin", "squared", "square", "sq", "err", "error", "errors") 
 _NEVER_COMMANDS = ("squared", "square", "err", "error", "errors")
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
+_SHORTEST_RUN = 5  # rows that the usual run of a log has at least
+_EVEN = 0.5  # share of the median by which a clock's usual step may differ from it
+_MOSTLY, _MANY = 0.98, 0.8  # shares of the steps of a clock that are not backwards, and that are forwards
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,12 @@ class Guess:
 
     Args:
         name: the column.
-        kind: one of time, done, reward, position, velocity, action, desired position, desired velocity, or unknown.
+        kind: one of time, done, reward, run, position, velocity, action, desired position, desired velocity, or
+            unknown.
         unit: its unit.
         stem: the name without the words of its kind and its unit, by which positions and velocities are paired.
         note: what the user should check; empty if nothing is doubtful.
+        of_model: the model's name of this quantity, if the column has it, apart from words such as "desired".
     """
 
     name: str
@@ -73,6 +79,7 @@ class Guess:
     unit: str = "1"
     stem: str = ""
     note: str = ""
+    of_model: str | None = None
 
 
 def guess_columns(
@@ -83,7 +90,8 @@ def guess_columns(
     Args:
         values: the numbers of each column by name; None for a column that is not numbers.
         model_names: kind and SI unit (None if not known) of the names in the user's model. A column with such a name,
-            apart from case, signs and its own unit, is that quantity, whatever its words mean elsewhere.
+            apart from case, signs and its own unit, is that quantity, whatever its words mean elsewhere. With "desired"
+            or "command" beside it, it is the command of that actuator, or what is desired of that joint.
 
     Example:
         >>> import numpy as np
@@ -92,15 +100,18 @@ def guess_columns(
         >>> [(column.kind, column.unit) for column in found]
         [('time', 'ms'), ('velocity', 'deg/s'), ('unknown', '1')]
     """
-    known = {_letters(name): quantity for name, quantity in (model_names or {}).items()}
+    known = {_letters(name): (name, *quantity) for name, quantity in (model_names or {}).items()}
     found = [_guess(name, numbers, known) for name, numbers in values.items()]
     actions = [guess for guess in found if guess.kind == "action"]
-    supplies = [guess for guess in actions if _letters(guess.name) not in known and _is_supply(guess, values)]
+    supplies = [guess for guess in actions if guess.of_model is None and _is_supply(guess, values)]
     if len(supplies) < len(actions):
         note = "hardly changes, as the voltage of a supply"
         found = [replace(guess, kind="unknown", note=note) if guess in supplies else guess for guess in found]
-    found = [one if _letters(without_unit(one.name)[0]) in known else _of_another(one, values) for one in found]
-    for kind in ("time", "done", "reward"):
+    found = [one if one.of_model is not None else _of_another(one, values) for one in found]
+    if not any(one.kind == "time" for one in found):
+        clocks = [one.name for one in found if _is_time(one, values[one.name])][:1]
+        found = [clock(one.name, values[one.name]) if one.name in clocks else one for one in found]
+    for kind in ("time", "done", "reward", "run"):
         same = [i for i, guess in enumerate(found) if guess.kind == kind]
         for i in same[1:]:
             found[i] = replace(found[i], kind="unknown", note=f"another column of {kind}")
@@ -123,19 +134,65 @@ def _of_another(guess: Guess, values: Mapping[str, np.ndarray | None]) -> Guess:
     return replace(guess, kind="unknown", note=note) if note else guess
 
 
-def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str, str | None]]) -> Guess:
+def _guess(name: str, numbers: np.ndarray | None, known: Mapping[str, tuple[str, str, str | None]]) -> Guess:
     if numbers is None:
         return Guess(name, "unknown", note="not numbers")
     plain, unit = without_unit(name)
     words = words_of(plain)
-    kind, si = known.get(_letters(plain), (_kind(words, numbers), None))
+    of_model, kind, si = _of_model(plain, known) or (None, _kind(words, numbers), None)
     stem = " ".join(word for word in words if word not in (*_WORDS["velocity"], *_WORDS["action"], *_WHERE))
     if kind == "time":
         return Guess(name, kind, *_unit_of_time(numbers, unit))
     if unit is not None:
-        return Guess(name, kind, unit, stem)
+        return Guess(name, kind, unit, stem, of_model=of_model)
     unit, note = _unit_of(kind, si, words, numbers)
-    return Guess(name, kind, unit, stem, note)
+    return Guess(name, kind, unit, stem, note, of_model)
+
+
+def _of_model(plain: str, known: Mapping[str, tuple[str, str, str | None]]) -> tuple[str, str, str | None] | None:
+    """The model's name of a column, its kind and its unit."""
+    if (letters := _letters(plain)) in known:
+        return known[letters]
+    asked = (*_WORDS["command"], *_WORDS["desired"])
+    words = words_of(plain)
+    bare = "".join(word for word in words if word not in asked)
+    if bare not in known or len(words) == len([word for word in words if word not in asked]):
+        return None
+    name, kind, si = known[bare]
+    return name, kind if kind == "action" else f"desired {kind}", si
+
+
+def clock(name: str, numbers: np.ndarray | None) -> Guess:
+    """A column of time, with the unit that its step suggests."""
+    return Guess(name, "time", *_unit_of_time(np.zeros(2) if numbers is None else numbers, None))
+
+
+def is_clock(numbers: np.ndarray | None) -> bool:
+    """Whether a column grows in steps that are mostly alike."""
+    if numbers is None or len(numbers) < 3 or not np.isfinite(numbers).all():
+        return False
+    steps = np.diff(numbers)
+    usual = float(np.median(steps))
+    return (
+        usual > 0.0
+        and (steps >= 0.0).mean() >= _MOSTLY
+        and (steps > 0.0).mean() >= _MANY
+        and np.median(np.abs(steps - usual)) <= _EVEN * usual
+    )
+
+
+def is_counter(numbers: np.ndarray | None) -> bool:
+    """Whether a column counts rows."""
+    return numbers is not None and bool((np.diff(numbers) == 1.0).all())
+
+
+def _is_time(guess: Guess, numbers: np.ndarray | None) -> bool:
+    """Whether a column of which the name tells nothing is a regular clock: its steps are alike, but it counts no rows."""
+    told = guess.kind != "unknown" or guess.note or any(word in _NO_COMMANDS for word in words_of(guess.name))
+    if told or numbers is None or not is_clock(numbers) or is_counter(numbers):
+        return False
+    steps = np.diff(numbers)
+    return bool((np.abs(steps - np.median(steps)) <= _EVEN * np.median(steps)).mean() >= _MOSTLY)
 
 
 def _kind(words: list[str], numbers: np.ndarray) -> str:
@@ -146,6 +203,9 @@ def _kind(words: list[str], numbers: np.ndarray) -> str:
         fits.discard("action")  # the current position
     if "time" in fits and not ((np.diff(numbers) >= 0).mean() > 0.9 and np.ptp(numbers) > 0):
         fits.remove("time")
+    changes = np.diff(numbers) != 0
+    if "run" in fits and not (changes.sum() * _SHORTEST_RUN <= len(numbers) and (numbers == np.round(numbers)).all()):
+        fits.remove("run")
     if fits & {"desired", "command"}:
         motion = () if any(word in _FORCES for word in words) else ("velocity", "position")
         return next((f"desired {kind}" for kind in motion if kind in fits), "action")
