@@ -17,7 +17,8 @@ MOST_SECONDS, MOST_BYTES = 5.0, 2 * 2**30
 EXAMPLES = os.environ.get("TORCHRL_H2O_FUZZ")  # a number: that many examples, others in every run
 _CHECKS = {"suppress_health_check": list(HealthCheck), "deadline": None}
 few = settings(max_examples=20, derandomize=True, **_CHECKS)
-many = settings(max_examples=int(EXAMPLES or 300), derandomize=EXAMPLES is None, **_CHECKS)
+some = settings(max_examples=int(EXAMPLES or 100), derandomize=EXAMPLES is None, **_CHECKS)
+many = settings(max_examples=int(EXAMPLES or 200), derandomize=EXAMPLES is None, **_CHECKS)
 
 _NUMBERS = [
     b"\xff" * 4,
@@ -34,6 +35,7 @@ _WORDS = [
     "inf",
     "-inf",
     "1e999",
+    "1e20",
     "-1",
     "0",
     "",
@@ -47,10 +49,9 @@ _WORDS = [
     "0x10",
     "1_0",
     "\0",
-    "é",
-    "١",
 ]
-_WORDS += ["true", "null", "[]", "{}", "- ", ": ", "&a [*a]", "${a}", "!!python/object/apply:os.getpid []", "9" * 5000]
+_WORDS += ["é", "١", "[1, 2]", '"[1]"', "(", "true"]
+_WORDS += ["null", "[]", "{}", "- ", ": ", "&a [*a]", "${a}", "!!python/object/apply:os.getpid []", "9" * 5000]
 _WORDS += ["1e308", "\ud7ff", "2026-13-45", "<<: *a", "? ", "|", "[" * 3000, "x" * 1000, "%", "@", "\t", "---", "..."]
 _KINDS = ("replace", "insert", "delete", "cut", "repeat")
 _PIECES = st.one_of(st.binary(min_size=1, max_size=8), st.sampled_from(_NUMBERS))

@@ -163,3 +163,26 @@ def test_the_unit_of_actions_is_that_of_what_the_actuators_exert(folder, motor, 
     (folder / "robot.xml").write_text(f"<mujoco><worldbody>{body}</worldbody>{actuator}</mujoco>")
     guess_columns(["--guess", "data=log.csv", "simulator=robot.xml"])
     assert {column.unit for column in LogColumns.load("log.yaml").columns if column.role == "action"} == {unit}
+
+
+def test_a_place_that_cannot_be_written_is_named(folder):
+    (folder / "file").write_text("in the way")
+    with pytest.raises(DataError, match=r"file/log\.yaml: the file cannot be written: .*; choose another name"):
+        guess_columns(["--guess", "data=log.csv", "columns=file/log.yaml"])
+
+
+def test_columns_of_one_run_in_several_files_are_not_described_by_the_first(folder):
+    for name in ("position", "effort"):
+        np.savetxt(f"{name}.csv", np.stack([T, T], 1), delimiter=",", header=f"t,hip_{name}", comments="")
+    with pytest.raises(DataError, match="one run in 2 files; join them on time"):
+        guess_columns(["--guess", "data=[position.csv, effort.csv]"])
+
+
+def test_actions_with_the_names_of_actuators_are_in_the_model_s_order(folder, capsys):
+    servos = "".join(f'<position name="{name}" joint="{name}" kp="9"/>' for name in ("slider", "hip"))
+    (folder / "servo.xml").write_text(MODEL.replace('<motor name="push" joint="slider"/>', servos))
+    columns = {"t": T, "slider": np.sin(T), "hip": np.cos(T), "hip_des": np.cos(T), "slider_des": np.sin(T)}
+    np.savetxt("log.csv", np.stack(list(columns.values()), 1), delimiter=",", header=",".join(columns), comments="")
+    guess_columns(["--guess", "data=log.csv", "simulator=servo.xml"])
+    assert LogColumns.load("log.yaml").action == ("slider_des", "hip_des")
+    assert "Not yet readable" not in capsys.readouterr().out

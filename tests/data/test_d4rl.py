@@ -120,7 +120,14 @@ def test_flag_other_than_zero_and_one_is_refused(tmp_path, name, bad):
     assert (caught.value.column, caught.value.row) == (name, 6)
 
 
-@pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminals", "timeouts"])
+def test_without_timeouts_runs_end_where_the_next_observation_is_not_the_following_row(tmp_path):
+    found = read_d4rl(write(tmp_path / "a.hdf5", timeouts=None))
+    assert_same(found, make_recording(LENGTHS, ENDINGS))
+    with pytest.raises(DataError, match="has no timeouts or next_observations; it has "):
+        read_d4rl(write(tmp_path / "b.hdf5", timeouts=None, next_observations=None))
+
+
+@pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminals"])
 def test_missing_array_is_named(tmp_path, name):
     with pytest.raises(DataError, match=f"has no {name}; it has ") as caught:
         read_d4rl(write(tmp_path / "a.hdf5", **{name: None}))

@@ -1,6 +1,7 @@
 """load(): all kinds of sources, and errors for invalid ones."""
 
 import io
+import json
 import pickle
 import zipfile
 
@@ -149,3 +150,47 @@ def test_environment_without_an_observation_entry_is_refused():
 
     with pytest.raises(DataError, match=r"no entry 'observation', it has \['action'\].*CatTensors"):
         check_specs(make_recording(), Dictionary(GymEnv("Pendulum-v1")))
+
+
+@pytest.mark.parametrize("source", [None, 3, {"data": "log.csv"}, [None]])
+def test_what_is_no_source_is_refused(source):
+    with pytest.raises(DataError, match="is neither a path nor a list of paths"):
+        load(source)
+
+
+def test_a_lerobot_dataset_is_named_with_what_to_give(tmp_path):
+    (tmp_path / "arm" / "meta").mkdir(parents=True)
+    names = {"names": ["pan.pos", "lift.pos"]}
+    info = {"codebase_version": "v3.0", "fps": 30, "total_episodes": 4}
+    info["features"] = {"action": names, "observation.state": names}
+    (tmp_path / "arm" / "meta" / "info.json").write_text(json.dumps(info))
+    said = r"it is a LeRobot dataset \(v3\.0, 4 episodes at 30 Hz; action: pan\.pos, lift\.pos.*arm/data/\*/\*\.parquet"
+    with pytest.raises(DataError, match=said):
+        load(tmp_path / "arm")
+
+
+def test_tensors_of_torch_are_refused_with_a_way_out(tmp_path):
+    torch.save({"dof_pos": torch.zeros(3)}, tmp_path / "log.pt")
+    with pytest.raises(DataError, match=r"torch\.load\(file, weights_only=True\); numpy\.savez"):
+        load(tmp_path / "log.pt", columns="simple_pendulum")
+
+
+def columns_of_one_run(folder, begin=0.0):
+    """Positions and efforts of one run, a file each; the second one has stamps of its own, ``begin`` s later."""
+    time = 0.01 * np.arange(50)
+    for name, values, first in (("position", np.sin(time), 0.0), ("effort", np.cos(time), begin)):
+        rows = np.stack([time + first, values], 1)
+        np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header=f"t,hip_{name}", comments="")
+    return [folder / "position.csv", folder / "effort.csv"]
+
+
+def test_files_of_columns_of_one_run_are_not_taken_for_runs(tmp_path):
+    columns = [("t", "time", "s"), ("hip_position", "observation", "rad"), ("hip_effort", "action", "N·m")]
+    described = {"columns": [dict(zip(("name", "role", "unit"), one, strict=True)) for one in columns]}
+    described |= {"separator": ",", "header": True}
+    with pytest.raises(
+        DataError, match=r"position\.csv, effort\.csv have the same times.*one run in 2 files; join them"
+    ):
+        load(columns_of_one_run(tmp_path, begin=0.003), columns=described)
+    with pytest.raises(DataError, match="the column is missing"):
+        load(columns_of_one_run(tmp_path, begin=7.0), columns=described)

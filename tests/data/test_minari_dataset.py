@@ -219,3 +219,11 @@ def test_data_of_another_task_are_refused_and_of_another_version_are_not(tmp_pat
     assert len(load(folder, task="Pendulum-v0")) == 5
     with pytest.raises(DataError, match=r"recorded in Pendulum-v1, not in HalfCheetah-v5"):
         load(folder, task="HalfCheetah-v5")
+
+
+def test_a_relative_root_is_the_folder_that_is_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = write_minari(make_recording(), "test-v0", root="sets")
+    assert folder == tmp_path / "sets" / "test-v0"
+    assert_same(read_minari(folder), make_recording())
+    assert [path.name for path in tmp_path.iterdir()] == ["sets"]

@@ -291,3 +291,42 @@ def test_real_pendulum(shared_data, name, transitions, dt):
     # the logged velocity is the derivative of the position, up to noise
     moved = (td["next", "observation"] - td["observation"])[:, 0] / dt
     assert torch.corrcoef(torch.stack([moved, td["observation"][:, 1]]))[0, 1] > 0.9
+
+
+AGAIN = [(10 * (i % 20), i, 0) for i in range(60)]  # time in ms, begins again every 20 rows
+
+
+@pytest.mark.parametrize("resample", [None, 0.01])
+def test_a_run_begins_where_time_begins_again(tmp_path, resample):
+    path = timed(tmp_path, AGAIN)
+    with pytest.raises(DataError, match="set on_time_jump: split") as caught:
+        read_robot_log(path, changed(TIMED, resample=resample))
+    assert caught.value.row == 22
+    found = list(episodes(read_robot_log(path, changed(TIMED, on_time_jump="split", resample=resample))))
+    assert [len(run) for run in found] == [19, 19, 19]
+    assert [float(run["time"][0]) for run in found] == [0, 0, 0]
+
+
+def test_rows_out_of_order_begin_no_run(tmp_path):
+    path = timed(tmp_path, [*AGAIN[:10], (85, 9, 0), *AGAIN[10:20]])
+    with pytest.raises(DataError, match="time must increase"):
+        read_robot_log(path, changed(TIMED, on_time_jump="split"))
+
+
+@pytest.mark.parametrize("resample", [None, 0.01])
+def test_a_run_ends_where_its_number_changes(tmp_path, resample):
+    rows = [(10 * i, i, 0, i // 20) for i in range(60)]
+    text = "t,q,u,episode\n" + "".join(",".join(map(str, row)) + "\n" for row in rows)
+    layout = changed(TIMED, columns=(*TIMED.columns, Column("episode", "run")), resample=resample)
+    found = list(episodes(read_robot_log(write(tmp_path, text), layout)))
+    assert [len(run) for run in found] == [19, 19, 19]
+
+
+def test_a_layout_may_be_a_mapping(tmp_path):
+    entries = {"dt": 0.01, "columns": [{"name": "q", "role": "observation"}, {"name": "u", "role": "action"}]}
+    path = write(tmp_path, "1 2\n3 4\n")
+    assert read_robot_log(path, entries)["action"].item() == 2.0
+    with pytest.raises(DataError, match="columns: unknown entry 'q'; choose from columns, dt"):
+        read_robot_log(path, {"q": "observation"})
+    with pytest.raises(DataError, match="columns=3 describes no columns"):
+        read_robot_log(path, 3)

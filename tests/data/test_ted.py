@@ -130,6 +130,12 @@ def test_existing_folder_is_not_overwritten(tmp_path):
     assert_same(read_ted(folder), make_recording())
 
 
+def test_a_place_where_no_folder_can_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(DataError, match=r"file/recording: the folder cannot be made: Not a directory; choose another"):
+        write_ted(make_recording(), tmp_path / "file" / "recording")
+
+
 def test_failed_write_leaves_nothing(tmp_path, monkeypatch):
     def fail(*args, **kwargs):
         raise OSError("disk full")

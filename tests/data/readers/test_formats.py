@@ -2,14 +2,16 @@
 
 import io
 import pickle
+import struct
 import zipfile
+import zlib
 
 import h5py
 import numpy as np
 import pytest
 import torch
 
-from torchrl_h2o.data import Column, DataError, LogColumns, load, read_robot_log
+from torchrl_h2o.data import Column, DataError, LogColumns, episodes, load, read_robot_log
 from torchrl_h2o.data.readers.file_kind import LARGEST_EXPANSION
 
 ROWS = 40
@@ -377,3 +379,153 @@ def test_the_counts_of_an_encoder_are_unwrapped_by_the_size_of_its_turn():
     assert column.in_si(counts) == pytest.approx(rad * np.array([4000.0, 4050.0, 4090.0, 4126.0, 4176.0, 4216.0]))
     with pytest.raises(ValueError, match="give the size of its turn, such as unwrap: 4096"):
         Column("q", "observation", unit="rad", scale=rad, unwrap=True).in_si(counts)
+
+
+def test_lists_in_cells_are_columns(tmp_path):
+    rows = "".join(f'{t},"[{q}, {v}]",({u} 0.0)\n' for t, q, v, u in zip(T, Q, V, U, strict=True))
+    (tmp_path / "log.csv").write_text("t,state,motor\n" + rows)
+    td = load(tmp_path / "log.csv", columns=layout(names=("t", "state[0]", "state[1]", "motor[0]")))
+    torch.testing.assert_close(td["observation"][:, 0], torch.from_numpy(np.deg2rad(Q[:-1])).float())
+    torch.testing.assert_close(td["action"].flatten(), torch.from_numpy(U[:-1]).float())
+    ragged = rows.replace(", ", " ", 1).replace("]", " 0]", 1)
+    (tmp_path / "log.csv").write_text("t,state,motor\n" + ragged)
+    with pytest.raises(DataError, match=r"the column is missing; the header is t, state, motor\[0\]"):
+        load(tmp_path / "log.csv", columns=layout(names=("t", "state[0]", "state[1]", "motor[0]")))
+
+
+@pytest.mark.parametrize("kind", ["list_", "fixed"])
+def test_lists_in_parquet_are_columns_and_a_run_ends_with_its_episode(tmp_path, kind):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    of = pyarrow.list_(pyarrow.float64(), *([2] if kind == "fixed" else []))
+    state = pyarrow.array(np.stack([Q, V], 1).tolist(), of)
+    names = pyarrow.array([["a"] * (i % 2) for i in range(ROWS)])
+    episode = np.arange(ROWS) // 20
+    columns = {"t": T % 0.2, "state": state, "u": U, "episode": episode, "names": names}
+    parquet.write_table(pyarrow.table(columns), tmp_path / "log.parquet")
+    described = layout(names=("t", "state[0]", "state[1]", "u"))
+    described = LogColumns(**{**vars(described), "columns": (*described.columns, Column("episode", "run"))})
+    found = list(episodes(load(tmp_path / "log.parquet", columns=described)))
+    assert [len(run) for run in found] == [19, 19]
+    torch.testing.assert_close(found[1]["observation"][:, 0], torch.from_numpy(np.deg2rad(Q[20:-1])).float())
+
+
+def test_two_arrays_of_one_name_and_encrypted_ones_are_refused(tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, t=T, q=Q, v=V, u=U)
+    content = path.read_bytes()
+    array = io.BytesIO()
+    np.save(array, 2.0 * Q)
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("q.npy", array.getvalue())
+    with pytest.raises(DataError, match="two arrays have this name") as caught:
+        load(path, columns=layout())
+    assert caught.value.column == "q"
+    local, central = content.index(b"PK\x03\x04"), content.index(b"PK\x01\x02")
+    marked = bytearray(content)
+    marked[local + 6] |= 1
+    marked[central + 8] |= 1
+    path.write_bytes(bytes(marked))
+    with pytest.raises(DataError, match=r"cannot be read as \.npz: .*encrypted"):
+        load(path, columns=layout())
+
+
+def matlab_object(name, kind):
+    """A variable of a MATLAB 5 file that is an object, as MATLAB writes it; scipy writes none."""
+
+    def element(number, content):
+        return struct.pack("<II", number, len(content)) + content.ljust(-(-len(content) // 8) * 8, b"\0")
+
+    reference = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 6, 1)) + element(1, b"")
+    reference += element(6, struct.pack("<6I", 0xDD000000, 2, 1, 1, 1, 1))
+    parts = (element(1, text.encode()) for text in (name, "MCOS", kind))
+    return element(14, element(6, struct.pack("<II", 17, 0)) + b"".join(parts) + element(14, reference))
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("kind", ["timeseries", "timetable"])
+def test_objects_of_matlab_are_named_with_what_to_save(tmp_path, kind, compressed):
+    from scipy.io import savemat
+
+    savemat(tmp_path / "log.mat", {"t": T})
+    added = matlab_object("hip", kind)
+    if compressed:
+        packed = zlib.compress(added)
+        added = struct.pack("<II", 15, len(packed)) + packed
+    with (tmp_path / "log.mat").open("ab") as file:
+        file.write(added)
+    with pytest.raises(DataError, match=rf"column 'hip': it is a {kind}.*t = hip.Time; x = hip.Data; save") as caught:
+        load(tmp_path / "log.mat", columns=layout())
+    assert caught.value.column == "hip"
+
+
+def test_an_object_of_matlab_in_a_newer_file_is_named(tmp_path):
+    columns = write_mat73(tmp_path / "log.mat")
+    with h5py.File(tmp_path / "log.mat", "a") as file:
+        file["hip"] = np.zeros((1, 6), np.uint32)
+        file["hip"].attrs["MATLAB_class"] = np.bytes_("timeseries")
+        file["hip"].attrs["MATLAB_object_decode"] = 3
+    with pytest.raises(DataError, match=r"it is a timeseries.*hip\.Data"):
+        load(tmp_path / "log.mat", columns=columns)
+
+
+def linked_to_itself(file):
+    file["log/again"] = file["log"]
+
+
+def linked_twice(file):
+    file["log/more"] = file["t"]
+
+
+@pytest.mark.parametrize("link", [linked_to_itself, linked_twice])
+def test_a_group_of_a_matlab_file_that_is_linked_again_is_refused(tmp_path, link):
+    """Followed, the links have no end, or give one array any number of names."""
+    columns = write_mat73(tmp_path / "log.mat")
+    with h5py.File(tmp_path / "log.mat", "a") as file:
+        link(file)
+    with pytest.raises(DataError, match=r"it is another link to (log|t|log/more);"):
+        load(tmp_path / "log.mat", columns=columns)
+
+
+def test_a_bag_with_damaged_bytes_is_refused(tmp_path):
+    path = tmp_path / "log.mcap"
+    columns = write_mcap(path)
+    whole, content = load(path, columns=columns), path.read_bytes()
+    refused = 0
+    for place in range(60, len(content) - 400, 97):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 0x11]) + content[place + 1 :])
+        try:
+            assert torch.equal(load(path, columns=columns)["observation"], whole["observation"])
+        except DataError:
+            refused += 1
+    assert refused > 10
+
+
+@pytest.mark.parametrize(
+    ("last", "is_whole"),
+    [("0.5000", True), ("0.50", False), ("0.", False), ("-1", False), ("0.5000\n", True), ("0.50\n", True)],
+)
+def test_a_last_cell_that_may_be_cut_is_refused(tmp_path, last, is_whole):
+    (tmp_path / "log.csv").write_text("t,q,v,u\n0.00,1,1,0.1234\n0.01,2,2,-0.1230\n0.02,3,3," + last)
+    if is_whole:
+        assert len(load(tmp_path / "log.csv", columns=layout())) == 2
+        return
+    with pytest.raises(DataError, match="without a line break, so this number may be cut") as caught:
+        load(tmp_path / "log.csv", columns=layout())
+    assert (caught.value.column, caught.value.row) == ("u", 4)
+
+
+def test_a_last_cell_that_is_not_used_or_cannot_be_cut_is_read(tmp_path):
+    (tmp_path / "log.csv").write_text("t,q,v,u,mode\n0.00,1,1,0.1234,run\n0.01,2,2,-0.1230,ru")
+    assert len(load(tmp_path / "log.csv", columns=layout())) == 1
+    (tmp_path / "log.csv").write_text("t,q,v,u\n0.00,1,1,7\n0.01,2,2,-9")
+    assert len(load(tmp_path / "log.csv", columns=layout())) == 1
+
+
+@pytest.mark.parametrize("cell", ["1e20", "-2e12", "\u0661", "\uff11"])
+def test_implausible_numbers_and_other_digits_are_refused(tmp_path, cell):
+    (tmp_path / "log.csv").write_text(f"t,q,v,u\n0.00,1,1,1\n0.01,2,2,{cell}\n0.02,3,3,1\n", encoding="utf-8")
+    with pytest.raises(DataError, match=r"at most 1e\+12|is not a number") as caught:
+        load(tmp_path / "log.csv", columns=layout())
+    assert (caught.value.column, caught.value.row) == ("u", 3)

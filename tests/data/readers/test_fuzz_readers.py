@@ -1,11 +1,15 @@
 """Damaged files of every format: each reader returns valid transitions or raises a short DataError."""
 
 import json
+import re
 import shutil
+import warnings
+import zipfile
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 import yaml
@@ -13,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.data.readers import test_formats as formats
-from tests.data.recordings import make_recording
+from tests.data.recordings import assert_same, make_recording
 from tests.data.test_d4rl import write as write_d4rl
 from tests.data.test_log_columns import GOOD
 from tests.fuzzing import (
@@ -23,6 +27,7 @@ from tests.fuzzing import (
     few,
     many,
     outcome,
+    some,
     text_damages,
     with_changed_entries,
 )
@@ -96,6 +101,103 @@ def assert_read_or_refused(original, folder, number, changes):
     file = path if original.path == chosen else path / chosen.relative_to(original.path)
     file.write_bytes(damaged(file.read_bytes(), changes))
     assert_valid(outcome(original.read, path))
+
+
+CHECKED = ["npz", "mcap"]  # their bytes have checksums: what is read equals the original
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHECKED)
+@some
+@given(share=st.floats(0, 1, exclude_max=True), flipped=st.integers(1, 255))
+def test_a_flipped_byte_is_refused_or_changes_nothing(originals, tmp_path_factory, name, share, flipped):
+    original = originals(name)
+    content = bytearray(original.path.read_bytes())
+    content[int(share * len(content))] ^= flipped
+    path = copy_of(original, tmp_path_factory.getbasetemp())
+    path.write_bytes(content)
+    if (td := outcome(original.read, path)) is not None:
+        assert_same(td, original.read(original.path))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["csv", "txt"])
+@some
+@given(share=st.floats(0, 1))
+def test_a_text_that_is_cut_is_refused_or_a_shorter_log(originals, tmp_path_factory, name, share):
+    original = originals(name)
+    content, path = original.path.read_bytes(), copy_of(original, tmp_path_factory.getbasetemp())
+    path.write_bytes(content[: int(share * len(content))])
+    if (td := outcome(original.read, path)) is not None:
+        whole = original.read(original.path)
+        for key in ("observation", "action", ("next", "observation")):
+            assert torch.equal(td[key], whole[key][: len(td)])
+
+
+GROUPS = ["/", "/g", "/g/h"]
+links = st.lists(
+    st.tuples(st.sampled_from(GROUPS), st.text("abcdefgh", min_size=1, max_size=2), st.integers(0, 10), st.booleans()),
+    min_size=1,
+    max_size=6,
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mat73", "d4rl", "minari"])
+@some
+@given(drawn=links)
+def test_links_within_a_file(originals, tmp_path_factory, name, drawn):
+    original = originals(name)
+    path = copy_of(original, tmp_path_factory.getbasetemp())
+    with h5py.File(path / "data" / "main_data.hdf5" if path.is_dir() else path, "a") as file:
+        file.require_group("/g/h")
+        for parent, link, number, soft in drawn:
+            entries = [*GROUPS]
+            file.visit(entries.append)
+            target = entries[number % len(entries)]
+            if link not in file[parent]:
+                file[parent][link] = h5py.SoftLink(target) if soft else file[target]
+    assert_valid(outcome(original.read, path))
+
+
+@pytest.mark.slow
+@some
+@given(members=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.sampled_from([0, 0, 1, 2**6])), max_size=5))
+def test_members_of_an_archive(originals, tmp_path_factory, members):
+    """Doubled, renamed and encrypted ones."""
+    original = originals("npz")
+    path = copy_of(original, tmp_path_factory.getbasetemp())
+    with zipfile.ZipFile(original.path) as archive:
+        names = archive.namelist()
+        with zipfile.ZipFile(path, "w") as changed, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for name in names:
+                changed.writestr(name, archive.read(name))
+            for source, target, _ in members:
+                changed.writestr(names[target % len(names)], archive.read(names[source % len(names)]))
+    content = bytearray(path.read_bytes())
+    for number, _, flag in members:
+        for start, place in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+            content[[found.start() for found in re.finditer(start, content)][number % len(names)] + place] |= flag
+    path.write_bytes(content)
+    td = outcome(original.read, path)
+    assert td is None or not members
+    assert_valid(td)
+
+
+sizes = st.floats(-12, 12).map(lambda exponent: 10.0**exponent)
+
+
+@pytest.mark.slow
+@some
+@given(step=sizes, tolerance=sizes, gap=sizes, unit=st.sampled_from(["s", "ms", "ns"]))
+def test_steps_and_gaps_of_any_size(tmp_path_factory, step, tolerance, gap, unit):
+    path = tmp_path_factory.getbasetemp() / "gap.csv"
+    path.write_text("t,q,u\n" + "".join(f"{t!r},{i},0\n" for i, t in enumerate([0.0, 1.0, 2.0, 2.0 + gap, 3.0 + gap])))
+    entries = {"separator": ",", "header": True, "resample": step, "time_tolerance": tolerance}
+    columns = [{"name": "t", "role": "time", "unit": unit}, {"name": "q", "role": "observation"}]
+    columns.append({"name": "u", "role": "action"})
+    assert_valid(outcome(partial(read_robot_log, columns={**entries, "columns": columns}), path))
 
 
 any_damages = st.one_of(damages(), text_damages)

@@ -1,5 +1,7 @@
 """Guessed kinds, units and sets of columns."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -309,3 +311,99 @@ def test_columns_that_may_be_the_action_say_so(tmp_path):
     text = guessed(tmp_path, "time,q,drive,other", [TIME, ANGLE, COMMAND, COMMAND], model)
     assert text.count("perhaps an action: actuators in the model: 1, columns that are left: 2") == 2
     assert "no column of actions was found; see those marked 'perhaps an action'" in text
+
+
+def roles(text):
+    """The role of each column of a guessed layout."""
+    return dict(re.findall(r'name: "([^"]+)", role: (\w+)', text))
+
+
+LEGS = [f"{leg}_{part}" for leg in ("FL", "RR") for part in ("hip", "thigh", "calf")]
+
+
+@pytest.mark.parametrize(
+    ("model", "suffix"),
+    [
+        (Coordinates({f"{leg}_joint": "rad" for leg in LEGS}, LEGS, servos=True), "des"),
+        (Coordinates(dict.fromkeys(LEGS, "rad"), LEGS, servos=True), "target"),
+        (Coordinates(dict.fromkeys(LEGS, "rad"), [f"m{i}" for i in range(6)], servos=True), "cmd"),
+    ],
+    ids=["names of actuators", "names of joints", "as many as actuators"],
+)
+def test_each_servo_has_a_command(tmp_path, model, suffix):
+    joints = list(model.units)
+    names = ["time", *joints, *(f"{leg}_{suffix}" for leg in LEGS)]
+    found = roles(guessed(tmp_path, ",".join(names), [TIME, *[ANGLE] * 6, *[COMMAND] * 6], model))
+    assert [name for name, role in found.items() if role == "action"] == names[7:]
+    assert [found[joint] for joint in joints] == ["observation"] * 6
+
+
+def test_a_column_named_like_an_actuator_is_an_action_beside_others_of_its_number(tmp_path):
+    names = "time,hip,hip_velocity,motor1,elevon1,current1"
+    columns = [TIME, ANGLE, 4.0 * np.cos(TIME), COMMAND, COMMAND, COMMAND]
+    model = Coordinates({"hip": "rad", "hip_velocity": "rad/s"}, ["motor1", "elevon1"])
+    found = roles(guessed(tmp_path, names, columns, model))
+    assert (found["motor1"], found["elevon1"], found["current1"]) == ("action", "action", "ignore")
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1)])
+def test_of_several_sets_of_velocities_the_one_that_are_slopes_is_taken(tmp_path, order):
+    moving = [ANGLE, 3.0 * np.sin(2.0 * TIME)]
+    sets = [moving, [np.cos(5.0 * TIME)] * 2, [4.0 * np.cos(TIME), 6.0 * np.cos(2.0 * TIME)]]
+    names = [[f"{name}[{i}]" for i in range(2)] for name in ("local_position", "local_rate", "local_velocity")]
+    columns = [column for index in order for column in sets[index]]
+    header = ",".join(name for index in order for name in names[index])
+    found = roles(guessed(tmp_path, f"time,{header},tau", [TIME, *columns, COMMAND]))
+    assert [found[name] for name in (*names[1], *names[2])] == ["ignore", "ignore", "observation", "observation"]
+
+
+@pytest.mark.parametrize(("names", "order"), [("q1,q2,q3,q4", (0, 1, 2, 3)), ("q1,q2,q3,q4", (0, 2, 1, 3))])
+@pytest.mark.parametrize("timed", [False, True])
+def test_slopes_are_velocities_also_where_no_name_tells_it(tmp_path, names, order, timed):
+    time = 0.008 * np.arange(1000)
+    columns = [np.sin(3.0 * time), np.cos(1.7 * time), 3.0 * np.cos(3.0 * time), -1.7 * np.sin(1.7 * time)]
+    columns = [*([time] if timed else []), *(columns[i] for i in order), np.cos(7.0 * time)]
+    text = guessed(tmp_path, ("time," if timed else "") + names + ",u", columns)
+    assert "derivative_of" not in text
+    assert text.count('unit: "rad/s"') == 2
+    assert timed or float(text.split("dt: ")[1].split()[0]) == pytest.approx(0.008, rel=0.01)
+
+
+def test_columns_that_are_no_slopes_stay_positions(tmp_path):
+    time = 0.008 * np.arange(1000)
+    text = guessed(tmp_path, "q1,q2,u", [np.sin(3.0 * time), np.cos(3.0 * time), time])
+    assert text.count("derivative_of") == 2
+    model = Coordinates({f"q{i}": "rad" for i in (1, 2)}, ["u"])
+    text = guessed(tmp_path, "time,q1,q2,u", [time, np.sin(3.0 * time), 3.0 * np.cos(3.0 * time), time], model)
+    assert text.count("derivative_of") == 2  # the model has two joints
+
+
+def test_a_regular_clock_without_a_name_is_the_time(tmp_path):
+    time = 0.002 * np.arange(500)
+    np.savetxt(tmp_path / "log.dat", np.stack([time, np.sin(3 * time), 3 * np.cos(3 * time), np.cos(9 * time)], 1))
+    text = guess_layout(tmp_path / "log.dat").text
+    assert list(roles(text).values()) == ["time", "observation", "observation", "ignore"]
+    assert "the median step is 0.002, which is 0.002 s" in text
+
+
+@pytest.mark.parametrize("values", [np.arange(1500.0), np.sin(0.1 * TIME), TIME + 0.01 * (np.arange(1500) % 3)])
+def test_what_counts_rows_or_grows_unevenly_is_no_clock(tmp_path, values):
+    assert roles(guessed(tmp_path, "a,q,tau", [values, ANGLE, COMMAND]))["a"] == "ignore"
+
+
+def test_lists_in_cells_are_described_one_by_one(tmp_path):
+    rows = "".join(f'{t:.2f},"[{np.sin(t):.6f}, {t:.2f}]","[{np.cos(t):.6f}, 1.0]"\n' for t in TIME[:200])
+    (tmp_path / "log.csv").write_text("t,positions,velocities\n" + rows)
+    found = roles(guess_layout(tmp_path / "log.csv").text)
+    assert list(found) == ["t", "positions[0]", "positions[1]", "velocities[0]", "velocities[1]"]
+    (tmp_path / "log.yaml").write_text(guess_layout(tmp_path / "log.csv").text)
+    assert load(tmp_path / "log.csv", columns=tmp_path / "log.yaml")["observation"].shape == (199, 4)
+
+
+def test_the_number_of_an_episode_separates_runs(tmp_path):
+    episode = np.arange(1500) // 500
+    text = guessed(tmp_path, "t,q,tau,episode_index", [TIME % 5.0, ANGLE, COMMAND, episode])
+    assert roles(text)["episode_index"] == "run"
+    (tmp_path / "log.yaml").write_text(text)
+    read = load(tmp_path / "log.csv", columns=tmp_path / "log.yaml")
+    assert int(read["next", "done"].sum()) == 3

@@ -152,3 +152,16 @@ def test_a_run_ends_with_its_last_fresh_reading(tmp_path):
     td = read(tmp_path, np.c_[time, position, 0 * time])
     assert float(td["next", "observation"][-1]) == pytest.approx(2.0 * time[25])
     assert len(td) == 25
+
+
+@pytest.mark.parametrize("step", [1e-9, 1e-4])
+def test_a_step_far_below_the_log_s_own_is_refused(tmp_path, step):
+    rows = np.c_[irregular(40), np.zeros((40, 2))]
+    with pytest.raises(DataError, match=r"rows from 40; give at least 0\.0002"):
+        read(tmp_path, rows, layout(resample=step))
+
+
+def test_a_bridged_gap_counts_as_well(tmp_path):
+    time = np.append(irregular(40), 1e8)
+    with pytest.raises(DataError, match=r"gives 1e\+10 rows from 41"):
+        read(tmp_path, np.c_[time, np.zeros((41, 2))], layout(time_tolerance=1e12))

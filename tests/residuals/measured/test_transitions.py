@@ -104,6 +104,12 @@ def test_rows_for_fits_then_for_selection_then_for_the_report():
     assert np.bincount(split).tolist() == [153, 57, 90]
 
 
+@pytest.mark.parametrize("share", [float("nan"), 1.0, -0.1])
+def test_a_share_to_hold_out_that_is_none_is_refused(share):
+    with pytest.raises(DataError, match=f"held_out={share} is no share of the transitions; give a share below 1"):
+        of(ted(), held_out=share)
+
+
 def test_borders_move_to_the_ends_of_runs_that_are_near():
     data = ted()
     for last in (159, 219):

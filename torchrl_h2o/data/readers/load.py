@@ -79,9 +79,7 @@ def load(
     return td
 
 
-def _read(
-    source: str | Path, columns: Columns | None, reward: Reward | None, task: str | None
-) -> TensorDict:
+def _read(source: str | Path, columns: Columns | None, reward: Reward | None, task: str | None) -> TensorDict:
     path = Path(source).expanduser()
     if path.is_dir():
         _require_no_columns(columns, source)

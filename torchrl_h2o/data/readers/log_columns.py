@@ -24,8 +24,8 @@ class Column:
     Args:
         name: the column's name; in a file with a header, the name in the header.
         role: one of observation, action, reward, done, time, run, ignore. ``done`` is 1 in rows in which the task has
-            ended. The ``reward`` of a row is the reward of that row's action. ``run`` is the number of an episode; a run
-            ends where it changes.
+            ended. The ``reward`` of a row is the reward of that row's action. ``run`` is the number of an episode: a
+            run ends where it changes.
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
         scale: a factor in addition to the unit's, such as a gear ratio or a sign.
         offset: a constant in SI that is added after unit and scale, such as the zero of an angle.

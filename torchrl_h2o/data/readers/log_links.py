@@ -122,7 +122,7 @@ def same_episode(table: LogTable, layout: LogColumns, done: np.ndarray) -> np.nd
 
 
 def _other_runs(table: LogTable, layout: LogColumns) -> np.ndarray:
-    """Whether a row and the next one are of different runs by their number, or, where a layout splits, by their time."""
+    """Whether a row and the next one are of different runs: by their number or, where a layout splits, their time."""
     others = np.zeros(len(table.rows) - 1, bool)
     if (run := layout.named("run")) is not None:
         others |= np.diff(table.columns([run.name])[:, 0]) != 0
@@ -146,9 +146,7 @@ def _require_declared_restart(table: LogTable, layout: LogColumns, restarts: np.
         )
 
 
-def _jumps(
-    table: LogTable, layout: LogColumns, linked: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _jumps(table: LogTable, layout: LogColumns, linked: np.ndarray) -> tuple[np.ndarray, float]:
     """Return a mask of the linked pairs of rows whose time step is not dt, and dt.
 
     Raises:
@@ -191,8 +189,8 @@ def require_increasing(table: LogTable, layout: LogColumns, linked: np.ndarray) 
         index = backwards[0]
         raise DataError(
             f"time goes from {time[index]:.9g} s to {time[index + 1]:.9g} s",
-            "time must increase: set on_time_jump: split or give a column of role run if another run begins here, or set "
-            "drop_trailing_zero_rows if the logger pads the end with zeros",
+            "time must increase: set on_time_jump: split or give a column with role: run if a run begins here, or "
+            "set drop_trailing_zero_rows if the logger pads the end with zeros",
             source=table.source,
             column=name,
             row=int(table.rows[index + 1]),

@@ -179,9 +179,7 @@ def _open(source: str | Path) -> MinariDataset:
     for name in ("metadata.json", _MAIN_FILE):
         if (data / name).exists():
             require_file(data / name)
-    remedy = (
-        "give the folder that contains data/metadata.json, or a name that is in MINARI_DATASETS_PATH or can be downloaded"
-    )
+    remedy = "give the folder that contains data/metadata.json, or a name in MINARI_DATASETS_PATH or to download"
     with unreadable("no Minari dataset can be opened", remedy, source=source):
         if data.is_dir():
             _require_plausible_count(data)

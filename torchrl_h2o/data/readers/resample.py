@@ -59,7 +59,7 @@ def resample(table: LogTable, layout: LogColumns) -> LogTable:
     stale = _stale(table.columns(measured))
     step = cast("float", layout.resample)
     runs = _up_to_fresh(_runs(steps, linked, table, layout), stale)
-    _require_plausible_step(step, sum(time[run.stop - 1] - time[run.start] for run in runs), table)
+    _require_plausible_step(step, sum(float(time[run.stop - 1] - time[run.start]) for run in runs), table)
     parts = [
         _resampled(table, layout, _Run(time[run], step, stale[run], run, bool(done[run.stop - 1])))
         for run in runs
@@ -82,7 +82,7 @@ def _require_plausible_step(step: float, duration: float, table: LogTable) -> No
     if step < least:
         raise DataError(
             f"resample: {step:g} s gives {duration / step:.3g} rows from {len(table.rows)}",
-            f"give at least {least:.2g} s, a step near the log's own",
+            f"give at least {1.05 * least:.2g} s, a step near the log's own",
             source=table.source,
         )
 

@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 BOUND_ROUNDING = 1e-6
 
 
-def check_specs(
-    td: TensorDictBase, env: EnvBase, *, source: str | Path = "transitions"
-) -> None:
+def check_specs(td: TensorDictBase, env: EnvBase, *, source: str | Path = "transitions") -> None:
     """Check that transitions match the specs of an environment.
 
     Args:

@@ -284,7 +284,7 @@ def divided(
         (T), the :class:`Split` of each transition.
 
     Raises:
-        DataError: if the logs of the report are all logs, or none.
+        DataError: if the logs of the report are all logs, or none, or the share is none.
 
     Examples:
         >>> run = np.array([0, 0, 0, 0, 0, 1, 1, 2, 2, 2])
@@ -293,6 +293,9 @@ def divided(
     """
     split = np.full(len(run), Split.FIT)
     if isinstance(held_out, float | int):
+        if not 0.0 <= held_out < 1.0:
+            problem = f"held_out={held_out} is no share of the transitions"
+            raise DataError(problem, "give a share below 1, such as 0.25, or the indices of logs", source=source)
         split[_border(run, 1.0 - held_out) :] = Split.REPORT
     else:
         split[np.isin(logs, list(held_out))] = Split.REPORT

@@ -107,7 +107,7 @@ def _hdf5_arrays(path: Path) -> dict[str, np.ndarray]:
         found = {name.replace("/", "."): each for name, each in own_arrays(file, names, source=path).items()}
         for name, each in found.items():
             if "MATLAB_object_decode" in each.attrs:
-                raise _object_error(name, bytes(each.attrs["MATLAB_class"]).decode(errors="replace"), path)
+                raise _object_error(name, np.bytes_(each.attrs["MATLAB_class"]).decode(errors="replace"), path)
         # MATLAB stores columns first
         return {name: each[()].T for name, each in found.items() if each.dtype.kind in "fiub"}
 

@@ -62,7 +62,7 @@ def read_mcap(path: Path, layout: LogColumns | None) -> RawTable:
             a layout, the rows are those of the topic with most messages.
 
     Raises:
-        DataError: for a bag whose checksums do not agree with its bytes, a bag without joint states, or an unknown or missing topic.
+        DataError: for a damaged bag, by its checksums, a bag without joint states, or an unknown or missing topic.
     """
     topics = _topics(path)
     name = _main_topic(topics, layout, path)

@@ -47,6 +47,6 @@ def read_parquet(path: Path, layout: LogColumns | None) -> RawTable:
         columns |= {name: partial(values, name)}
         if pyarrow.types.is_list(kind) or pyarrow.types.is_fixed_size_list(kind):
             with suppress(ValueError):  # lists that differ in length are no columns of numbers
-                columns |= columns_of(name, np.stack(values(name)))
+                columns |= columns_of(name, np.stack(list(values(name))))
                 del columns[name]
     return table_of(columns, rows, path, layout)

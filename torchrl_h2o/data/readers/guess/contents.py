@@ -79,15 +79,15 @@ def require_several_runs(paths: Sequence[str | Path]) -> None:
     contents = [read_contents(path) for path in logs]
     times = [_time(each) for each in contents]
     first, begin = contents[0], times[0]
-    for path, each, time in zip(logs[1:], contents[1:], times[1:], strict=True):
+    for each, time in zip(contents[1:], times[1:], strict=True):
         if begin is None or time is None or set(each.values) == set(first.values):
             return
         shared = min(begin[-1], time[-1]) - max(begin[0], time[0])
         if shared < _SHARED * max(np.ptp(begin), np.ptp(time)):
             return
     raise DataError(
-        f"{', '.join(path.name for path in logs)} have the same times and other columns: they are one run in {len(logs)} "
-        "files",
+        f"{', '.join(path.name for path in logs)} have the same times and other columns: they are one run in "
+        f"{len(logs)} files",
         "join them on time, for example with pandas.merge_asof, and give the joined file",
         source=logs[0].parent,
     )

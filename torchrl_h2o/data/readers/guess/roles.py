@@ -187,7 +187,7 @@ def is_counter(numbers: np.ndarray | None) -> bool:
 
 
 def _is_time(guess: Guess, numbers: np.ndarray | None) -> bool:
-    """Whether a column of which the name tells nothing is a regular clock: its steps are alike, but it counts no rows."""
+    """Whether a column whose name tells nothing is a regular clock: its steps are alike, but it counts no rows."""
     told = guess.kind != "unknown" or guess.note or any(word in _NO_COMMANDS for word in words_of(guess.name))
     if told or numbers is None or not is_clock(numbers) or is_counter(numbers):
         return False

@@ -95,8 +95,8 @@ def _correlation(moved: np.ndarray, expected: np.ndarray, good: np.ndarray, rows
 def slopes_among(names: Sequence[str], slopes: Slopes, unit: str) -> dict[str, str]:
     """Return the position of each velocity among columns whose names tell them not apart, such as q1 to q4.
 
-    The first half are positions and the second half their exact slopes, or each velocity is beside its position. Without
-    a time, at least two must tell the same time between two rows.
+    The first half are positions and the second half their exact slopes, or each velocity is beside its position.
+    Without a time, at least two must tell the same time between two rows.
 
     Args:
         names: the columns, in the order of the file.
@@ -108,7 +108,10 @@ def slopes_among(names: Sequence[str], slopes: Slopes, unit: str) -> dict[str, s
     """
     half = len(names) // 2
     per_row = slopes.time is None
-    for pairs in (dict(zip(names[half:], names[:half], strict=False)), dict(zip(names[1::2], names[::2], strict=False))):
+    for pairs in (
+        dict(zip(names[half:], names[:half], strict=False)),
+        dict(zip(names[1::2], names[::2], strict=False)),
+    ):
         ratios = []
         for speed, place in pairs.items():
             found = (slopes.per_row if per_row else slopes.of)(place, speed, unit)

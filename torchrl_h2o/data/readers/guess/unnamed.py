@@ -182,9 +182,7 @@ def _actions(slopes: Slopes, taken: set[str], states: _States, model: Coordinate
     return min(blocks, key=lambda block: (accelerations(block), order[block[0]] < last, order[block[0]]), default=())
 
 
-def _may_be(
-    block: Sequence[str], table: Mapping[str, np.ndarray | None], states: _States, model: Coordinates
-) -> bool:
+def _may_be(block: Sequence[str], table: Mapping[str, np.ndarray | None], states: _States, model: Coordinates) -> bool:
     """Whether columns may be commands: of servos, those that change follow the positions, else not all copy a state."""
     columns = [column for name in block if (column := table[name]) is not None and np.isfinite(column).all()]
     moving = [column for column in columns if np.ptp(column) > 0.0]
