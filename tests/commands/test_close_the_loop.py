@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import hydra
@@ -12,8 +13,19 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from hydra.core.plugins import Plugins
+from hydra.core.singleton import Singleton
 
-from torchrl_h2o.commands.close_the_loop import chosen_entries, expanded, make_simulation, print_report
+from tests.full_disk import full_disk
+from torchrl_h2o.commands.close_the_loop import (
+    chosen_entries,
+    expanded,
+    make_simulation,
+    minutes_left,
+    print_files,
+    print_result,
+    run,
+)
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import LogColumns, write_ted
 from torchrl_h2o.data.readers.ted import to_ted
@@ -243,7 +255,8 @@ def test_the_step_is_the_log_s_or_has_to_be_given(robot):
 
 
 def test_what_is_printed_is_short_and_has_units(capsys, tmp_path):
-    print_report(report(Gravity(0.5)), tmp_path)
+    print_result(report(Gravity(0.5)))
+    print_files(report(Gravity(0.5)), tmp_path)
     printed = capsys.readouterr().out
     for part in ("Your simulator lacks: gravity × 0.5", "0.49 to 0.51", "rad", "0.031", "0.004", "report.html"):
         assert part in printed
@@ -256,7 +269,9 @@ def test_units_and_effects_that_the_model_s_file_lacks_are_printed(capsys, tmp_p
     push = JointForce(6.72, "rail")
     found = FoundEffect(push, True, {"torque": (6.5, 6.9)}, 0.1, effect_words(push, names), effect_units(push, names))
     mended = MendedModel("mended.xml", (LeftOut(push, "MJCF has no such force", effect_words(push, names)),))
-    print_report(dataclasses.replace(report(), found=(found,), mended_model=mended), tmp_path)
+    mended_report = dataclasses.replace(report(), found=(found,), mended_model=mended)
+    print_result(mended_report)
+    print_files(mended_report, tmp_path)
     printed = capsys.readouterr().out
     assert "force" + " " * 17 + "6.72  6.5 to 6.9 N\n" in printed
     assert "not in mended.xml: constant force of 6.72 N on joints rail" in printed
@@ -276,6 +291,35 @@ def test_a_report_without_effects_and_a_file_that_is_none_are_refused(compose, t
         make_simulator(compose(f"gap_fix={path}", config="h2o_plus"))
     with pytest.raises(ValueError, match="cannot be read"):
         make_simulator(compose(f"gap_fix={tmp_path / 'none.json'}", config="h2o_plus"))
+
+
+def test_the_files_are_written_within_the_minutes_and_the_audit_counts():
+    assert minutes_left(None, 0.0) is None
+    assert 0.9 < minutes_left(1.0, time.monotonic()) < 1.0
+    assert minutes_left(1.0, time.monotonic() - 30.0) < 0.5
+    with pytest.raises(ValueError, match=r"^minutes=1 is too short: reading and auditing the data took 2 minutes$"):
+        minutes_left(1.0, time.monotonic() - 120.0)
+
+
+def test_a_full_disk_does_not_lose_the_result(robot, monkeypatch, capsys):
+    monkeypatch.chdir(robot)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    report(Gravity(0.5)).save(robot / "out")
+    before = {path: path.read_bytes() for path in (robot / "out").iterdir()}
+    chosen = ["simulator=robot.xml", "data=log.csv", "columns=log.yaml", "simulator.coordinates={angle: pivot}"]
+    chosen += ["catalogue=[JointDamping]", "audit=false", "hydra.run.dir=out"]
+    monkeypatch.setattr(sys, "argv", ["close-the-loop", *chosen])
+    Plugins.instance()  # registered once, at their import
+    state = Singleton.get_state()
+    with full_disk(), pytest.raises(SystemExit, match="1"):
+        run()
+    Singleton.set_state(state)
+    printed = capsys.readouterr()
+    assert "Your simulator lacks: damping of joints pivot + 0.1 N·m·s/rad" in printed.out
+    *_, line = printed.err.splitlines()
+    assert line.startswith("OSError: ")
+    assert "File too large" in line
+    assert {path: path.read_bytes() for path in (robot / "out").iterdir()} == before
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Expected errors of the scripts are one line; bugs, and expected errors on request, have a traceback."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -62,6 +63,16 @@ def test_an_expected_error_is_one_line_without_a_traceback(capsys, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(DataError), one_line_errors():
         raise DataError("wrong", "correct it")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT])
+def test_a_disk_that_is_full_or_may_not_be_written_is_one_line(capsys, monkeypatch, number):
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    with pytest.raises(SystemExit, match="1"), one_line_errors():
+        raise OSError(number, os.strerror(number), "out/report.json")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert os.strerror(number) in line
+    assert line.endswith("'out/report.json'; make room, or choose a folder that can be written")
 
 
 def run(folder, *arguments, full=False):

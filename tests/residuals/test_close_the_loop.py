@@ -17,7 +17,6 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
 )
 from torchrl_h2o.residuals import LoopSettings, Report, Simulation, Split, close_the_loop, residuals
-from torchrl_h2o.residuals.report.contents import UNDECIDED
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -167,22 +166,25 @@ def test_a_simulator_that_diverges_is_no_conclusion():
     assert "diverges within one step of" in closed(far).conclusion
 
 
-def test_a_search_whose_time_is_up_does_not_say_that_the_catalogue_has_no_cause():
-    report = closed(recorded(SIMULATION.with_effects(Gravity(1.3)), 1500), minutes=1e-9)
-    assert not report.found
-    assert report.sentence().startswith("Something is missing that the search has not explained")
-    assert "The time for the search was up while it was looking for effects" in report.sentence()
-    assert Report.from_json(report.to_json()).ended_in == report.ended_in
-
-
-def test_a_search_whose_time_is_up_does_not_say_that_nothing_is_missing():
-    """No test on so few and noisy rows shows this gravity; the whole search finds it."""
-    measured = recorded(SIMULATION.with_effects(Gravity(1.07)), 600, noise=0.02)
-    report = closed(measured, catalogue=[GRAVITY], minutes=1e-9)
-    assert report.verdict.kind == UNDECIDED
-    assert not report.verdict.undetectable
-    assert report.sentence().startswith("Nothing was found so far, and no test shows that something is missing")
-    assert [type(effect) for effect in closed(measured, catalogue=[GRAVITY]).effects] == [Gravity]
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"data": {"observation": np.zeros((3, 2))}}, r"data=<class 'dict'>: must be a TensorDict"),
+        ({"catalogue": "gravity"}, "catalogue='gravity': must be a list of CatalogueEntry"),
+        ({"known": "gravity"}, "known='gravity': must be a list of effects"),
+        ({"known": ["gravity"]}, r"known=\['gravity'\]: must be a list of effects"),
+        ({"seed": "a"}, "seed='a': must be a whole number, 0 or more"),
+        ({"seed": -1}, "seed=-1: must be"),
+        ({"minutes": -1}, "minutes=-1: must be a number above 0"),
+        ({"minutes": "8"}, "minutes='8': must be"),
+        ({"held_out": float("nan")}, "held_out=nan: must be a share above 0 and below 1"),
+        ({"held_out": 1.5}, "held_out=1.5: must be"),
+    ],
+)
+def test_an_argument_that_cannot_be_used_is_named(arguments, said):
+    rest = {"data": recorded(SIMULATION, 100), "progress": False}
+    with pytest.raises(ValueError, match=f"^{said}"):
+        close_the_loop(SIMULATION, **(rest | arguments))
 
 
 def test_a_progress_bar_is_shown_only_if_asked(capsys):

@@ -54,16 +54,41 @@ def test_the_time_left_follows_from_all_the_time_passed():
         assert "about 01:0" in str(bar) or "about 00:5" in str(bar)
 
 
-def test_the_search_ends_when_its_time_is_up_and_the_report_does_not():
-    with LoopBar(disable=True, minutes=1e-9) as bar:
+def test_each_part_ends_when_its_time_is_up_and_all_within_the_minutes():
+    now = 0.0
+    with LoopBar(disable=True, minutes=1.0, clock=lambda: now) as bar:
+        bar.keep_for_report(evaluation=0.1)  # the report takes many of them
         bar.stage(EFFECTS)
+        now = 40.0
+        bar.closer(0.5)
+        now = 50.0
         with pytest.raises(OutOfTimeError, match=EFFECTS):
             bar.closer(0.5)
+        bar.begin_last_fit()
+        bar.check()
+        now = 55.0
+        with pytest.raises(OutOfTimeError):
+            bar.check()
         bar.stage(REPORT)
-        bar.closer(0.5)
+        assert bar.within_time("errors", lambda: 3, 0) == 3
+        now = 60.0
+        assert bar.within_time("the floor", lambda: 3, 0) == 0
+        assert bar.left_out == ["the floor"]
 
 
-@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan")])
+def test_the_search_ends_earlier_where_simulating_takes_longer():
+    ends = []
+    for evaluation in (1e-3, 0.2, 1e3):
+        now = 0.0
+        with LoopBar(disable=True, minutes=1.0, clock=lambda: now) as bar:  # noqa: B023
+            bar.keep_for_report(evaluation)
+            while not bar.time_is_up:
+                now += 1.0
+        ends.append(now)
+    assert 30.0 < ends[2] < ends[1] < ends[0] < 60.0
+
+
+@pytest.mark.parametrize("minutes", [0.0, -1.0, float("nan"), "8"])
 def test_a_time_that_is_none_is_refused(minutes):
     with pytest.raises(ValueError, match="above 0"):
         LoopBar(disable=True, minutes=minutes)

@@ -10,6 +10,8 @@ close-the-loop --guess data=log.csv simulator=robot.xml                # writes 
 import os
 import re
 import sys
+import time
+from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -32,6 +34,8 @@ from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 from torchrl_h2o.residuals.report.json_file import write_json
 from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
 from torchrl_h2o.residuals.report.sentence import sentences
+
+FOR_FILES = 0.04  # share of ``minutes`` for writing the report and the mended model
 
 
 def make_simulation(cfg: DictConfig, recording: Recording) -> Simulation:
@@ -77,29 +81,56 @@ def chosen_entries(cfg: DictConfig, simulation: Simulation) -> list[CatalogueEnt
 
 @hydra_main("../config", "close_the_loop", CloseTheLoopOptions)
 def main(cfg: DictConfig) -> None:
+    begin = time.monotonic()
     directory = Path(HydraConfig.get().runtime.output_dir)
     recording = read_recording(cfg)
     simulation = make_simulation(cfg, recording)
     recording = recording.for_simulation(simulation)
+    entries = chosen_entries(cfg, simulation)
+    audited = audit_data(cfg, recording, simulation)
+
+    def so_far(unfinished: Report) -> None:
+        with suppress(OSError):  # a disk that is full now may have room at the end
+            write_json(unfinished, directory)
+
     report = close_the_loop(
         simulation,
         recording.transitions,
-        chosen_entries(cfg, simulation),
+        entries,
         source="; ".join(filter(None, [recording.source, words_of_estimates(recording.estimated)])),
         held_out=recording.reported_on,
         seed=cfg.seed,
-        minutes=cfg.minutes,
-        audit=audited(cfg, recording, simulation),
+        minutes=minutes_left(cfg.minutes, begin),
+        audit=audited,
         known=() if cfg.start_from is None else Report.load(cfg.start_from).effects,
-        so_far=lambda unfinished: write_json(unfinished, directory),
+        so_far=so_far,
     )
+    print_result(report)  # before it is written, because the disk may be full
     if report.recommended:
         report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
     report.save(directory)
-    print_report(report, directory)
+    print_files(report, directory)
 
 
-def audited(cfg: DictConfig, recording: Recording, simulation: Simulation) -> Audit | None:
+def minutes_left(minutes: float | None, begin: float) -> float | None:
+    """Time for the search and its judgement, in minutes, after the time that has passed and that for the files.
+
+    Args:
+        minutes: time for the whole command; None for as long as it takes.
+        begin: when the command began, in s of the monotonic clock.
+
+    Raises:
+        ValueError: if nothing is left.
+    """
+    if minutes is None:
+        return None
+    passed = (time.monotonic() - begin) / 60.0
+    if (left := (1.0 - FOR_FILES) * minutes - passed) <= 0.0:
+        raise ValueError(f"minutes={minutes:g} is too short: reading and auditing the data took {passed:.2g} minutes")
+    return left
+
+
+def audit_data(cfg: DictConfig, recording: Recording, simulation: Simulation) -> Audit | None:
     """Audit the data, print the findings, and stop at severe ones; None with ``audit=false``.
 
     Raises:
@@ -116,8 +147,8 @@ def audited(cfg: DictConfig, recording: Recording, simulation: Simulation) -> Au
     return found
 
 
-def print_report(report: Report, directory: Path) -> None:
-    """Print the result in words, tables of its effects and errors, and the paths of the files written."""
+def print_result(report: Report) -> None:
+    """Print the result in words, and tables of its effects and errors."""
     print("", *sentences(report), f"\ndata       {report.data.source}", sep="\n")
     if report.found:
         print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
@@ -134,6 +165,10 @@ def print_report(report: Report, directory: Path) -> None:
         print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
         for dimension in report.error.per_dimension:
             print(f"{dimension.name:<48}{dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
+
+
+def print_files(report: Report, directory: Path) -> None:
+    """Print the paths of the files written, and commands that use them."""
     folder = os.path.relpath(directory)
     print(f"\nresults    {folder}/report.json\nreport     {folder}/report.html")
     mended = report.mended_model

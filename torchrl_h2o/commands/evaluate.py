@@ -1,11 +1,14 @@
 """Replays a trained policy: prints its returns in reality or the simulator and writes a film or PNG frames.
 
+The files go into the run's folder, or into the working directory if that folder cannot be written.
+
 h2o-evaluate checkpoint=outputs/wheel_legged/...                    # reality, with a film
 h2o-evaluate checkpoint=... in=simulator episodes=10 film=null
 h2o-evaluate checkpoint=... method="SAC in the simulator" film=frames   # a folder of PNG files
 """
 
 import json
+import os
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -26,6 +29,7 @@ WORLDS = {"reality": make_reality, "simulator": make_simulator}
 @hydra_main("../config", "evaluate", EvaluateOptions)
 def main(options: DictConfig) -> None:
     directory, world = Path(options.checkpoint), options["in"]
+    folder = directory if os.access(directory, os.W_OK) else Path.cwd()
     cfg = load_config(directory, trust=options.trust)
     check_options(cfg, TrainOptions, saved=True)
     method = options.method or method_named(cfg.get("method", "h2o_plus")).title
@@ -34,9 +38,9 @@ def main(options: DictConfig) -> None:
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]
     print(f"{method} in {world}: return {result.mean:.1f} ± {result.std:.1f}, episodes of {seconds} s")
     summary = {"method": method, "in": world, "seed": options.seed, **result.summary()}
-    write_text(directory / "evaluation.json", json.dumps(summary | {"returns": result.returns}, indent=2) + "\n")
+    write_text(folder / "evaluation.json", json.dumps(summary | {"returns": result.returns}, indent=2) + "\n")
     if options.film is not None:
-        path = directory / options.film
+        path = folder / options.film
         task, preprocessing = task_of(cfg), preprocessing_of(cfg)
         film(task, preprocessing, policy, path, simulator=world == "simulator", seconds=options.seconds)
         print(f"film: {path}")

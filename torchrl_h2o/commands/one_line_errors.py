@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dis
+import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
+_OF_THE_DISK = {errno.EACCES, errno.EDQUOT, errno.EFBIG, errno.ENOSPC, errno.EPERM, errno.EROFS}
 _RAISE = dis.opmap["RAISE_VARARGS"]  # the bytecode of a raise statement
 _PACKAGE = Path(__file__).resolve().parents[1]
 _OWN_FOLDERS = (_PACKAGE, _PACKAGE.with_name("recipes"))
@@ -42,7 +44,8 @@ def one_line_errors() -> Iterator[None]:
         if full or not is_expected(error):
             raise
         message, _, _ = str(error).partition("Config search path:")  # Hydra's list of places inside the package
-        sys.stderr.write(f"{type(error).__name__}: {' '.join(message.split())}\n")
+        remedy = "; make room, or choose a folder that can be written" if of_the_disk(error) else ""
+        sys.stderr.write(f"{type(error).__name__}: {' '.join(message.split())}{remedy}\n")
         sys.exit(1)
 
 
@@ -54,15 +57,20 @@ def asks_for_tracebacks() -> bool:
 def is_expected(error: Exception) -> bool:
     """Whether an error tells the user what to correct, rather than the developer.
 
-    These are Hydra's errors of the configuration, DataError, and ValueError, OSError and ArithmeticError (a training
-    that diverges) if a ``raise`` statement of this package or of its recipes raised them. A ValueError that NumPy
-    raises is a bug.
+    These are Hydra's errors of the configuration, DataError, an OSError of a disk that is full or may not be written,
+    and ValueError, OSError and ArithmeticError (a training that diverges) if a ``raise`` statement of this package or
+    of its recipes raised them. A ValueError that NumPy raises is a bug.
     """
     from torchrl_h2o.data import DataError
 
-    if isinstance(error, HydraException | OmegaConfBaseException | DataError):
+    if isinstance(error, HydraException | OmegaConfBaseException | DataError) or of_the_disk(error):
         return True
     return isinstance(error, ValueError | OSError | ArithmeticError) and _is_raised_here(error)
+
+
+def of_the_disk(error: Exception) -> bool:
+    """Whether an error says that a disk is full, or that a file or folder may not be written."""
+    return isinstance(error, OSError) and error.errno in _OF_THE_DISK
 
 
 def _is_raised_here(error: Exception) -> bool:

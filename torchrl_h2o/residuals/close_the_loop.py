@@ -25,7 +25,7 @@ from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.offered import offered_entries
-from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar
+from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -63,8 +63,8 @@ def close_the_loop(
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
         seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
         progress: whether to show a progress bar.
-        minutes: time for the search, more than 0; its result until then is judged and reported. None for as long as it
-            takes. The step under way, a last fit of the effects found, and the report come after it.
+        minutes: time for all of it, more than 0: the search ends early enough for its result to be fitted and judged,
+            and what could not be judged in time is named in the report. None for as long as it takes.
         audit: findings of :func:`torchrl_h2o.data.audit`, for the report.
         known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
         so_far: called with an unfinished report whenever an effect has been found and after each stage.
@@ -75,7 +75,8 @@ def close_the_loop(
 
     Raises:
         DataError: if the data do not fit the simulator.
-        ValueError: if ``minutes`` is not above 0, or the simulator's state cannot be computed from its observations.
+        ValueError: for an argument of another type or outside its bounds, or if the simulator's state cannot be
+            computed from its observations.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -89,31 +90,57 @@ def close_the_loop(
         ['gravity × 0.5']
     """
     start, cpu_start = time.perf_counter(), cpu_seconds()
-    simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
-    measured = read_measured(data, simulation, source, held_out, settings)
-    if (reason := why_no_conclusion(simulation, measured)) is not None:
-        return inconclusive_report(simulation, measured, reason, audit)
-    entries = offered_entries(simulation, measured) if catalogue is None else catalogue
+    _require_arguments(data, catalogue, held_out, seed, known)
     with LoopBar(disable=not progress, minutes=minutes) as bar:
-        evidence = gather_evidence(simulation, measured, audit=audit)
-        explanation = explain(
-            evidence,
-            entries,
-            rng=np.random.default_rng(seed),
-            progress=bar,
-            known=known,
-            so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
-            settings=settings,
-        )
-        computing = "the errors before and after were computed"
-        so_far(unfinished_report(evidence, explanation, computing))
+        simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
+        simulation = replace(simulation, check=bar.check)
+        measured = read_measured(data, simulation, source, held_out, settings)
+        begin = time.perf_counter()
+        try:
+            if (reason := why_no_conclusion(simulation, measured)) is not None:
+                return inconclusive_report(simulation, measured, reason, audit)
+            bar.keep_for_report(time.perf_counter() - begin)
+            entries = offered_entries(simulation, measured) if catalogue is None else catalogue
+            evidence = gather_evidence(simulation, measured, audit=audit)
+            explanation = explain(
+                evidence,
+                entries,
+                rng=np.random.default_rng(seed),
+                progress=bar,
+                known=known,
+                so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
+                settings=settings,
+            )
+        except OutOfTimeError as end:
+            reason = f"the time was up while {end}, before there was a first result; give more minutes"
+            return inconclusive_report(simulation, measured, reason, audit)
+        so_far(unfinished_report(evidence, explanation, "the errors before and after were computed"))
         bar.stage(REPORT)
-        one_more = partial(bar.closer, 1.0 / max(1, len(entries)))
-        judgement = judge(evidence, explanation, entries, seed=seed, advance=one_more, settings=settings)
+        judgement = judge(evidence, explanation, entries, seed=seed, progress=bar, settings=settings)
         bar.finish()
         wall_s = time.perf_counter() - start
         made_by = provenance(cpu_start)
         return compose_report(evidence, explanation, judgement, wall_s=wall_s, made_by=made_by, settings=settings)
+
+
+def _require_arguments(
+    data: object, catalogue: object, held_out: float | Collection[int], seed: object, known: object
+) -> None:
+    """Raises a ValueError that names the first argument that cannot be used."""
+    share = held_out if isinstance(held_out, int | float) else 0.5
+    for right, name, value, allowed in (
+        (isinstance(data, TensorDictBase | Measured), "data", type(data), "a TensorDict of transitions, or Measured"),
+        (_are(catalogue, CatalogueEntry) or catalogue is None, "catalogue", catalogue, "a list of CatalogueEntry"),
+        (_are(known, Effect), "known", known, "a list of effects, such as [Gravity(0.9)]"),
+        (isinstance(seed, int | np.integer) and seed >= 0, "seed", seed, "a whole number, 0 or more"),
+        (0.0 < share < 1.0, "held_out", held_out, "a share above 0 and below 1, or the indices of logs"),
+    ):
+        if not right:
+            raise ValueError(f"{name}={value!r}: must be {allowed}")
+
+
+def _are(values: object, kind: type) -> bool:
+    return isinstance(values, Sequence) and all(isinstance(value, kind) for value in values)
 
 
 def read_measured(
@@ -162,7 +189,12 @@ def explain(
             return replace(before, ended_in=before.ended_in or stage)
         so_far(before, f"{what} was looked for")
         progress.stage(stage)
-        return _tried(what, before, lambda: add(simulation, measured, before, settings=settings))
+        try:
+            return add(simulation, measured, before, settings=settings)
+        except OutOfTimeError:
+            return replace(before, ended_in=stage)
+        except FAILURES as error:  # a constant action or collinear terms make the equations of a search singular
+            return before.with_failure(f"the search for {what} failed: {error}")
 
     declared = _by_catalogue(
         lambda found: trace_effects(simulation, measured, catalogue, found=found, **options),
@@ -189,14 +221,3 @@ def _by_catalogue(
         if not explanations:  # the data cannot be searched at all
             raise
         return explanations[-1].with_failure(f"the search for further effects of the catalogue failed: {error}")
-
-
-def _tried(what: str, before: Explanation, search: Callable[[], Explanation]) -> Explanation:
-    """The result of a search, or the explanation before it with the search recorded as failed.
-
-    Data without variety, such as a constant action or collinear terms, may make the equations of a search singular.
-    """
-    try:
-        return search()
-    except FAILURES as error:
-        return before.with_failure(f"the search for {what} failed: {error}")

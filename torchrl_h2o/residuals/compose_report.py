@@ -90,6 +90,7 @@ def compose_report(
         verdict=judgement.verdict,
         failures=judgement.failures,
         ended_in=explanation.ended_in,
+        left_out=judgement.left_out,
         others=tuple(
             OtherExplanation(rival.fit.effects, error, where, tuple(map(words, rival.fit.effects)))
             for rival, error, where in judgement.others

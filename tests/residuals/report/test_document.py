@@ -26,11 +26,14 @@ from torchrl_h2o.effects import (
     paper_gap,
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, mujoco_model
+from torchrl_h2o.residuals.progress import EFFECTS, OTHERS
 from torchrl_h2o.residuals.report.contents import (
+    EXPLAINED,
     FoundEffect,
     IndistinguishableGroup,
     RejectedEffect,
     TwoSample,
+    Verdict,
 )
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.errors import ErrorSummary
@@ -206,7 +209,8 @@ def test_the_file_holds_what_a_reader_of_it_looks_for():
     assert set(entries) == {
         *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "two_sample"),
         *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "made_by", "trace"),
-        *("windows", "runs", "mended_model", "verdict", "failures", "unfinished", "ended_in", "audit", "others"),
+        *("windows", "runs", "mended_model", "verdict", "failures", "unfinished", "ended_in", "left_out"),
+        *("audit", "others"),
     }
     assert {"name", "declared", "parameters", "error_after"} <= set(entries["effects"][0])
     assert entries["effects"][2]["name"] == "JointFrictionLoss[elbow]"
@@ -245,6 +249,53 @@ def test_a_report_of_an_effect_that_is_none_is_refused(tmp_path):
     path.write_text(path.read_text(encoding="utf-8").replace("Gravity", "Levity"), encoding="utf-8")
     with pytest.raises(DataError, match="Levity"):
         Report.load(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        (("runs", 0, "before"), "0.1", r"runs\.0\.before: .* not '0\.1'"),
+        (("error", "before"), [1.0], r"error\.before: "),
+        (("error", "per_dimension", 0, "after"), "small", r"error\.per_dimension\.0\.after: "),
+        (("wall_s",), "long", r"wall_s: "),
+        (("verdict", "recommended"), "yes", r"verdict\.recommended: "),
+        (("simulator",), 3, r"simulator: "),
+        (("effects", 0, "error_after"), "x" * 10_000, r"found\.0\.error_after: "),
+    ],
+)
+def test_text_among_numbers_is_refused_by_name(tmp_path, place, value, said):
+    report = dataclasses.replace(windowed(), trace=None, verdict=Verdict(EXPLAINED))
+    entries = json.loads(json.dumps(report.to_json()))
+    *above, last = place
+    part = entries
+    for key in above:
+        part = part[key]
+    part[last] = value
+    (tmp_path / "report.json").write_text(json.dumps(entries))
+    with pytest.raises(DataError, match=said) as caught:
+        Report.load(tmp_path)
+    assert len(str(caught.value)) < 300 + len(str(tmp_path))
+
+
+def test_a_file_with_deeply_nested_lists_is_refused(tmp_path):
+    (tmp_path / "report.json").write_text("[" * 200_000)
+    with pytest.raises(DataError, match="is not a report"):
+        Report.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "unfinished", [{"ended_in": EFFECTS}, {"ended_in": OTHERS}, {"unfinished": "effects were tried"}]
+)
+def test_an_unfinished_report_recommends_its_effects_nowhere(unfinished):
+    report = dataclasses.replace(full_report(), verdict=Verdict(EXPLAINED), **unfinished)
+    assert not report.recommended
+    assert report.to_json()["verdict"]["recommended"] is False
+    assert "was not finished" in report.why_not_recommended()
+    read = Report.from_json(json.loads(json.dumps({**report.to_json(), "verdict": {"kind": EXPLAINED}})))
+    assert not read.verdict.recommended
+    finished = dataclasses.replace(full_report(), verdict=Verdict(EXPLAINED))
+    assert finished.recommended
+    assert finished.to_json()["verdict"]["recommended"] is True
 
 
 def test_a_part_of_a_report_that_lacks_something_is_named(tmp_path):

@@ -24,6 +24,8 @@ def assert_read_or_refused(folder, content):
         json.dumps(report.to_json(), allow_nan=False)
         assert isinstance(report.recommended, bool)
         assert isinstance(report.sentence(), str)
+        saved = report.save(folder / "again")
+        assert Report.load(saved).to_json() == report.to_json()
 
 
 @few

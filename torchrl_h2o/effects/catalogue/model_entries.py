@@ -16,7 +16,7 @@ from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMa
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
 from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
-from torchrl_h2o.effects.model.joint import Armature, JointDamping, JointFrictionLoss, JointRange
+from torchrl_h2o.effects.model.joint import LOCKED, Armature, JointDamping, JointFrictionLoss, JointRange
 from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
 from torchrl_h2o.effects.selection import Names
 
@@ -56,7 +56,8 @@ def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         return named_choices(_joint_paths(model), joints, passed_over=passed_over, groups=groups)
 
     everything = set(range(model.njnt))
-    yield from _factors(mechanism, JointRange, "joints", chosen(limited, everything - set(limited)))
+    ranges = each("scale", *mechanism.settings.factors, LOCKED)
+    yield from entries_of(JointRange, "joints", chosen(limited, everything - set(limited)), lambda _: ranges)
     yield from _factors(mechanism, JointStiffness, "joints", chosen(sprung, everything - set(sprung)))
     yield from entries_of(JointRest, "joints", chosen(sprung, groups=False), lambda _: each("angle", 0.1, -0.1))
     yield from entries_of(JointSpring, "joints", chosen(loose), _added(mechanism.torque, "stiffness", (0.1, 1.0)))

@@ -13,13 +13,15 @@ from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.parameter import ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Names
 
+LOCKED = 0.001  # factor on a joint's range that leaves no motion
+
 
 @dataclass(frozen=True)
 class JointRange(ModelEffect):
-    """Scales both ends of the range of joints.
+    """Scales both ends of the range of joints; a joint whose range is next to nothing is locked near zero.
 
     Args:
-        scale: factor on the ends of the range.
+        scale: factor on the ends of the range; :data:`LOCKED` for a joint that does not move.
         joints: name patterns of the joints; joints without a range are skipped.
 
     Raises:
@@ -28,12 +30,14 @@ class JointRange(ModelEffect):
     Examples:
         >>> JointRange(0.5, joints="*thigh*").describe()
         'range of joints *thigh* × 0.5'
+        >>> JointRange(LOCKED, joints="*thigh*").describe()
+        'range of joints *thigh* × 0.001'
 
     Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gaps ``broken_thigh`` and ``flexible_thigh``.
     """
 
     wording: ClassVar[str] = "range of {joints} × {scale}"
-    scale: float = parameter(unit="1", bounds=(0.01, 10.0), neutral=1.0)
+    scale: float = parameter(unit="1", bounds=(LOCKED, 10.0), neutral=1.0)
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:

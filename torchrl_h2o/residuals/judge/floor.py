@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import nn
@@ -53,7 +55,7 @@ def explainable_floor(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         y = y.clamp(-CLIP, CLIP)
-        network = _trained(x, y, fitted[~stopping], fitted[stopping])
+        network = _trained(x, y, fitted[~stopping], fitted[stopping], simulation.check)
     with torch.no_grad():
         explained = network(x).double().numpy() * scale
     rest = targets - explained
@@ -80,6 +82,7 @@ def _trained(
     y: torch.Tensor,
     rows: np.ndarray | torch.Tensor,
     stopping: np.ndarray | torch.Tensor,
+    check: Callable[[], object],
 ) -> nn.Module:
     """Trains a network on some rows; keeps the weights of the epoch with the lowest loss on the stopping rows."""
     network = nn.Sequential(
@@ -90,6 +93,7 @@ def _trained(
     rows, stopping = torch.as_tensor(rows), torch.as_tensor(stopping)
     best, weights, since = torch.inf, network.state_dict(), 0
     for _ in range(EPOCHS):
+        check()
         for batch in rows[torch.randperm(len(rows))].split(BATCH):
             optimizer.zero_grad()
             nn.functional.mse_loss(network(x[batch]), y[batch]).backward()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from torchrl_h2o.residuals.judge.floor import explainable_floor
@@ -10,39 +12,50 @@ from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HorizonError
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.settings import LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 METRIC = "held-out one-step RMSE, each dimension divided by the standard deviation of its one-step change"
 
 
-def error_summary(
-    simulation: Simulation, mended: Simulation, measured: Measured, settings: LoopSettings = DEFAULTS
-) -> ErrorSummary:
-    """Summarises the held-out errors of two simulations.
+def error_summary(simulation: Simulation, mended: Simulation, measured: Measured) -> ErrorSummary:
+    """Summarises the held-out errors of two simulations, without a floor and without the errors ahead.
 
     Args:
         simulation: the simulator before the effects are put in.
         mended: the simulator with them.
         measured: the data.
-        settings: horizons.
     """
     names, units = simulation.state_map.names, simulation.state_map.units
     before, after = (_rmse(which, measured, 1) for which in (simulation, mended))
     ahead = headline_horizon(simulation, measured)
-    floor = explainable_floor(mended, measured)
     whiteness = autocorrelation(mended, measured)
-    columns = (values.tolist() for values in (before, after, floor, whiteness))
+    columns = zip(names, units, before.tolist(), after.tolist(), whiteness.tolist(), strict=True)
     return ErrorSummary(
         metric=METRIC,
         unit="1",
         before=overall_error(simulation, measured),
         after=overall_error(mended, measured),
-        floor=float(np.sqrt(np.mean((floor / spread(measured)) ** 2))),
-        per_dimension=tuple(map(DimensionError, names, units, *columns)),
-        horizons=_horizons(simulation, mended, measured, settings),
+        per_dimension=tuple(
+            DimensionError(name, unit, first, last, autocorrelation=white) for name, unit, first, last, white in columns
+        ),
         headline=None if ahead is None else headline_error(simulation, mended, measured, ahead),
     )
+
+
+def with_horizons(
+    error: ErrorSummary, simulation: Simulation, mended: Simulation, measured: Measured, settings: LoopSettings
+) -> ErrorSummary:
+    """The summary with the errors several steps ahead."""
+    return replace(error, horizons=_horizons(simulation, mended, measured, settings))
+
+
+def with_floor(error: ErrorSummary, mended: Simulation, measured: Measured) -> ErrorSummary:
+    """The summary with the estimated error of the best possible model."""
+    floor = explainable_floor(mended, measured)
+    per_dimension = (replace(one, floor=value) for one, value in zip(error.per_dimension, floor.tolist(), strict=True))
+    overall = float(np.sqrt(np.mean((floor / spread(measured)) ** 2)))
+    return replace(error, floor=overall, per_dimension=tuple(per_dimension))
 
 
 def overall_error(simulation: Simulation, measured: Measured) -> float:

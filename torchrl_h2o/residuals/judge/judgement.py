@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, is_negligible
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
-from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error
+from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error, with_floor, with_horizons
 from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
@@ -23,6 +25,7 @@ from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outsid
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
+from torchrl_h2o.residuals.progress import REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.contents import NOT_EXPLAINED, NOTHING_MISSING, UNDECIDED, TwoSample, Verdict
 from torchrl_h2o.residuals.report.errors import ErrorSummary
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
@@ -59,32 +62,34 @@ class Judgement:
     Args:
         measured: the data, without the intervals of remaining disturbances.
         disturbed: the remaining disturbances.
-        error: errors before and after.
+        error: errors before and after; None if there was no time to compute them.
         errors_after: for each part, the error with the effects up to and including it.
         rejected: attempts that are not part of the explanation, and the error with each of them alone.
         alternatives: an entry for each part that has alternatives.
         two_sample: AUC of a classifier before and after.
-        trace: the residual over time.
+        trace: the residual over time; None if there was no time.
         windows: worst, median and best window, measured against simulated.
         runs: error of each run.
         verdict: what these figures say.
         failures: attempts that failed with an error, and why.
         others: error and separating data of each other set of effects that explains the data as well.
+        left_out: parts that were not computed because the time was up, in words.
     """
 
     measured: Measured
     disturbed: tuple[OutsideInterval, ...]
-    error: ErrorSummary
+    error: ErrorSummary | None
     errors_after: tuple[float, ...]
     rejected: tuple[tuple[Attempt, float], ...]
     alternatives: tuple[Alternatives, ...]
     two_sample: TwoSample
-    trace: ResidualTrace
+    trace: ResidualTrace | None
     windows: tuple[ShownWindow, ...]
     runs: tuple[RunError, ...]
     verdict: Verdict
     failures: tuple[str, ...] = ()
     others: tuple[tuple[RivalSet, float, str], ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 def judge(
@@ -92,8 +97,8 @@ def judge(
     explanation: Explanation,
     catalogue: Sequence[CatalogueEntry] = (),
     *,
+    progress: LoopBar,
     seed: int = 0,
-    advance: Callable[[], object] = lambda: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Judgement:
     """Judges an explanation on data that no fit has used.
@@ -103,53 +108,110 @@ def judge(
         explanation: the effects.
         catalogue: the effects that were tried; where nothing is missing, the verdict names those of a usual size that
             the data could not have shown.
+        progress: the time for the report; what it does not allow is left out and named in ``left_out``.
         seed: seed of the classifiers.
-        advance: called after each entry of the catalogue that is judged.
         settings: horizons, significance level and the classifier's updates.
 
     Returns:
         The held-out figures and the verdict.
     """
-    simulation, effects = evidence.simulation, explanation.effects
-    disturbed = _remaining_disturbances(evidence, explanation)
-    measured = without_intervals(evidence.measured, disturbed)
+    simulation, effects, optional = evidence.simulation, explanation.effects, progress.within_time
     mended = simulation.with_effects(*_without_noise(effects))
-    error = error_summary(simulation, mended, measured, settings)
-    # random effects are drawn in the two-sample test
-    two_sample = _two_sample(simulation, simulation.with_effects(*effects), measured, seed, settings)
-    rejected, failures = _rejected(simulation, measured, explanation)
-    undetermined = undetermined_values(explanation.parts, simulation.names)
-    verdict = reach_verdict(simulation, mended, measured, effects, error, two_sample, settings, undetermined)
-    if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None:
-        too_few = too_few_rows(simulation, measured, rejected, error, explanation.trace.loss)
-        verdict = replace(verdict, too_few=too_few)
-    if verdict.kind == NOTHING_MISSING and explanation.ended_in is not None:
+    disturbed = optional("disturbances", lambda: _remaining_disturbances(evidence, explanation), [])
+    measured = without_intervals(evidence.measured, disturbed)
+    error = optional("the errors", lambda: error_summary(simulation, mended, measured), None)
+    sampled = simulation.with_effects(*effects)  # random effects are drawn in the two-sample test
+    two_sample = optional(
+        "the two-sample test", lambda: _two_sample(simulation, sampled, measured, seed, settings), TwoSample()
+    )
+    verdict = optional(
+        "the verdict",
+        lambda: _verdict(simulation, mended, measured, explanation, error, two_sample, settings),
+        Verdict(UNDECIDED, ("the time was up before a verdict was reached",), recommended=False),
+    )
+    if verdict.kind == NOTHING_MISSING and (explanation.ended_in is not None or progress.left_out):
         verdict = replace(verdict, kind=UNDECIDED)
     if verdict.kind == NOTHING_MISSING and not explanation.failures:
-        unseen = undetectable_effects(simulation, measured, catalogue, advance, settings)
+        one_more = partial(progress.closer, 1.0 / max(1, len(catalogue)))
+        unseen = optional(
+            "effects that the data could not have shown",
+            lambda: undetectable_effects(simulation, measured, catalogue, one_more, settings),
+            (),
+        )
         verdict = replace(verdict, undetectable=tuple(effect_words(effect, simulation.names) for effect in unseen))
+    details = _details(simulation, mended, measured, explanation, error, progress, settings)
+    if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None and error is not None:
+        rejected, loss = details["rejected"], explanation.trace.loss
+        too_few = too_few_rows(simulation, measured, rejected, error, loss)
+        verdict = replace(verdict, too_few=too_few)
     return Judgement(
         measured=measured,
         disturbed=tuple(disturbed),
-        error=error,
-        errors_after=tuple(
-            overall_error(simulation.with_effects(*_without_noise(effects[: index + 1])), measured)
-            for index in range(len(effects))
-        ),
-        rejected=rejected,
-        alternatives=tuple(
-            _alternatives(simulation, measured, effects, index, part.alike)
-            for index, part in enumerate(explanation.parts)
-            if part.alike
-        ),
         two_sample=two_sample,
-        trace=_residual_trace(simulation, mended, measured),
-        windows=shown_windows(simulation, mended, measured, _shown_steps(error, simulation)),
-        runs=run_errors(simulation, mended, measured),
         verdict=verdict,
-        failures=(*explanation.failures, *failures),
-        others=_others(simulation, mended, measured, explanation),
+        left_out=tuple(progress.left_out),
+        **details,
     )
+
+
+def _details(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    explanation: Explanation,
+    error: ErrorSummary | None,
+    progress: LoopBar,
+    settings: LoopSettings,
+) -> dict[str, Any]:
+    """The fields of a judgement that the verdict does not need, the most useful ones first, as far as there is time."""
+    effects, optional = explanation.effects, progress.within_time
+    unknown = (math.nan,) * len(effects)
+    errors_after = optional("errors of each effect", lambda: _errors_after(simulation, effects, measured), unknown)
+    alternatives = optional("errors of alternatives", lambda: _all_alternatives(simulation, measured, explanation), ())
+    others = optional("other sets", lambda: _others(simulation, mended, measured, explanation), ())
+    if error is not None:
+        error = optional("errors ahead", partial(with_horizons, error, simulation, mended, measured, settings), error)
+        error = optional("the floor", partial(with_floor, error, mended, measured), error)
+    steps = _shown_steps(error, simulation)
+    windows = optional("windows", lambda: shown_windows(simulation, mended, measured, steps), ())
+    runs = optional("errors by run", lambda: run_errors(simulation, mended, measured), ())
+    trace = optional("the residual over time", lambda: _residual_trace(simulation, mended, measured), None)
+    rejected, failures = optional(
+        "errors of rejected effects", lambda: _rejected(simulation, measured, explanation), ((), ())
+    )
+    return {
+        "error": error,
+        "errors_after": errors_after,
+        "alternatives": alternatives,
+        "others": others,
+        "windows": windows,
+        "runs": runs,
+        "trace": trace,
+        "rejected": rejected,
+        "failures": (*explanation.failures, *failures),
+    }
+
+
+def _verdict(
+    simulation: Simulation,
+    mended: Simulation,
+    measured: Measured,
+    explanation: Explanation,
+    error: ErrorSummary | None,
+    two_sample: TwoSample,
+    settings: LoopSettings,
+) -> Verdict:
+    if error is None:
+        raise OutOfTimeError(REPORT)  # the verdict is read from the errors
+    undetermined = undetermined_values(explanation.parts, simulation.names)
+    effects = explanation.effects
+    return reach_verdict(simulation, mended, measured, effects, error, two_sample, settings, undetermined)
+
+
+def _errors_after(simulation: Simulation, effects: tuple[Effect, ...], measured: Measured) -> tuple[float, ...]:
+    """For each effect, the error with the effects up to and including it."""
+    counts = range(1, len(effects) + 1)
+    return tuple(overall_error(simulation.with_effects(*_without_noise(effects[:n])), measured) for n in counts)
 
 
 def too_few_rows(
@@ -184,9 +246,9 @@ def too_few_rows(
     )
 
 
-def _shown_steps(error: ErrorSummary, simulation: Simulation) -> int | None:
+def _shown_steps(error: ErrorSummary | None, simulation: Simulation) -> int | None:
     """Control steps of the windows that the report shows: those of its sentence."""
-    return None if error.headline is None else round(error.headline.seconds / simulation.control_step)
+    return None if error is None or error.headline is None else round(error.headline.seconds / simulation.control_step)
 
 
 def _remaining_disturbances(evidence: Evidence, explanation: Explanation) -> list[OutsideInterval]:
@@ -217,6 +279,14 @@ def _rejected(
             failures.append(f"{words} cannot be put into the model alone: {reason}")
         rejected.append((attempt, error))
     return tuple(rejected), tuple(failures)
+
+
+def _all_alternatives(simulation: Simulation, measured: Measured, explanation: Explanation) -> tuple[Alternatives, ...]:
+    return tuple(
+        _alternatives(simulation, measured, explanation.effects, index, part.alike)
+        for index, part in enumerate(explanation.parts)
+        if part.alike
+    )
 
 
 def _alternatives(

@@ -60,6 +60,7 @@ def two_sample_auc(
         loss = DynamicsRatioLoss(estimator)
         optimiser = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=1e-2, fused=True)
         for _ in range(settings.classifier_updates):
+            simulation.check()
             losses = loss(train[torch.randint(len(train), (CLASSIFIER_BATCH,))])
             optimiser.zero_grad()
             (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()

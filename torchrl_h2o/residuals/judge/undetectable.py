@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 
 from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.effects.model.joint import LOCKED, JointRange
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -100,6 +101,7 @@ def _largest(entry: CatalogueEntry) -> list[Effect]:
         return list(entry.starts)
     [name] = entry.fitted
     values, neutral = [trial[name] for trial in entry.trials], entry.effect.parameters[name].neutral
+    values = [value for value in values if not isinstance(entry.effect, JointRange) or value > LOCKED]
     least, most = min(values), max(values)
     ends = [least] if least < neutral else []
     ends += [most] if math.isfinite(neutral) and most > neutral else []

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import mannwhitneyu
 
-from torchrl_h2o.effects import Effect, selection
+from torchrl_h2o.effects import Effect, JointRange, selection
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
 from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
 from torchrl_h2o.residuals.judge.friction_beside_noise import friction_beside_noise
@@ -285,6 +285,8 @@ def _lowers_the_error(
 def _why_implausible(effect: Effect) -> str:
     """Why a value is implausible: a factor far from one, or a fit that ended at a bound; empty if it is plausible."""
     for parameter in effect.parameters.values():
+        if isinstance(effect, JointRange):
+            continue  # a joint may be locked, which is a range of next to nothing
         if parameter.neutral == 1.0:  # a factor; a reversed sensor or motor has -1
             if not 1.0 / EXTREME_FACTOR < abs(parameter.value) < EXTREME_FACTOR:
                 return "implausibly far from the model's value"

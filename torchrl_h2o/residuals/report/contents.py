@@ -1,7 +1,7 @@
 """Contents of a report as plain data: the effects that a simulator lacks, their intervals, and the held-out errors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torchrl_h2o.data.audit import Audit
@@ -152,7 +152,8 @@ class Verdict:
     Args:
         kind: one of :data:`VERDICTS`.
         reasons: figures that the kind follows from, in words.
-        recommended: whether the effects should be put into a simulator for training.
+        recommended: whether the effects should be put into a simulator for training; in a report, False also if there
+            are no effects or the search was not finished.
         where: when and at which states the unexplained part is largest; empty if nothing is unexplained.
         caveats: sentences on effects that may have another cause than the one they are named after, or another value.
         undetectable: where nothing is missing, effects that the data could not have shown, in words; one of each kind
@@ -237,6 +238,7 @@ class ReportContents:
         failures: attempts that failed with an error, and why.
         unfinished: stage in which the run stopped or was when the report was written; None for a finished report.
         ended_in: stage in which the time for the search was up, or which did not begin for that; None if all ended.
+        left_out: parts of the report that were not computed because the time was up, in words.
         audit: findings of the audit of the data; None if it was not audited.
         windows: worst, median and best window by the error with the effects, measured against simulated.
         runs: error of each run.
@@ -264,6 +266,7 @@ class ReportContents:
     failures: tuple[str, ...] = ()
     unfinished: str | None = None
     ended_in: str | None = None
+    left_out: tuple[str, ...] = ()
     audit: Audit | None = None
     windows: tuple[ShownWindow, ...] = ()
     runs: tuple[RunError, ...] = ()
@@ -276,6 +279,8 @@ class ReportContents:
                 f"a report with {len(self.found)} effects has a reason for no conclusion ({self.conclusion!r}); "
                 "set conclusion=None, or leave out the effects"
             )
+        if self.verdict is not None and self.verdict.recommended != self.recommended:
+            object.__setattr__(self, "verdict", replace(self.verdict, recommended=self.recommended))
 
     @property
     def effects(self) -> tuple[Effect, ...]:

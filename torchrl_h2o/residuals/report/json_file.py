@@ -4,10 +4,12 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.data.readers.error import DataError
@@ -58,14 +60,26 @@ def read_json(path: str | Path, build: Callable[[Mapping[str, Any]], Read]) -> R
     try:
         read = build(json.loads(path.read_text(encoding="utf-8")))
         # an entry of a wrong type would otherwise show itself only where it is used
+        _types_of(type(read)).validate_python(read, strict=True)
         json.dumps(report_to_json(read), allow_nan=False)
         return read
     except OSError as error:
         raise DataError(f"cannot be read ({error.strerror})", remedy, source=path) from error
     except KeyError as error:
         raise DataError(f"is not a report: it lacks {error}", remedy, source=path) from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where, problem = ".".join(map(str, first["loc"])), f"{first['msg']}, not {str(first['input'])[:50]!r}"
+        raise DataError(f"is not a report: {where}: {problem}", remedy, source=path) from error
     except Exception as error:  # whatever it is that fails with entries of wrong types
         raise DataError(f"is not a report: {error}", remedy, source=path) from error
+
+
+@cache
+def _types_of(report: type) -> TypeAdapter:
+    """Checks the types of all entries of a report."""
+    allowed = ConfigDict(arbitrary_types_allowed=True, revalidate_instances="always", defer_build=False)
+    return TypeAdapter(with_config(allowed)(report))
 
 
 def report_to_json(report: ReportContents) -> dict[str, Any]:
@@ -109,6 +123,7 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "audit": None if report.audit is None else report.audit.to_dict(),
             "unfinished": report.unfinished,
             "ended_in": report.ended_in,
+            "left_out": report.left_out,
             "two_sample": dataclasses.asdict(report.two_sample),
             "unexplained_intervals": [dataclasses.asdict(interval) for interval in report.unexplained_intervals],
             "data": dataclasses.asdict(report.data),
@@ -145,6 +160,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "audit": None if entries.get("audit") is None else Audit.from_dict(entries["audit"]),
         "unfinished": entries.get("unfinished"),
         "ended_in": entries.get("ended_in"),
+        "left_out": tuple(entries.get("left_out", ())),
         "two_sample": _read(TwoSample, entries["two_sample"]),
         "unexplained_intervals": tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
         "data": _read(DataSummary, entries["data"]),

@@ -42,12 +42,14 @@ def sentences(report: ReportContents) -> list[str]:
     """The result in words, and what qualifies it.
 
     Returns:
-        The result; whether the time for the search was up before its end; other effects that these data cannot rule
-        out; effects that may have another cause or value; what the effects found do not explain; where nothing is
-        missing, effects that the data could not have shown; and severe faults of the data, or warnings that the data do
-        not fit the model. Those that do not apply are left out.
+        The result; whether the time was up before the end of the search, or of the report; other effects that these
+        data cannot rule out; effects that may have another cause or value; what the effects found do not explain; where
+        nothing is missing, effects that the data could not have shown; and severe faults of the data, or warnings that
+        the data do not fit the model. Those that do not apply are left out.
     """
     words = _verdict_words(report)
+    if report.left_out:
+        words.append(f"The time was up before these parts of the report were computed: {listed(report.left_out)}.")
     if report.audit is not None and report.audit.severe:
         faults = "; ".join(finding.words for finding in report.audit.severe)
         words.append(f"Do not rely on this: the data are faulty ({faults}).")
@@ -84,7 +86,8 @@ def _verdict_words(report: ReportContents) -> list[str]:
         lacks = "The best explanation so far" if report.preliminary else "Your simulator lacks"
         return [f"{lacks}: {_joined(words, error)}.", *ended, *_alternatives_words(report), *caveats, *rest]
     if kind == UNDECIDED:
-        return [f"{_joined('Nothing was found so far, and no test shows that something is missing', error)}.", *ended]
+        reasons = (report.verdict and report.verdict.reasons) or ("no test shows that something is missing",)
+        return [f"{_joined(f'Nothing was found so far, and {reasons[0]}', error)}.", *ended]
     nothing = f"Nothing is missing: {_joined('the effects tried explain no more than chance', error)}."
     return [nothing, *_undetectable_words(report.verdict)]
 

@@ -33,6 +33,8 @@ from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, Simul
 from torchrl_h2o.residuals.simulation.source import SimulatorSource
 from torchrl_h2o.residuals.simulation.state_map import StateMap
 
+STEPS_BETWEEN_CHECKS = 50_000  # physics steps, about a second for a robot with twelve joints
+
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
@@ -48,6 +50,7 @@ class Simulation:
         name: the name for reports.
         action_units: units of the action's entries, (nu), for reports; empty if they are not known.
         settings: tolerances and limits.
+        check: called before every few thousand simulated steps; it raises to end a computation whose time is up.
 
     Examples:
         >>> from torchrl.envs import GymEnv
@@ -65,6 +68,7 @@ class Simulation:
     name: str = "simulator"
     action_units: tuple[str, ...] = ()
     settings: SimulationSettings = SIMULATION_SETTINGS
+    check: Callable[[], object] = field(default=lambda: None, repr=False)
     _pool: Rollout = field(default_factory=lambda: Rollout(nthread=cpu_count()), repr=False)
 
     @classmethod
@@ -237,7 +241,9 @@ class Simulation:
         batch, horizon, _ = actions.shape
         full = self._full(states, np.zeros(batch) if time is None else time, activations, actions[:, 0])
         forces = self.pipeline.batched_forces(self.model)
-        chunk = max(1, self.settings.rollout_numbers // (horizon * self.frame_skip * full.shape[-1]))
+        physics_steps = horizon * self.frame_skip
+        numbers = self.settings.rollout_numbers // full.shape[-1]
+        chunk = max(1, min(numbers, STEPS_BETWEEN_CHECKS) // physics_steps)
         parts = []
         with _no_warnings:
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
@@ -297,6 +303,7 @@ class Simulation:
         applied: np.ndarray | None = None,
     ) -> np.ndarray:
         """States (B, H, nq + nv) after each control step from full physics states (B, size); NaN where it diverges."""
+        self.check()
         pool, data = self._workers
         reached = roll_out(pool, self.model, data, full, actions, self.frame_skip, forces=forces, applied=applied)
         # MuJoCo resets a simulation and its clock if the state is not finite or too large

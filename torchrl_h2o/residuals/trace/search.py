@@ -67,6 +67,9 @@ def trace_effects(
     Returns:
         The effects found, the other effects tried, and equivalent alternatives; those found so far if the time of
         ``progress`` is up.
+
+    Raises:
+        OutOfTimeError: if the time is up before the search has begun.
     """
     progress.stage(EFFECTS)
     horizon = choose_horizon(simulation, measured, rng, settings)
@@ -86,11 +89,14 @@ def trace_effects(
         )
     except OutOfTimeError as end:
         ended_in = str(end)
-    best = _fitted_to_all(_divided_in_longer_windows(best, catalogue, rng))
+    progress.begin_last_fit()
     try:
+        if ended_in is None:
+            best = _divided_in_longer_windows(best, catalogue, rng)
+        best = _fitted_to_all(best)
         other = None if ended_in else replaced_by_forces(best, catalogue, rng, progress)
-    except OutOfTimeError as end:
-        other, ended_in = None, str(end)
+    except OutOfTimeError as end:  # the values stay those of the search's windows
+        other, ended_in = None, ended_in or str(end)
     if other is not None:
         return replace(_outcome(other), by_forces=True)
     return replace(_outcome(best), others=others, ended_in=ended_in)
