@@ -23,6 +23,7 @@ from torchrl_h2o.comparison.grids import check_overrides, chosen_grid, group_nam
 from torchrl_h2o.comparison.launching import GridLauncher, shared_overrides
 from torchrl_h2o.comparison.options import PaperOptions
 from torchrl_h2o.comparison.recorded_run import train_grid_run
+from torchrl_h2o.comparison.results_file import RESULTS
 from torchrl_h2o.options.types import why_unavailable
 
 ON_THIS_MACHINE = ("basic", "joblib")  # Hydra's launchers that train here
@@ -34,7 +35,7 @@ def main(cfg: DictConfig) -> None:
     if launcher in ON_THIS_MACHINE and (problem := why_unavailable(cfg.device)):
         raise ValueError(f"device={cfg.device}: {problem}, or a launcher of machines that have one")
     shared = shared_overrides(HydraConfig.get().overrides.task)
-    results = Path(cfg.results or Path(__file__).parent / "results" / f"{group_name(cfg)}.csv").resolve()
+    results = Path(cfg.results or RESULTS / f"{group_name(cfg)}.csv").resolve()
     runs = list(chosen_grid(cfg).runs(tuple(cfg.seeds)))
     check_overrides(shared, runs)
     grid = GridLauncher.of_this_job(results, shared, train_grid_run)

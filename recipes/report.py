@@ -1,4 +1,4 @@
-"""Makes tables and figures of the results in recipes/results/, with the paper's numbers for comparison.
+"""Makes tables and figures of the results of paper.py in outputs/results/, beside the paper's own numbers.
 
 python recipes/report.py                              # all groups with results
 python recipes/report.py groups=[returns] updates=50000
@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.comparison.grids import FIGURES, TABLES
 from torchrl_h2o.comparison.options import ReportOptions
-from torchrl_h2o.comparison.results_file import read_rows, require_groups
+from torchrl_h2o.comparison.results_file import RESULTS, read_rows, require_groups
 from torchrl_h2o.comparison.robot_figures import draw_robot
 from torchrl_h2o.comparison.robot_trajectories import kept_results
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
@@ -27,7 +27,7 @@ from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_siz
 
 @hydra_main("config", "report", ReportOptions)
 def main(cfg: DictConfig) -> None:
-    results = Path(cfg.results or Path(__file__).parent / "results")
+    results, paper = Path(cfg.results or RESULTS), read_rows(Path(__file__).with_name("paper.csv"))
     to = Path(cfg.to or results)
     require_groups(results, [*cfg.groups, *cfg.by_seed], TABLES | FIGURES)
     references = REFERENCES | {env: tuple(returns) for env, returns in cfg.references.items()}
@@ -35,14 +35,14 @@ def main(cfg: DictConfig) -> None:
     for group in cfg.groups:
         try:
             rows = of_one_budget(read_rows(results / f"{group}.csv"), cfg.updates, group)
-            if not rows:
+            if not len(rows):
                 asked = "" if cfg.updates is None else f" of {cfg.updates} updates"
                 print(f"{group}: no run{asked} in {results / group}.csv")
                 continue
             if group == "data_size":
                 report_data_size(rows, to, cfg.reps)
                 continue
-            report(group, rows, results, to, references, cfg.reps)
+            report(group, rows, results, to, references, paper, cfg.reps)
         except MixedRunsError as error:
             refused.append(str(error))
             continue

@@ -59,7 +59,8 @@ class Case:
         return with_torque_noise(data, self.torque_noise, self.seed) if self.torque_noise else data
 
     @property
-    def truth_in_words(self) -> str:
+    def words(self) -> str:
+        """The true effects in words."""
         return ", ".join(effect.describe() for effect in self.truth) or "nothing"
 
 

@@ -1,43 +1,52 @@
 """Measures how often close_the_loop finds randomly drawn effects from a simulator and data.
 
-python recipes/benchmarks/close_the_loop.py                                    # the whole table, some hours
+python recipes/benchmarks/close_the_loop.py                                    # all families, some hours
 python recipes/benchmarks/close_the_loop.py cases=[paper16,nothing] draws=3
-python recipes/benchmarks/close_the_loop.py cases=[several] numbers=[7]        # one case again
-python recipes/benchmarks/close_the_loop.py logs=path/to/logs                  # with the two real robots
+python recipes/benchmarks/close_the_loop.py cases=[several] numbers=[7] minutes=5     # one case, a limited search
 
-Writes results.json, results.csv (one row per case) and each case's report.html to the run's folder.
+Writes a record of each case and its report.html to outputs/benchmark/close_the_loop. Cases that the same commit has
+recorded there are skipped, so an interrupted benchmark goes on. `recipes/results/make.py store` stores the records.
 """
 
 from pathlib import Path
 
-from families import choose_families
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
-from options import CloseTheLoopBenchmarkOptions
-from results_table import print_speed, print_table
-from running import Job, run_all
-from speed import steps_per_second
-from systems import SYSTEMS
+from options import read_options
+from running import FAMILIES, TABLE, Job, run_all, table
+from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
-from torchrl_h2o.commands.hydra_main import hydra_main
-from torchrl_h2o.residuals import Simulation, close_the_loop
+from torchrl_h2o.comparison.records import read_records
+from torchrl_h2o.options.nearest import did_you_mean
+from torchrl_h2o.residuals import close_the_loop
 
 
-@hydra_main("../config", "close_the_loop_benchmark", CloseTheLoopBenchmarkOptions)
-def main(cfg: DictConfig) -> None:
-    directory = Path(HydraConfig.get().runtime.output_dir)
-    logs = None if cfg.logs is None else Path(cfg.logs).resolve()
-    families = choose_families(cfg.cases, logs)
+def main() -> None:
+    cfg = read_options(
+        cases=list(FAMILIES),
+        draws=None,  # cases of each family; None for all
+        numbers=None,  # only these cases, such as [3,7]
+        seed=0,
+        minutes=None,  # most minutes of a search
+        processes=2,
+        folder="outputs/benchmark/close_the_loop",
+    )
+    for unknown in set(cfg.cases) - set(FAMILIES):
+        raise SystemExit(f"cases=[{unknown}]: choose from {', '.join(FAMILIES)}{did_you_mean(unknown, FAMILIES)}")
     jobs = [
-        Job(name, number, cfg.seed, directory, logs)
-        for name, family in families.items()
-        for number in (cfg.numbers if cfg.numbers is not None else range(min(family.size, cfg.draws or family.size)))
-        if number < family.size
+        Job(name, number, cfg.seed, cfg.minutes)
+        for name in cfg.cases
+        for number in cfg.numbers or range(min(FAMILIES[name].size, cfg.draws or FAMILIES[name].size))
+        if number < FAMILIES[name].size
     ]
-    rows = run_all(jobs, cfg.processes, close_the_loop)
-    print_table(families, rows, directory)
-    print_speed(rows, steps_per_second(Simulation.from_env(SYSTEMS["HalfCheetah"].env())), cfg.processes)
+    folder = Path(cfg.folder)
+    done = {record.name: record for record in read_records(folder, TABLE) if record.is_current}
+    records = [done[job.name] for job in jobs if job.name in done]
+    with tqdm(total=len(jobs), initial=len(records), unit=" cases") as bar:
+        for record in run_all([job for job in jobs if job.name not in done], cfg.processes, close_the_loop, folder):
+            records.append(record)
+            bar.set_postfix_str(f"{sum(r.values['ok'] for r in records)} of {len(records)} passed; {record.name}")
+            bar.update()
+    print(f"\n{table(records)}\n\nresults    {folder}/{TABLE}, {folder}/reports")
 
 
 if __name__ == "__main__":

@@ -6,34 +6,33 @@ python recipes/benchmarks/corruptions.py systems=[HalfCheetah] numbers=[7]    # 
 A damage is written into a CSV file, which is read and audited like any other log. It is right if the reader refuses
 the file, or if the audit has a severe finding or a warning of the check that is responsible. A good log, with or
 without a dynamics gap and 1 % sensor noise, must have no severe finding. ``logs`` is the folder of the real logs;
-without it, only the recorded system is damaged. Writes corruptions.csv to the run's folder.
+without it, only the recorded system is damaged. Writes a record for each log and seed to
+outputs/benchmark/corruptions and skips those that the same commit has recorded there.
 """
 
-import csv
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from corruption_cases import CORRUPTIONS, Corruption
 from corruption_controls import drawn_controls, real_controls
 from corruption_logs import DamagedLog, GoodLog, good_log
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from options import CorruptionsOptions
+from options import read_options
 from tensordict import TensorDict
 from torchrl import torchrl_logger
 from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
-from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.data import Audit, DataError, audit
+from torchrl_h2o.provenance import cpu_seconds
 from torchrl_h2o.residuals import Simulation
-from torchrl_h2o.whole_file import whole_file
 
-COLUMNS = ("system", "number", "corruption", "seed", "right", "outcome", "check", "severity", "words", "warnings")
-TIMES = ("wall_s", "cpu_s")
+TABLE = "audit"
 
 
 def judge(good: GoodLog, number: int, corruption: Corruption, seed: int, folder: Path) -> dict:
@@ -71,77 +70,60 @@ def verdict(found: Audit, checks: tuple[str, ...]) -> dict:
     return {"right": bool(named), "outcome": "named" if named else "missed", **details}
 
 
-def damaged_rows(cfg: DictConfig, folder: Path) -> Iterator[dict]:
-    for system in cfg.systems:
-        good = good_log(system, None if cfg.logs is None else Path(cfg.logs))
-        if good is None:
-            continue
-        for number, corruption in tqdm(list(enumerate(CORRUPTIONS)), system, unit=" logs"):
-            if cfg.numbers is None or number in cfg.numbers:
-                for seed in cfg.seeds:
-                    yield judge(good, number, corruption, seed, folder)
+def damaged_rows(good: GoodLog, cfg: DictConfig, seed: int, folder: Path) -> Iterator[dict]:
+    for number, corruption in tqdm(list(enumerate(CORRUPTIONS)), f"{good.name}, seed {seed}", unit=" logs"):
+        if cfg.numbers is None or number in cfg.numbers:
+            yield judge(good, number, corruption, seed, folder)
 
 
-def control_rows(cfg: DictConfig) -> Iterator[dict]:
+def control_rows(cfg: DictConfig, logs: Path | None) -> Iterator[dict]:
     """One row per good log; right if it has no severe finding."""
-    controls = list(drawn_controls(cfg.draws))
-    if cfg.logs is not None:
-        controls += list(real_controls(Path(cfg.logs)))
-    for number, control in enumerate(tqdm(controls, "good logs", unit=" logs")):
-        transitions, simulation = control.load()
-        found, seconds = timed_audit(transitions, simulation)
+    controls = [*drawn_controls(cfg.draws), *([] if logs is None else real_controls(logs))]
+    for control in tqdm(controls, "good logs", unit=" logs"):
+        found, seconds = timed_audit(*control.load())
         worst = found.findings[0] if found.findings else None
         details = {} if worst is None else {"check": worst.check, "severity": worst.severity, "words": worst.words}
-        yield {
-            "system": control.system,
-            "number": number,
-            "corruption": f"none: {control.words}",
-            "right": not found.severe,
-            "outcome": "severe" if found.severe else "passed",
-            "warnings": len(found.warnings),
-            **seconds,
-            **details,
-        }
+        name = f"{control.system}: {control.words}"
+        right = not found.severe
+        yield {"corruption": name, "right": right, "outcome": "passed" if right else "severe", **seconds, **details}
 
 
-def save(rows: list[dict], path: Path) -> None:
-    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [*COLUMNS, *TIMES])
-        writer.writeheader()
-        writer.writerows(row | {key: f"{row[key]:.2f}" for key in TIMES} for row in rows)
+def summary(rows: list[dict]) -> dict:
+    """Numbers of logs and of right ones, the wrong ones with what the audit said, and the longest audit."""
+    wrong = [f"{row['corruption']}: {row.get('words', 'nothing found')}" for row in rows if not row["right"]]
+    counts = {outcome: sum(row["outcome"] == outcome for row in rows) for outcome in ("named", "refused", "passed")}
+    longest = max((row["cpu_s"] for row in rows), default=0.0)
+    return {"logs": len(rows), "right": len(rows) - len(wrong), **counts, "longest_cpu_s": longest, "wrong": wrong}
 
 
-def print_table(rows: list[dict]) -> None:
-    """Prints the number of right cases per system, the others, and the seconds of the audits."""
-    groups = {(row["system"], row["corruption"].startswith("none")) for row in rows}
-    print(f"\n{'logs':<44}{'right':>12}{'named':>8}{'refused':>9}{'most CPU s':>12}")
-    for system, good in sorted(groups, key=lambda group: (group[1], group[0])):
-        own = [r for r in rows if r["system"] == system and r["corruption"].startswith("none") == good]
-        right, name = sum(row["right"] for row in own), f"{system}, {'good' if good else 'damaged'}"
-        named, refused = (sum(row["outcome"] == outcome for row in own) for outcome in ("named", "refused"))
-        slowest = max(row["cpu_s"] for row in own)
-        print(f"{name:<44}{f'{right} of {len(own)}':>12}{named:>8}{refused:>9}{slowest:>12.1f}")
-    for row in rows:
-        if not row["right"]:
-            seed = f", seed {row['seed']}" if "seed" in row else ""
-            print(f"  wrong: {row['system']}, {row['corruption']}{seed}: {row.get('severity', 'nothing found')}, "
-                  f"{row.get('words', '')}")  # fmt: skip
-
-
-@hydra_main("../config", "corruptions_benchmark", CorruptionsOptions)
-def main(cfg: DictConfig) -> None:
-    directory = Path(HydraConfig.get().runtime.output_dir)
-    directory.mkdir(parents=True, exist_ok=True)
+def main() -> None:
+    cfg = read_options(
+        systems=["double_pendulum", "HalfCheetah"],
+        numbers=None,  # only these damages, such as [3,7]; None for all
+        seeds=[0],  # of the drawn joints and rows
+        draws=20,  # good logs with a drawn dynamics gap; 0 for no good logs
+        logs=None,  # folder of the real logs: double_pendulum/, simple_pendulum/, wheel_legged/, minari/
+        folder="outputs/benchmark/corruptions",
+    )
+    folder, logs = Path(cfg.folder), None if cfg.logs is None else Path(cfg.logs)
+    folder.mkdir(parents=True, exist_ok=True)
     torchrl_logger.setLevel("WARNING")  # the reader reports each of its files
-    rows = []
-    for row in damaged_rows(cfg, directory):
-        rows.append(row)
-    for row in control_rows(cfg) if cfg.draws else ():
-        rows.append(row)
-    path = directory / "corruptions.csv"
-    save(rows, path)
-    print_table(rows)
-    print(f"\nresults    {os.path.relpath(path)}")
+    parts: dict[str, Callable[[], Iterator[dict]]] = {}
+    for good in filter(None, (good_log(system, logs) for system in cfg.systems)):
+        parts |= {f"{good.name}_damaged_{seed}": partial(damaged_rows, good, cfg, seed, folder) for seed in cfg.seeds}
+    if cfg.draws:
+        parts["good_logs"] = partial(control_rows, cfg, logs)
+    done = {record.name: record for record in read_records(folder, TABLE) if record.is_current}
+    for name, rows in parts.items():
+        if name not in done:
+            start = cpu_seconds()
+            done[name] = Record.of_this_process(TABLE, name, summary(list(rows())), start)
+            done[name].save(folder)
+        found = done[name].values
+        print(f"{name:<36}{found['right']:>4} of {found['logs']} right, {found['longest_cpu_s']:.1f} CPU s at most")
+        for wrong in found["wrong"]:
+            print(f"  wrong: {wrong}")
+    print(f"\nresults    {folder}/{TABLE}")
 
 
 if __name__ == "__main__":

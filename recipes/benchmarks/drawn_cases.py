@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from cases import Case, Family
-from leg import JOINTS
-from pendulum import CONTROL_STEP, PendulumEnv
+from motored_env import LEG_JOINTS, PENDULUM_STEP, PendulumEnv
 from scoring import (
     depends_on_time,
     is_exact_set,
@@ -241,7 +240,7 @@ def slow(number: int, rng: np.random.Generator) -> Case:
         effect: Effect = JointDamping(damping, joints="pivot")
     else:
         torque = float(rng.choice([-1, 1]) * rng.uniform(*DRIFT))
-        effect = DriftingTorque(torque, "pivot", duration=Case.transitions * CONTROL_STEP)
+        effect = DriftingTorque(torque, "pivot", duration=Case.transitions * PENDULUM_STEP)
     return Case(
         name=f"pendulum {type(effect).__name__}",
         system="swinging pendulum",
@@ -271,7 +270,7 @@ def joints(number: int, rng: np.random.Generator) -> Case:
     """Dry friction and rotor inertia of a leg's three joints, which differ from joint to joint."""
     truth = tuple(
         effect
-        for joint in JOINTS
+        for joint in LEG_JOINTS
         for effect in (
             JointFrictionLoss(float(rng.uniform(*FRICTION)), joint),
             Armature(float(rng.uniform(*ARMATURE)), joint),
@@ -304,7 +303,7 @@ def judge_joints(report: Report, case: Case) -> dict:
 
 def torques(number: int, rng: np.random.Generator) -> Case:
     """Dry friction of the leg's joints, logged with the torques of noisy sensors; every fourth draw has no friction."""
-    friction = [JointFrictionLoss(float(rng.uniform(*FRICTION)), joint) for joint in JOINTS]
+    friction = [JointFrictionLoss(float(rng.uniform(*FRICTION)), joint) for joint in LEG_JOINTS]
     truth: tuple[Effect, ...] = () if number % 4 == 3 else tuple(friction)
     return Case(
         name=f"leg {number}",

@@ -1,20 +1,24 @@
-"""A mechanism with a motor at each joint as a Gymnasium task, observed by its joints' angles and velocities."""
+"""Mechanisms with a motor at each joint as Gymnasium tasks, observed by their joints' angles and velocities."""
 
+import math
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 
 NO_REWARD = 0.0  # the benchmark trains no policy
+LEG_JOINTS = ("abduction", "flexion", "knee")
+PENDULUM_STEP = 0.01  # s
 
 
 class MotoredEnv(MujocoEnv):
     """Observes angles (rad) and angular velocities (rad/s) of all joints; the actions are torques, in N·m.
 
     Args:
-        model: MJCF file of hinge joints.
+        model: name of the MJCF file, of hinge joints, beside this file.
         frame_skip: physics steps per control step.
         control_step: control step, in s.
         start_angle: largest angle of a joint at the start of an episode, in rad; angles are uniform, as are velocities
@@ -25,13 +29,11 @@ class MotoredEnv(MujocoEnv):
         "render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]
     }
 
-    def __init__(self, model: Path, frame_skip: int, control_step: float, start_angle: float) -> None:
-        self.metadata = {
-            **self.metadata,
-            "render_fps": round(1.0 / control_step),
-        }  # MujocoEnv compares it with the model
+    def __init__(self, model: str, frame_skip: int, control_step: float, start_angle: float) -> None:
+        # MujocoEnv compares the frames per second with the model
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / control_step)}
         self._start_angle = start_angle
-        super().__init__(str(model), frame_skip, None)
+        super().__init__(str(Path(__file__).with_name(model)), frame_skip, None)
         self.observation_space = Box(-np.inf, np.inf, (self.model.nq + self.model.nv,), np.float64)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -45,3 +47,25 @@ class MotoredEnv(MujocoEnv):
 
     def _get_obs(self) -> np.ndarray:
         return np.concatenate([self.data.qpos, self.data.qvel])
+
+
+class PendulumEnv(MotoredEnv):
+    """A pendulum with one motor; an angle of 0 hangs down, and episodes start at any angle."""
+
+    def __init__(self) -> None:
+        super().__init__("pendulum.xml", 4, PENDULUM_STEP, start_angle=math.pi)
+
+    @classmethod
+    def critical_damping(cls) -> float:
+        """Viscous friction at which small swings just do not overshoot, in N·m·s/rad: 2 √(m g l · m l²)."""
+        model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("pendulum.xml")))
+        mass, length = float(model.body("arm").mass[0]), -float(model.body("arm").ipos[2])
+        weight = -float(model.opt.gravity[2]) * mass
+        return 2.0 * math.sqrt(weight * length * mass * length**2)
+
+
+class LegEnv(MotoredEnv):
+    """A leg with three motors, whose joints may differ in friction and rotor inertia; it starts near hanging."""
+
+    def __init__(self) -> None:
+        super().__init__("leg.xml", 2, 0.005, start_angle=0.3)

@@ -1,27 +1,23 @@
-"""Measures a population's updates per second, summed over members, and estimates the time of the paper's main table.
+"""Measures a population's updates per second, summed over its members.
 
 python recipes/benchmarks/population.py                                # on a CPU
 python recipes/benchmarks/population.py device=cuda compiled=[1,8,32,128]   # on a GPU, also with CUDA graphs
 
 In the same session it measures a single run with the losses of `recipes/h2o_plus.py`. All figures include sampling and
-exclude the simulator. Writes population.json to the run's folder.
+exclude the simulator. Writes a record to outputs/benchmark/speed.
 """
 
-import json
-import os
-import platform
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from options import PopulationOptions
-from turns import calls_per_second
-from update import action_spec, recipe_on, some_transitions
+from options import read_options
+from update import SIZES, action_spec, calls_per_second, device_name, filled_replay, recipe_on, some_transitions
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
-from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.commands.one_line_errors import one_line_errors
+from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.compiling import compiled
 from torchrl_h2o.training.cuda_graph import fit_to_device
@@ -29,9 +25,6 @@ from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.methods import h2o_plus
 from torchrl_h2o.training.populations import PopulationReplay
 from torchrl_h2o.training.populations.learner import PopulationLearner
-from torchrl_h2o.whole_file import write_text
-
-SINGLE = "a single run"
 
 
 def make_population(cfg: DictConfig, run: DictConfig, num_members: int) -> PopulationLearner:
@@ -51,24 +44,25 @@ def make_single(cfg: DictConfig, run: DictConfig, replay: HybridReplayBuffer, se
 
 def contenders(cfg: DictConfig, run: DictConfig, num_members: int) -> dict[str, Callable[[], object]]:
     """Build the contenders, each a function that makes one update of every member."""
-    on_gpu = torch.device(cfg.device).type == "cuda"
-    chosen = {"stacked": make_population(cfg, run, num_members).update}
-    if num_members == 1:
-        replay = HybridReplayBuffer(some_transitions(cfg), cfg.transitions, run.batch_size, device=cfg.device)
-        replay.extend(some_transitions(cfg))
-        chosen = {SINGLE: make_single(cfg, run, replay).update} | chosen
-        if on_gpu:
-            chosen[f"{SINGLE}, CUDA graph"] = with_cuda_graphs(make_single(cfg, run, replay)).update
-    if on_gpu:
-        chosen["stacked, CUDA graph"] = with_cuda_graphs(make_population(cfg, run, num_members)).update
-    if num_members in cfg.compiled:
-        learner = make_population(cfg, run, num_members)
+
+    def stacked() -> PopulationLearner:
+        return make_population(cfg, run, num_members)
+
+    def stacked_and_compiled() -> PopulationLearner:
+        learner = stacked()
         learner.losses_of = compiled(learner.losses_of)
-        chosen["compiled"] = learner.update
-        if on_gpu:
-            learner = make_population(cfg, run, num_members)
-            learner.losses_of = compiled(learner.losses_of)
-            chosen["compiled, CUDA graph"] = with_cuda_graphs(learner).update
+        return learner
+
+    def single() -> Learner:
+        return make_single(cfg, run, filled_replay(cfg, run))
+
+    ways: dict[str, Callable[[], Learner | PopulationLearner]] = {"a single run": single} if num_members == 1 else {}
+    ways["a population"] = stacked
+    if num_members in cfg.compiled:
+        ways["a population, compiled"] = stacked_and_compiled
+    chosen = {name: make().update for name, make in ways.items()}
+    if torch.device(cfg.device).type == "cuda":
+        chosen |= {f"{name}, CUDA graphs": with_cuda_graphs(make()).update for name, make in ways.items()}
     return chosen
 
 
@@ -78,57 +72,29 @@ def with_cuda_graphs(learner: Learner | PopulationLearner) -> Learner | Populati
     return learner
 
 
-def measure(cfg: DictConfig, run: DictConfig) -> list[dict]:
-    """Measure each size and contender: updates per second of the population, and of its members together."""
-    lines = []
-    for num_members in cfg.members:
-        functions = contenders(cfg, run, num_members)
-        rates = calls_per_second(functions, cfg.seconds, cfg.turns, cfg.device, least=cfg.calls)
-        lines += [
-            {
-                "members": num_members,
-                "way": way,
-                "updates_per_second": rate,
-                "run_updates_per_second": num_members * rate,
-            }
-            for way, rate in rates.items()
-        ]
-    return lines
-
-
-def device_name(device: str) -> str:
-    if torch.device(device).type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"{platform.machine()} CPU, {torch.get_num_threads()} threads"
-
-
-def print_table(result: dict) -> None:
-    single = next((line["updates_per_second"] for line in result["lines"] if line["way"] == SINGLE), None)
-    print(f"\n{'on ' + result['device']:<34}{'members':>8}{'updates/s':>12}{'run-updates/s':>15}{'× single':>10}")
-    for line in result["lines"]:
-        rate, together = line["updates_per_second"], line["run_updates_per_second"]
-        times_single = f"{together / single:>10.2f}" if single else ""
-        print(f"{line['way']:<34}{line['members']:>8}{rate:>12.1f}{together:>15.1f}{times_single}")
-    tasks, seeds, updates = result["table"]["tasks"], result["table"]["seeds"], result["table"]["updates"]
-    print(
-        f"\nThe paper's main table, {tasks} tasks x {seeds} seeds x {updates:,} updates, would take "
-        f"{result['table']['hours']:,.1f} h of updates at the best of these rates, without simulation and evaluation."
+def main() -> None:
+    cfg = read_options(
+        **SIZES | {"transitions": 10_000},
+        members=[1, 8, 32],
+        compiled=[1],  # sizes to measure compiled as well, one or two minutes each
+        seconds=2.0,  # length of one turn
+        turns=2,  # of each contender; the best counts
+        calls=1,  # minimum in a turn: one call of a large population takes seconds
+        threads=2,  # of torch
+        device="cpu",
+        folder="outputs/benchmark/speed",
     )
-
-
-@hydra_main("../config", "population_benchmark", PopulationOptions)
-def main(cfg: DictConfig) -> None:
-    run = recipe_on(cfg)
-    lines = measure(cfg, run)
-    best = max(line["run_updates_per_second"] for line in lines)
-    tasks, seeds, updates = cfg.table
-    table = {"tasks": tasks, "seeds": seeds, "updates": updates, "hours": tasks * seeds * updates / best / 3600}
-    result = {"lines": lines, "device": device_name(cfg.device), "table": table, "torch": torch.__version__}
-    directory = Path(HydraConfig.get().runtime.output_dir)
-    write_text(directory / "population.json", json.dumps(result, indent=2) + "\n")
-    print_table(result)
-    print(f"\nresults    {os.path.relpath(directory)}/population.json")
+    run, rates = recipe_on(cfg), {}
+    for members in cfg.members:
+        found = calls_per_second(contenders(cfg, run, members), cfg.seconds, cfg.turns, cfg.device, least=cfg.calls)
+        rates |= {f"{members} member{'s' * (members > 1)}, {way}": members * rate for way, rate in found.items()}
+    values = {"device": device_name(cfg.device), "updates_per_second": rates}
+    path = Record.of_this_process("speed", f"population_{cfg.device}", values).save(Path(cfg.folder))
+    for name, rate in rates.items():
+        print(f"{name:<44}{rate:>10.1f} updates/s of all members together")
+    print(f"\nresults    {path}")
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()

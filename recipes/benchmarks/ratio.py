@@ -6,42 +6,34 @@ python recipes/benchmarks/ratio.py estimators=[pairs] rows=[1000]
 
 The ratio is evaluated on the simulated rows that the discriminators were trained on, as in the losses, and the true one
 on new rows. With equal dynamics the mean ratio is 1, and the mean clamped ratio at most 1. MuJoCo tasks need
-MINARI_DATASETS_PATH or a download. Writes ratio.csv to the run's folder, one line per training, and prints the means.
+MINARI_DATASETS_PATH or a download. Writes a record of each training to outputs/benchmark/ratio,
+skips those that the same commit has recorded there, and prints the means.
 """
 
-import csv
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import pandas as pd
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from options import RatioOptions
+from options import read_options
 from ratio_systems import SYSTEMS, System
 from tensordict import TensorDictBase
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
-from torchrl_h2o.commands.hydra_main import hydra_main
+from torchrl_h2o.commands.one_line_errors import one_line_errors
+from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
-from torchrl_h2o.objectives import (
-    DynamicsRatioLoss,
-    accelerate,
-    fit_change_scale,
-    make_dynamics_ratio_estimator,
-    total_loss,
-)
-from torchrl_h2o.whole_file import whole_file
+from torchrl_h2o.objectives import DynamicsRatioLoss, fit_change_scale, make_dynamics_ratio_estimator, total_loss
+from torchrl_h2o.provenance import cpu_seconds
 
 NEXT = ("next", "observation")
 KEYS = ("observation", "action", NEXT)
-COLUMNS = (
-    "unclamped", "clamped", "ess", "ess_unclamped", "unclamped_new", "accuracy_sa", "accuracy", "correlation", "slope"
-)  # fmt: skip
+TABLE = "ratio"
 Sample = Callable[[tuple[int, int]], TensorDictBase]
 
 
@@ -126,7 +118,7 @@ def train_and_measure(cfg: DictConfig, case: dict, system: System, new: System) 
     torch.manual_seed(case["seed"])
     rows, name = case["rows"], case["estimator"].removesuffix(", shuffled")
     trained_on = shuffled(name, system, rows) if name != case["estimator"] else system
-    loss = accelerate(make_loss(name, trained_on, cfg))
+    loss = make_loss(name, trained_on, cfg)
     train(loss, make_sampler(name, trained_on, rows), cfg, case["steps"])
     held = {key: float(value) for key, value in _accuracies(loss, name, new).items()}
     return {**case, "delayed": loss.delay_estimator, **held, **measure(loss, trained_on, new, rows)}
@@ -139,45 +131,51 @@ def _accuracies(loss: DynamicsRatioLoss, name: str, new: System) -> dict[str, to
     return {key: value for key, value in figures.items() if key.startswith("accuracy")}
 
 
-def print_table(lines: list[dict]) -> None:
-    print(f"\n{'system':<20}{'estimator':<18}{'rows':>7}{'steps':>6}" + "".join(f"{name:>15}" for name in COLUMNS))
-    groups = dict.fromkeys((line["system"], line["rows"], line["steps"], line["estimator"]) for line in lines)
-    for group in sorted(groups, key=str):
-        system, rows, steps, estimator = group
-        own = [x for x in lines if (x["system"], x["rows"], x["steps"], x["estimator"]) == group]
-        shown = "".join(_cell([line[name] for line in own if name in line]) for name in COLUMNS)
-        print(f"{system:<20}{estimator:<18}{rows:>7}{steps:>6}{shown}")
+def means(records: list[Record]) -> str:
+    """Format the means over seeds, one line for each system and estimator."""
+    told = pd.DataFrame([record.values for record in records])
+    by = ["system", "rows", "steps", "estimator"]
+    return told.drop(columns=["seed", "delayed"]).groupby(by).mean().round(2).to_string()
 
 
-def _cell(values: list[float]) -> str:
-    if not values:
-        return " " * 15
-    values_ = torch.tensor(values)
-    return f"{f'{values_.mean():.2f} ± {values_.std(correction=0):.2f}':>15}"
-
-
-@hydra_main("../config", "ratio_benchmark", RatioOptions)
-def main(cfg: DictConfig) -> None:
+def main() -> None:
+    cfg = read_options(
+        estimators=["paper", "noise_on_next", "change", "pairs"],
+        systems=list(SYSTEMS),
+        seeds=[0, 1, 2],
+        rows=[2000, 20_000],  # simulated rows: of the first epochs, and later
+        steps=[1500],  # updates of the discriminators
+        batch_size=[256, 256],  # real, simulated
+        shuffled=["paper", "pairs"],  # estimators that are also trained on shuffled labels, as a control
+        lr=1e-3,
+        input_noise=0.1,  # of all estimators except pairs
+        change_noise=0.05,  # of pairs, and its penalty and bound: the defaults of a run
+        ratio_weight_penalty=2e-3,
+        ratio_logit_bound=4.0,
+        delayed=True,  # whether the ratio of change and pairs is that of averaged discriminators
+        tau=0.005,  # weight of the current discriminators in an update of the average
+        threads=1,  # of torch
+        folder="outputs/benchmark/ratio",
+    )
     torch.set_num_threads(cfg.threads)
-    directory = Path(HydraConfig.get().runtime.output_dir)
-    names = [*cfg.estimators, *(f"{name}, shuffled" for name in cfg.shuffled)]
-    cases = list(product(cfg.seeds, cfg.systems))
-    inner = list(product(names, cfg.rows, cfg.steps))
-    lines = []
-    with tqdm(total=len(cases) * len(inner), unit=" trainings") as bar:
-        for seed, name in cases:
-            system, new = (SYSTEMS[name].make(max(cfg.rows), one) for one in (seed, seed + 1000))
-            for estimator, rows, steps in inner:
-                case = {"system": name, "seed": seed, "estimator": estimator, "rows": rows, "steps": steps}
-                lines.append(train_and_measure(cfg, case, system, new))
-                bar.update()
-                with whole_file(directory / "ratio.csv") as partial, partial.open("w", newline="") as file:
-                    writer = csv.DictWriter(file, [*case, "delayed", *COLUMNS], extrasaction="ignore")
-                    writer.writeheader()
-                    writer.writerows(lines)
-    print_table(lines)
-    print(f"\nresults    {os.path.relpath(directory)}/ratio.csv")
+    folder, names = Path(cfg.folder), [*cfg.estimators, *(f"{name}, shuffled" for name in cfg.shuffled)]
+    done = {record.name: record for record in read_records(folder, TABLE) if record.is_current}
+    records = []
+    for system_name, seed in tqdm(list(product(cfg.systems, cfg.seeds)), unit=" systems"):
+        prepared: list[System] = []
+        for estimator, rows, steps in product(names, cfg.rows, cfg.steps):
+            case = {"system": system_name, "seed": seed, "estimator": estimator, "rows": rows, "steps": steps}
+            name = "_".join(str(part) for part in case.values()).replace(", ", "_").replace(" ", "_")
+            if name not in done:
+                prepared = prepared or [SYSTEMS[system_name].make(max(cfg.rows), one) for one in (seed, seed + 1000)]
+                start = cpu_seconds()
+                values = train_and_measure(cfg, case, *prepared)
+                done[name] = Record.of_this_process(TABLE, name, values, start)
+                done[name].save(folder)
+            records.append(done[name])
+    print(f"\n{means(records)}\n\nresults    {folder}/{TABLE}")
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors():
+        main()

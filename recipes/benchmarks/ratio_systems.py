@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
-import hydra
 import torch
-from omegaconf import OmegaConf
+from options import run_options
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -112,7 +111,7 @@ class Mujoco:
 
     @cache  # noqa: B019  (the systems are constants of this module)
     def _prepared(self) -> tuple[Task, Preprocessing, TensorDictBase, Tensor]:
-        cfg = _configuration(self.env)
+        cfg = run_options(f"env={self.env}")
         if self.equal:
             cfg.env.simulator = cfg.env.reality
         task = Task.from_config(cfg.env, gap=self.gap)
@@ -122,12 +121,6 @@ class Mujoco:
         following = simulate_transitions(simulation, raw)
         real = preprocessing.apply(raw)
         return task, preprocessing, real, preprocessing.next_observation(real, following)
-
-
-def _configuration(env: str):
-    cfg = hydra.compose("h2o_plus", [f"env={env}"])
-    OmegaConf.set_struct(cfg, False)
-    return cfg
 
 
 def collected(env: EnvBase, rows: int, seed: int) -> TensorDictBase:

@@ -7,8 +7,7 @@ from types import MappingProxyType
 
 import torch
 from gymnasium.wrappers import TimeLimit
-from leg import LegEnv
-from pendulum import PendulumEnv
+from motored_env import LegEnv, PendulumEnv
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
 

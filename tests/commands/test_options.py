@@ -119,7 +119,7 @@ OTHERS = {
     ("paper", "table=returns methods=[h2oplus]"): "methods=[h2oplus]: choose sac, cql, iql, darc, h2o, h2o_plus, rlpd, "
     "td3; did you mean h2o_plus?",
     ("paper", "table=returns device=gpu"): "device=gpu: must be cpu or cuda",
-    ("report", "groups=[retuns]"): f"retuns: there is no {ROOT}/recipes/results/retuns.csv; did you mean returns?",
+    ("report", "groups=[retuns]"): "retuns: there is no outputs/results/retuns.csv; did you mean returns?",
     ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
     "environment, such as +references.mine=[0,1000]",
     ("simulator", "seconds=0"): "seconds=0: must be a number above 0",
@@ -202,22 +202,6 @@ def test_the_options_that_ship_with_the_commands_pass(chosen, tmp_path):
     check_options(composed("close_the_loop", *chosen, folder=folder), CloseTheLoopOptions)
     (tmp_path / "config.yaml").touch()
     check_options(composed("evaluate", f"checkpoint={tmp_path}", folder=folder), EvaluateOptions)
-
-
-@pytest.mark.parametrize(
-    ("config", "model"),
-    {
-        "simulator": "SimulatorOptions",
-        "update": "UpdateOptions",
-        "population": "PopulationOptions",
-        "scaling": "ScalingOptions",
-        "close_the_loop": "CloseTheLoopBenchmarkOptions",
-        "corruptions": "CorruptionsOptions",
-        "ratio": "RatioOptions",
-    }.items(),
-)
-def test_the_options_that_ship_with_the_benchmarks_pass(config, model):
-    check_options(composed(f"{config}_benchmark"), getattr(importlib.import_module("options"), model))
 
 
 @pytest.mark.parametrize("config", ["h2o_plus", "train"])

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from types import SimpleNamespace
 
 import hydra
+import pandas as pd
 import pytest
 from torchrl.checkpoint import CheckpointRotation
 
@@ -40,13 +41,13 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
 
     process.kill()
     process.communicate()
-    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
+    assert read_rows(tmp_path / "results.csv")["method"].tolist() == ["iql"]
 
     done = subprocess.run(**asked, text=True, check=False)
     assert done.returncode == 0, done.stdout
     assert "2 runs, 1 of them done" in done.stdout
     assert done.stdout.count("run folder:") == 1
-    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql", "cql"]
+    assert read_rows(tmp_path / "results.csv")["method"].tolist() == ["iql", "cql"]
 
     cfg, real = compose("updates=200", "method=cql", config="train")
     train(METHODS["cql"], cfg, real, tmp_path / "unbroken")
@@ -57,7 +58,7 @@ def test_a_grid_is_left_alone_by_a_second_one_and_goes_on_where_it_was_when_kill
     moved = [*GRID[:-1], "results=elsewhere/results.csv", "methods=[cql]", "updates=200"]
     done = subprocess.run(**command(*moved, script="paper.py"), text=True, check=False)
     assert done.returncode == 0, done.stdout
-    assert [row["method"] for row in read_rows(tmp_path / "elsewhere" / "results.csv")] == ["cql"]
+    assert read_rows(tmp_path / "elsewhere" / "results.csv")["method"].tolist() == ["cql"]
 
 
 @pytest.mark.slow
@@ -84,8 +85,8 @@ def test_runs_at_once_record_what_runs_in_turn_do(command, compose, tmp_path):
         small = [*GRID[:-1], "methods=[iql,sac]", "updates=20", "data=recording", *folder]
         done = subprocess.run(**command(*small, script="paper.py"), text=True, check=False)
         assert done.returncode == 0, done.stdout
-        rows = sorted(read_rows(tmp_path / f"{name}.csv"), key=lambda row: row["method"])
-        recorded.append([(row["method"], row["return_mean"], row["return_std"]) for row in rows])
+        rows = read_rows(tmp_path / f"{name}.csv").sort_values("method")
+        recorded.append(rows[["method", "return_mean", "return_std"]].values.tolist())
     assert recorded[0] == recorded[1]
     assert len(recorded[0]) == 2
 
@@ -119,7 +120,7 @@ def test_a_run_that_died_once_is_done_by_the_second_try(grid_of):
             raise RuntimeError("a worker was killed")
         for number, _ in enumerate(jobs):
             who = identity_of([f"method={number}"])
-            append_rows(grid.results, (*IDENTITY, *RESULT), [dict.fromkeys(RESULT, "1") | who], who)
+            append_rows(grid.results, pd.DataFrame([who | dict.fromkeys(RESULT, "1")]))
         return [SimpleNamespace(return_value=None) for _ in jobs]
 
     grid = grid_of(launch)
@@ -162,7 +163,7 @@ def test_a_run_that_dies_is_reported_with_its_reason_and_the_others_go_on(comman
     grid = command(*GRID, "methods=[h2o_plus,iql]", "updates=20", "sim_capacity=1e12", script="paper.py")
     done = subprocess.run(**grid, text=True, check=False)
     assert done.returncode != 0
-    assert [row["method"] for row in read_rows(tmp_path / "results.csv")] == ["iql"]
+    assert read_rows(tmp_path / "results.csv")["method"].tolist() == ["iql"]
     assert "these runs failed:\n  method=h2o_plus" in done.stdout
     assert "allocate memory" in done.stdout  # for the simulated buffer, which IQL does not fill
     assert done.stdout.count("run folder:") == 3  # IQL once, H2O+ twice, because it is tried again once

@@ -44,7 +44,7 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     shutil.rmtree(folder)
     again = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
     np.testing.assert_equal(again, kept)
-    assert not kept_results(tmp_path / "kept.npz", tmp_path / "runs", [rows[0] | {"mixing": "0.9"}])
+    assert not kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows.assign(mixing="0.9"))
     draw_robot(tmp_path, again)
     for name in ("wheel_legged_trajectories.png", "wheel_legged_diversity.png"):
         assert (tmp_path / name).stat().st_size > 10_000

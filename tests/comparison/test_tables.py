@@ -1,17 +1,17 @@
 """The tables of a fixture of results, and their statistics compared with plain arithmetic."""
 
-import csv
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from torchrl_h2o.comparison.aggregates import common_scores, improvements, interquartile_means
 from torchrl_h2o.comparison.figures import draw_curves
 from torchrl_h2o.comparison.results_file import IDENTITY, RESULT, append_rows, read_rows
-from torchrl_h2o.comparison.scores import REFERENCES, cells, markdown, normalised, placed
+from torchrl_h2o.comparison.scores import REFERENCES, cell, markdown, normalised, placed, require_distinct
 from torchrl_h2o.comparison.tables import ABLATIONS, paper_cells
 
 ROOT = Path(__file__).parents[2]
@@ -41,41 +41,38 @@ def fixture():
 
 
 def write(path, rows):
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    pd.DataFrame(rows).to_csv(path, index=False)
+
+
+def table_of(rows, variants=False):
+    return placed(pd.DataFrame(rows), variants)
 
 
 def test_a_cell_is_the_mean_over_seeds_and_a_method_without_simulator_stands_in_every_gap():
-    table = cells(placed(fixture(), variants=False))
-    assert {task[2] for task in table} == {"gravity 2", "friction 0.3"}
-    friction = table["HalfCheetah-v5", "halfcheetah/medium-replay-v0", "friction 0.3"]
-    assert friction["h2o_plus"].text() == "1,600 ± 100 (3)"
-    assert friction["iql"].text() == "1,100 ± 100 (3)"
-    assert cells([row("sac", 0, 7)]).popitem()[1]["sac"].text() == "7 ± 10 (1)"
+    table = table_of(fixture())
+    assert {task[2] for task in table["task"]} == {"gravity 2", "friction 0.3"}
+    friction = table[[task[2] == "friction 0.3" for task in table["task"]]]
+    cells = {name: cell(runs) for name, runs in friction.groupby("method")}
+    assert (cells["h2o_plus"], cells["iql"]) == ("1,600 ± 100 (3)", "1,100 ± 100 (3)")
+    assert cell(table_of([row("sac", 0, 7)])) == "7 ± 10 (1)"
 
 
 def test_variants_are_rows_of_their_own_in_an_ablation():
     rows = [row("h2o_plus", 0, 1, mixing="0.1", ratio=ratio) for ratio in ("True", "False")]
-    assert len(cells(placed(rows, variants=True))) == 2
+    assert table_of(rows, variants=True)["task"].nunique() == 2
 
 
-def test_runs_with_other_settings_are_not_averaged():
-    table = cells(placed([row("sac", 0, 1), row("sac", 0, 9, others="lr=0.01")], variants=False))
-    assert sorted(c["sac"].returns[0] for c in table.values()) == [1.0, 9.0]
-
-
-def test_runs_that_differ_in_how_often_they_were_evaluated_stand_in_one_row():
+def test_only_settings_that_change_the_last_policy_make_another_task():
+    assert table_of([row("sac", 0, 1), row("sac", 0, 9, others="lr=0.01")])["task"].nunique() == 2
     often, rarely = (row(name, 0, 1, others=others) for name, others in (("sac", "eval_every=5"), ("h2o_plus", "")))
-    assert len(cells(placed([often, rarely], variants=False))) == 1
+    assert table_of([often, rarely])["task"].nunique() == 1
     best = row("h2o_plus", 1, 1, others="eval_every=5 keep=best_in_simulator")  # the evaluations choose the policy
-    assert len(cells(placed([often, best], variants=False))) == 2
+    assert table_of([often, best])["task"].nunique() == 2
 
 
 def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
-    table = cells(placed(fixture(), variants=False))
-    task = sorted(table)[1]
+    table = table_of(fixture())
+    task = sorted(table["task"])[-1]
     text = markdown(table, {"h2o_plus": "H2O+", "sac": "SAC", "cql": "CQL"}, {task: {"sac": "4,513 ± 513"}})
     head, _, *lines = text.splitlines()
     assert head.endswith("| H2O+ | SAC |")
@@ -103,15 +100,15 @@ def test_columns_are_in_the_order_of_the_titles_and_the_paper_stands_below():
     ],
 )
 def test_the_paper_s_figures_stand_beside_the_ablations_they_are_of(group, runs, figures):
-    table = cells(placed(runs, variants=group in ABLATIONS))
-    theirs = paper_cells(read_rows(ROOT / "recipes" / "results" / "paper.csv"), group, table)
+    tasks = set(table_of(runs, variants=group in ABLATIONS)["task"])
+    theirs = paper_cells(read_rows(ROOT / "recipes" / "paper.csv"), group, tasks)
     assert {text for cells_of_task in theirs.values() for text in cells_of_task.values()} == figures
-    assert theirs.keys() == table.keys()
+    assert theirs.keys() == tasks
 
 
 def test_curves_are_the_seeds_mean_and_their_range(tmp_path, saved_figures):
     rows = [row("sac", seed, seed * at, at=str(at)) for seed in (1, 2, 6) for at in (10, 20)]
-    draw_curves(tmp_path / "curves.png", rows, {"h2o_plus": "H2O+", "sac": "SAC"})
+    draw_curves(tmp_path / "curves.png", table_of(rows), {"h2o_plus": "H2O+", "sac": "SAC"})
     (axis,) = saved_figures[0].axes
     (line,) = axis.lines
     assert line.get_xydata().tolist() == [[10.0, 30.0], [20.0, 60.0]]
@@ -126,18 +123,18 @@ def test_curves_are_the_seeds_mean_and_their_range(tmp_path, saved_figures):
 
 def test_how_long_episodes_last_is_told_where_some_end_early():
     rows = [row("sac", s, 1, seconds=str(10.0 + s)) for s in range(2)] + [row("h2o_plus", 0, 1)]
-    lines = markdown(cells(rows), {"sac": "SAC", "cql": "CQL", "h2o_plus": "H2O+"}, {}).splitlines()
+    lines = markdown(table_of(rows), {"sac": "SAC", "cql": "CQL", "h2o_plus": "H2O+"}, {}).splitlines()
     assert [line for line in lines if "lasts" in line] == ["|  |  |  |  | lasts, s | 10.5 | 50.0 |"]
 
 
 def test_two_runs_of_a_seed_are_not_taken_for_one():
     rows = [row("h2o_plus", 0, value, mixing=str(value)) for value in (0.1, 0.5)]
     with pytest.raises(ValueError, match=r"h2o_plus has two runs of seed 0 in .* results="):
-        cells(placed(rows, variants=False))
+        require_distinct(table_of(rows))
 
 
 def test_the_interquartile_mean_is_that_of_the_middle_half():
-    scores = common_scores(cells(placed(fixture(), variants=False)))
+    scores = common_scores(table_of(fixture()))
     means = interquartile_means(scores, reps=100)
     assert scores.seeds == [0, 1, 2]
     values = sorted(normalised(2000 + 100 * s - h, REFERENCES["HalfCheetah-v5"]) for s in range(3) for h in (0, 500))
@@ -152,7 +149,7 @@ def test_the_probability_of_improvement_counts_pairs_of_runs():
     rows = [row("h2o_plus", s, v) for s, v in enumerate((1, 4, 5))] + [
         row("sac", s, v) for s, v in enumerate((2, 3, 6))
     ]
-    better = improvements(common_scores(cells(rows)), reps=50)
+    better = improvements(common_scores(table_of(rows)), reps=50)
     assert better["sac"].value == pytest.approx(4 / 9)
     assert 0 <= better["sac"].low <= 4 / 9 <= better["sac"].high <= 1
 
@@ -160,30 +157,29 @@ def test_the_probability_of_improvement_counts_pairs_of_runs():
 def test_aggregates_are_of_tasks_and_seeds_that_every_method_has():
     rows = [r for r in fixture() if (r["method"], r["gap"]) != ("sac", "friction")]
     rows = [r for r in rows if (r["method"], r["seed"]) != ("iql", "2")]
-    scores = common_scores(cells(placed(rows, variants=False)))
+    scores = common_scores(table_of(rows))
     assert [task[2] for task in scores.tasks] == ["gravity 2"]
     assert scores.seeds == [0, 1]
     assert {x.shape for x in scores.runs.values()} == {(2, 1)}
 
 
 def test_a_method_that_has_done_little_does_not_take_tasks_from_the_others():
-    table = cells(placed([*fixture(), row("td3", 0, 5)], variants=False))
-    scores = common_scores(table)
+    scores = common_scores(table_of([*fixture(), row("td3", 0, 5)]))
     assert len(scores.tasks) == 2
     assert "td3" not in scores.runs
-    scores = common_scores(cells(placed([*fixture(), *(row("td3", s, 5, g) for s in range(3) for g in GAPS)], False)))
+    scores = common_scores(table_of([*fixture(), *(row("td3", s, 5, g) for s in range(3) for g in GAPS)]))
     assert scores.runs["td3"].shape == (3, 2)
-    scores = common_scores(cells(placed([*fixture(), *(row("td3", 0, 5, g) for g in GAPS)], variants=False)))
+    scores = common_scores(table_of([*fixture(), *(row("td3", 0, 5, g) for g in GAPS)]))
     assert scores.seeds == [0, 1, 2]
     assert "td3" not in scores.runs
 
 
 def test_runs_that_count_in_several_gaps_are_drawn_anew_together():
-    scores = common_scores(cells(placed(fixture(), variants=False)))
+    scores = common_scores(table_of(fixture()))
     assert scores.runs["iql"].shape == (3, 1)
     both = interquartile_means(scores, reps=200)["iql"]
     once = [r for r in fixture() if r["gap"] != "friction"]
-    alone = interquartile_means(common_scores(cells(placed(once, variants=False))), reps=200)["iql"]
+    alone = interquartile_means(common_scores(table_of(once)), reps=200)["iql"]
     values = [normalised(1000 + 100 * seed, REFERENCES["HalfCheetah-v5"]) for seed in range(3)]
     assert both.value == pytest.approx(values[1])
     assert (both.low, both.high) == pytest.approx((values[0], values[2]))
@@ -199,7 +195,6 @@ def test_one_command_makes_tables_and_pictures(tmp_path):
         for at in (500, 1000)
     ]
     write(tmp_path / "returns_curves.csv", curve)
-    write(tmp_path / "paper.csv", read_rows(ROOT / "recipes" / "results" / "paper.csv"))
     command = [sys.executable, str(ROOT / "recipes" / "report.py"), f"results={tmp_path}", "reps=50"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -256,7 +251,6 @@ def test_a_task_of_one_s_own_is_scored_by_returns_of_its_own(tmp_path):
 
 
 def test_a_run_is_recorded_once(tmp_path):
-    who = dict.fromkeys(IDENTITY, "x")
     for value in (1, 2):
-        append_rows(tmp_path / "a.csv", (*IDENTITY, "return_mean"), [who | {"return_mean": value}], who)
-    assert [r["return_mean"] for r in read_rows(tmp_path / "a.csv")] == ["1"]
+        append_rows(tmp_path / "a.csv", pd.DataFrame([dict.fromkeys(IDENTITY, "x") | {"return_mean": value}]))
+    assert read_rows(tmp_path / "a.csv")["return_mean"].tolist() == ["1"]

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from rliable import library, metrics
 
 from torchrl_h2o.comparison.grids import OFFLINE, SIX
-from torchrl_h2o.comparison.scores import REFERENCES, Cell, Reference, Task, normalised
+from torchrl_h2o.comparison.scores import REFERENCES, Reference, Task, normalised
 
 BASE = "h2o_plus"
 
@@ -50,35 +51,34 @@ class Scores:
         return lambda runs: runs[:, self.columns[name]]
 
 
-def common_scores(table: dict[Task, dict[str, Cell]], references: Mapping[str, Reference] = REFERENCES) -> Scores:
+def common_scores(placed: pd.DataFrame, references: Mapping[str, Reference] = REFERENCES) -> Scores:
     """Select the tasks and seeds for which all of the paper's methods in the table have results.
 
     Methods that are not in the paper are included only if they have results for all of these tasks and seeds.
 
     Args:
-        table: cells by task and method.
+        placed: runs from :func:`~torchrl_h2o.comparison.scores.placed`.
         references: by environment, the returns with score 0 and score 100.
     """
-    present = {name for cells in table.values() for name in cells}
-    methods = [name for name in SIX if name in present] or sorted(present)
-    tasks = sorted(task for task, cells in table.items() if set(methods) <= set(cells))
-    seeds = sorted(set.intersection(*(set(table[t][m].returns) for t in tasks for m in methods))) if tasks else []
-    further = sorted(present - set(methods))
-    methods += [m for m in further if all(m in table[t] and set(seeds) <= set(table[t][m].returns) for t in tasks)]
+    returns = placed.pivot(index="seed", columns=["task", "method"], values="return_mean")
+    has = {key: set(returns.index[returns[key].notna()]) for key in returns}  # seeds by task and method
+    present = sorted({method for _, method in has})
+    methods = [name for name in SIX if name in present] or present
+    tasks = sorted(task for task in {task for task, _ in has} if all((task, name) in has for name in methods))
+    seeds = sorted(set.intersection(*(has[task, name] for task in tasks for name in methods))) if tasks else []
+    methods += [
+        name for name in present
+        if name not in methods and all(set(seeds) <= has.get((task, name), set()) for task in tasks)
+    ]  # fmt: skip
     runs, columns = {}, {}
-    for name in methods:
-        seen = [_run_of(name, task) for task in tasks]
+    for name in methods if tasks else []:
+        # an offline method's run does not depend on the gap
+        seen = [(*task[:2], "" if name in OFFLINE else task[2], *task[3:]) for task in tasks]
         own = dict(zip(seen, tasks, strict=True))  # one task for each distinct run
-        cells = [(task[0], table[task][name]) for task in own.values()]
-        runs[name] = np.array([[normalised(cell.returns[s], references[env]) for env, cell in cells] for s in seeds])
+        scores = [normalised(returns.loc[seeds, (task, name)], references[task[0]]) for task in own.values()]
+        runs[name] = np.array(scores).T
         columns[name] = np.array([list(own).index(run) for run in seen], dtype=int)
     return Scores(runs, columns, tasks, seeds)
-
-
-def _run_of(name: str, task: Task) -> Task:
-    """Return the task without the parts that a method's run does not depend on: the gap, for an offline method."""
-    env, data, gap, *variant = task
-    return (env, data, "" if name in OFFLINE else gap, *variant)
 
 
 def interquartile_means(scores: Scores, reps: int, seed: int = 0) -> dict[str, Interval]:

@@ -1,22 +1,20 @@
 """Draws learning curves with bands over seeds, and aggregate scores with their intervals."""
 
 import math
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from torchrl_h2o.comparison.aggregates import Interval
-from torchrl_h2o.comparison.scores import Row, Task, task_of
 from torchrl_h2o.training.learning_curve import COLOURS
 from torchrl_h2o.whole_file import whole_file
 
 
-def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> None:
+def draw_curves(path: Path, rows: pd.DataFrame, titles: Mapping[str, str]) -> None:
     """Draw return against updates, one panel per task: mean over seeds, and a band from the lowest to the highest seed.
 
     Args:
@@ -24,17 +22,16 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
         rows: one per evaluation, from :func:`~torchrl_h2o.comparison.scores.placed`.
         titles: titles of the methods, in the order of the legend.
     """
-    curves = _curves(rows)
-    tasks = sorted({task for task, _ in curves})
+    tasks = sorted(rows["task"].unique())
     columns = min(4, len(tasks))
     lines = math.ceil(len(tasks) / columns)
     figure = Figure((4.2 * columns, 3.2 * lines), layout="constrained")
     sharey = len({task[0] for task in tasks}) == 1  # returns of different environments have different scales
     axes = figure.subplots(lines, columns, squeeze=False, sharey=sharey)
     for axis, task in zip(axes.flat, tasks, strict=False):
-        for name in titles:
-            if (task, name) in curves:
-                _draw_band(axis, curves[task, name], titles[name])
+        of_task = rows[rows["task"] == task]
+        for name in [name for name in titles if (of_task["method"] == name).any()]:
+            _draw_band(axis, of_task[of_task["method"] == name], titles[name])
         env, data, *variant = task
         axis.set_title("\n".join(filter(None, [f"{env} {data}".strip(), " ".join(filter(None, variant))])), fontsize=8)
         axis.xaxis.set_major_locator(MaxNLocator(4))
@@ -56,19 +53,11 @@ def draw_curves(path: Path, rows: Sequence[Row], titles: Mapping[str, str]) -> N
     _save(figure, path)
 
 
-def _curves(rows: Sequence[Row]) -> dict[tuple[Task, str], dict[int, list[float]]]:
-    """Returns of all seeds by task and method, then by number of updates."""
-    curves: dict[tuple[Task, str], dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        curves[task_of(row), row["method"]][int(row["at"])].append(float(row["return_mean"]))
-    return curves
-
-
-def _draw_band(axis: Axes, curve: Mapping[int, list[float]], title: str) -> None:
-    at = sorted(curve)
+def _draw_band(axis: Axes, rows: pd.DataFrame, title: str) -> None:
+    curve = rows.groupby("at")["return_mean"].agg(["mean", "min", "max"])
     colour = COLOURS.get(title)
-    axis.plot(at, [np.mean(curve[x]) for x in at], color=colour, label=title, lw=1.5)
-    axis.fill_between(at, [min(curve[x]) for x in at], [max(curve[x]) for x in at], color=colour, alpha=0.2, lw=0)
+    axis.plot(curve.index, curve["mean"], color=colour, label=title, lw=1.5)
+    axis.fill_between(curve.index, curve["min"], curve["max"], color=colour, alpha=0.2, lw=0)
 
 
 def draw_aggregates(

@@ -13,7 +13,7 @@ from hydra.core.utils import JobReturn
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from torchrl_h2o.comparison.results_file import GRID, adopt_runs, identity, recorded
+from torchrl_h2o.comparison.results_file import GRID, adopt_runs, identity, read_rows, recorded
 from torchrl_h2o.data.transition_checks import UnstableSimulatorError
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.run_folder import resolve_paths
@@ -76,7 +76,7 @@ class GridLauncher:
 
     def remaining(self, runs: Sequence[Run]) -> list[Run]:
         """Return the runs that are not in the results file yet."""
-        done = recorded(self.results)
+        done = recorded(read_rows(self.results))
         return [run for run in runs if tuple(self.identity(run).values()) not in done]
 
     def identity(self, run: Run) -> dict[str, str]:

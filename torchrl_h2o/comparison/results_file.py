@@ -1,25 +1,27 @@
-"""Reads and writes the results of a group of runs as CSV, such as recipes/results/returns.csv.
+"""Reads and writes the results of a group of runs as CSV, such as outputs/results/returns.csv.
 
 Each row is one run, identified by the columns :data:`IDENTITY`. A second file, ``returns_curves.csv``, has one row per
 evaluation, for learning curves.
 """
 
-import csv
 import json
-import re
 import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 from filelock import FileLock
 from omegaconf import DictConfig
 
+from torchrl_h2o.comparison.records import shorten_paths
 from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.training.run_folder import uninterrupted
 from torchrl_h2o.whole_file import whole_file
 
+RESULTS = Path("outputs/results")  # folder of the results files, unless an option names another
 IDENTITY = (
     "method",
     "env",
@@ -42,9 +44,10 @@ RESULT = (
     "seconds",  # mean length of an episode
     "mean_v",
     "max_abs_x",
-    "effects_added",  # to the simulator by the option mend; empty without it, and in files of earlier versions
+    "effects_added",  # to the simulator by the option mend; empty without it
     "return_data",
     "updates_per_second",
+    "commit",  # with a + where files differed from it
     "versions",
     "command",
 )
@@ -57,7 +60,6 @@ TOLD = {
 }
 #: overrides of paper.py that choose runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "sizes", "log", "seeds", "retries"}
-EVALUATED = {"mean": "return_real", "std": "return_real_std"}
 CURVE = ("at", "return_mean", "return_std", "seconds")
 
 
@@ -78,7 +80,7 @@ def identity(cfg: DictConfig) -> dict[str, str]:
         "backbone": cfg.backbone if h2o_plus else "",
         "mixing": str(float(cfg.mixing)) if h2o_plus else "",
         "ratio": str(bool(cfg.ratio)) if h2o_plus else "",
-        "others": " ".join(sorted(_portable(o) for o in cfg.overrides or () if key_of(o) not in TOLD | GRID)),
+        "others": " ".join(sorted(shorten_paths(o) for o in cfg.overrides or () if key_of(o) not in TOLD | GRID)),
     }
 
 
@@ -89,13 +91,8 @@ def key_of(override: str) -> str:
 
 def repeating_command(cfg: DictConfig) -> str:
     """Return the command that repeats a run, without the options for results and folders; paths are shortened."""
-    chosen = [_portable(o) for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
+    chosen = [shorten_paths(o) for o in cfg.overrides or () if key_of(o) not in GRID | {"results", "folder", "resume"}]
     return shlex.join(["python", "recipes/train.py", *chosen])
-
-
-def _portable(override: str) -> str:
-    """Return an override with the last two parts of each absolute path, because a folder exists on one machine only."""
-    return re.sub(r"(?<=[=\[,'\"])/[^,\]'\"]*", lambda path: _short(path[0]), override)
 
 
 def _strength(cfg: DictConfig) -> float:
@@ -110,6 +107,27 @@ def _short(data: Source) -> str:
     return "/".join(path.parts[-2:]) if path.is_absolute() else str(data)
 
 
+def run_row(cfg: DictConfig, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns of a finished run, from its configuration and its summary.json; of a failed one without returns."""
+    row: dict[str, Any] = dict.fromkeys(RESULT, "") | identity(cfg)
+    if (real := summary["return_real"]) is not None:
+        observed = real.get("observed", {})
+        row |= {
+            "return_mean": _rounded(real["mean"]),
+            "return_std": _rounded(real["std"]),
+            "episodes": real["episodes"],
+            "seconds": _rounded(real["mean_length"] * cfg.env.seconds_per_step),
+            **{key: _rounded(observed[name][what]) for key, (name, what) in OBSERVED.items() if name in observed},
+            "return_data": _rounded(summary["return_data"]["mean"]),
+            "updates_per_second": _rounded(summary["updates_per_second"]),
+        }
+    if cfg.get("mend"):
+        row["effects_added"] = 0 if cfg.get("mended") is None else len(cfg.mended["effects"])
+    row["commit"] = f"{summary.get('commit') or ''}{'+' * bool(summary.get('dirty'))}"
+    row["versions"] = " ".join(f"{name}={number}" for name, number in summary["versions"].items())
+    return row | {"command": repeating_command(cfg)}
+
+
 def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
     """Append a finished run from the files in its folder, unless the CSV already has it.
 
@@ -118,73 +136,45 @@ def append_run(path: Path, cfg: DictConfig, directory: Path) -> None:
         cfg: the run's configuration.
         directory: the run's folder, with summary.json and metrics.csv.
     """
-    summary = json.loads((directory / "summary.json").read_text())
-    who = identity(cfg)
-    real = summary["return_real"]
-    result = who | {
-        "return_mean": _rounded(real["mean"]),
-        "return_std": _rounded(real["std"]),
-        "episodes": real["episodes"],
-        "seconds": _rounded(real["mean_length"] * cfg.env.seconds_per_step),
-        **{column: _observed(real, *where) for column, where in OBSERVED.items()},
-        "effects_added": _effects_added(cfg),
-        "return_data": _rounded(summary["return_data"]["mean"]),
-        "updates_per_second": _rounded(summary["updates_per_second"]),
-        "versions": " ".join(f"{name}={number}" for name, number in summary["versions"].items()),
-        "command": repeating_command(cfg),
-    }
-    with open(directory / "metrics.csv", newline="") as file:
-        curve = [who | _point(row, cfg.env.seconds_per_step) for row in csv.DictReader(file)]
-    _append(path, result, curve)
+    row = run_row(cfg, json.loads((directory / "summary.json").read_text()))
+    metrics = pd.read_csv(directory / "metrics.csv")
+    curve = pd.DataFrame(
+        {
+            "at": metrics["updates"],
+            "return_mean": metrics["return_real"].map(_rounded),
+            "return_std": metrics["return_real_std"].map(_rounded),
+            "seconds": (metrics["length_real"] * cfg.env.seconds_per_step).map(_rounded),
+        }
+    )
+    _append(path, pd.DataFrame([row]), curve.assign(**identity(cfg))[[*IDENTITY, *CURVE]])
 
 
-def _effects_added(cfg: DictConfig) -> int | str:
-    """Return how many effects ``mend`` has added to the simulator, or an empty text without ``mend``."""
-    if not cfg.get("mend"):
-        return ""
-    return 0 if cfg.get("mended") is None else len(cfg.mended["effects"])
-
-
-def _observed(real: Mapping, quantity: str, statistic: str) -> float | str:
-    """Return a statistic of an observed quantity, or an empty text if the task does not observe it."""
-    found = real.get("observed", {}).get(quantity)
-    return "" if found is None else _rounded(found[statistic])
-
-
-def _point(row: Mapping[str, str], seconds_per_step: float) -> dict[str, float | str]:
-    """Return the columns :data:`CURVE` of one evaluation from a row of metrics.csv."""
-    returns = {f"return_{key}": _rounded(row[name]) for key, name in EVALUATED.items()}
-    return {"at": row["updates"], **returns, "seconds": _rounded(float(row["length_real"]) * seconds_per_step)}
-
-
-def _append(path: Path, result: Mapping, curve: Iterable[Mapping]) -> None:
+def _append(path: Path, run: pd.DataFrame, curve: pd.DataFrame) -> None:
     """Append a run's curve, then its result, so that a run counts as unfinished if the process ends in between."""
     with uninterrupted():
-        append_rows(curves_of(path), (*IDENTITY, *CURVE), curve, result)
-        append_rows(path, (*IDENTITY, *RESULT), [result], result)
+        append_rows(curves_of(path), curve)
+        append_rows(path, run[[*IDENTITY, *RESULT]])
 
 
-def append_rows(path: Path, columns: Iterable[str], rows: Iterable[Mapping], who: Mapping[str, str]) -> None:
-    """Append a run's rows to a CSV file, unless the file already has rows of that run.
+def append_rows(path: Path, rows: pd.DataFrame) -> None:
+    """Append the rows of one run to a CSV file, unless the file already has rows of that run.
 
     Args:
         path: CSV file, created if missing.
-        columns: its columns.
-        rows: the rows to append.
-        who: the run's identity.
+        rows: the rows to append; their columns are those of the file.
+
+    Raises:
+        ValueError: if the file has other columns.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_name(f".{path.name}.lock")):  # other runs of the group may finish at the same time
         earlier = read_rows(path)
-        if any(_key(row) == _key(who) for row in earlier):
+        if recorded(earlier) & recorded(rows):
             return
-        columns = list(columns)
-        if earlier and (unknown := sorted(earlier[0].keys() - set(columns))):
-            raise ValueError(f"{path} has the columns {', '.join(unknown)}, so it is no file of such results")
-        with whole_file(path) as partial, partial.open("w", newline="") as new:
-            writer = csv.DictWriter(new, columns)
-            writer.writeheader()
-            writer.writerows([*earlier, *rows])
+        if len(earlier) and set(earlier.columns) != set(rows.columns):
+            raise ValueError(f"{path} has the columns {', '.join(earlier.columns)}, so it is no file of such results")
+        with whole_file(path) as partial:
+            pd.concat([earlier, rows]).to_csv(partial, index=False, columns=list(rows.columns))
 
 
 def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
@@ -194,24 +184,19 @@ def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:
         path: CSV file to copy to.
         runs: identities of the runs to copy.
     """
-    missing = {_key(who) for who in runs} - recorded(path)
+    missing = {tuple(who.values()) for who in runs} - recorded(read_rows(path))
     for other in sorted(path.parent.glob("[!.]*.csv")):
         if other == path or not other.is_file() or not _is_group(other):
             continue
         rows, curves = read_rows(other), read_rows(curves_of(other))
-        for row in rows:
-            if _key(row) in missing:
-                _append(path, row, [point for point in curves if _key(point) == _key(row)])
+        for who in sorted(recorded(rows) & missing):
+            _append(path, *(frame[[key == who for key in _keys(frame)]] for frame in (rows, curves)))
 
 
 def _is_group(path: Path) -> bool:
-    """Whether a CSV file has the columns of a results file; the folder may contain other CSV files.
-
-    Files of earlier versions have fewer columns: :func:`_key` takes missing ones as empty.
-    """
-    with open(path, newline="", errors="replace") as file:
-        columns = set(next(csv.reader(file), ()))
-    return {"method", "seed", "others", "command"} <= columns <= {*IDENTITY, *RESULT}
+    """Whether a CSV file has the columns of a results file; the folder may contain other CSV files."""
+    first = path.open(encoding="utf-8", errors="replace").readline().strip()
+    return first.split(",") == [*IDENTITY, *RESULT]
 
 
 def curves_of(path: Path) -> Path:
@@ -219,12 +204,11 @@ def curves_of(path: Path) -> Path:
     return path.with_name(f"{path.stem}_curves.csv")
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file; an empty list if the file is missing."""
+def read_rows(path: Path) -> pd.DataFrame:
+    """Read a CSV file as text; no rows if the file is missing."""
     if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+        return pd.DataFrame(columns=list(IDENTITY), dtype=str)
+    return pd.read_csv(path, dtype=str, keep_default_na=False)
 
 
 def require_groups(results: Path, groups: Iterable[str], known: Iterable[str]) -> None:
@@ -238,13 +222,13 @@ def require_groups(results: Path, groups: Iterable[str], known: Iterable[str]) -
         raise ValueError(f"{unknown}: there is no {results / unknown}.csv{did_you_mean(unknown, names)}")
 
 
-def recorded(path: Path) -> set[tuple[str, ...]]:
-    """Identities of the runs in the CSV, as tuples in the order of :data:`IDENTITY`."""
-    return {_key(row) for row in read_rows(path)}
+def recorded(rows: pd.DataFrame) -> set[tuple[str, ...]]:
+    """Identities of the runs in rows, as tuples in the order of :data:`IDENTITY`."""
+    return set(_keys(rows))
 
 
-def _key(who: Mapping[str, str]) -> tuple[str, ...]:
-    return tuple(who.get(column, "") for column in IDENTITY)
+def _keys(rows: pd.DataFrame) -> list[tuple[str, ...]]:
+    return list(rows[list(IDENTITY)].itertuples(index=False, name=None))
 
 
 def _rounded(value: float | str) -> float:

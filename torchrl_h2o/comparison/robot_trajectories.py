@@ -6,11 +6,12 @@ two arrays per run: ``way <run>``, trajectories ``[episodes, T]`` sampled every 
 file, with ``-`` for empty columns.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
 
 import numpy as np
+import pandas as pd
 import torch
 from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
@@ -34,7 +35,7 @@ COMPARED = ("h2o", "h2o_plus")  # the methods whose simulated data the paper com
 BINS = (np.linspace(-0.55, 0.55, 56), np.linspace(-8.0, 8.0, 65))  # of pitch (rad) and pitch rate (rad/s)
 
 
-def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> dict[str, np.ndarray]:
+def kept_results(path: Path, runs: Path, told: pd.DataFrame) -> dict[str, np.ndarray]:
     """Add requested runs that the NPZ file does not have from their folders, and return the arrays of these runs.
 
     Args:
@@ -45,7 +46,8 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
     Returns:
         Arrays by the keys ``way <run>`` and ``states <run>``.
     """
-    asked = {tuple(row.get(key, "") for key in IDENTITY): _name(row) for row in told}
+    who = told[list(IDENTITY)]
+    asked = {tuple(row): " ".join(value or "-" for value in row) for row in who.itertuples(index=False, name=None)}
     arrays = dict(np.load(path)) if path.exists() else {}
     for summary in sorted(runs.glob("*/summary.json")):
         cfg = load_config(summary.parent)
@@ -58,10 +60,6 @@ def kept_results(path: Path, runs: Path, told: Iterable[Mapping[str, str]]) -> d
         with whole_file(path) as partial:
             np.savez_compressed(partial, **arrays)
     return {key: array for key, array in arrays.items() if key.partition(" ")[2] in asked.values()}
-
-
-def _name(row: Mapping[str, str]) -> str:
-    return " ".join(row.get(key) or "-" for key in IDENTITY)
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:

@@ -1,11 +1,12 @@
-"""Arranges the rows of a results file as a table: one row per task, one column per method, all seeds in one cell."""
+"""Arranges the runs of a results file as a table: one row per task, one column per method, all seeds in one cell."""
 
-import statistics
-from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from typing import Any
+
+import pandas as pd
 
 from torchrl_h2o.comparison.grids import OFFLINE
+from torchrl_h2o.comparison.markdown import markdown_table
 
 Reference = tuple[float, float]  # returns with score 0 and score 100
 #: Returns with score 0 and score 100. For HalfCheetah and Walker2d: D4RL's random and expert policies (Fu et al., 2020,
@@ -16,146 +17,110 @@ REFERENCES = {
     "wheel_legged/standing_still": (0.0, 180_000.0),
     "wheel_legged/moving_forward": (0.0, 90_000.0),
 }
-
-Row = Mapping[str, str]
 Task = tuple[str, ...]
+#: columns in which the variants of H2O+ differ in the ablations, and their labels in tables
+VARIANTS = {"backbone": "", "mixing": "λ", "ratio": "ratio"}
+#: overrides that change how often a policy is evaluated during training, and nothing in the last policy
+EVALUATION = ("eval_every=", "eval_episodes=", "trial_episodes=")
+DATA = ["env", "data", "data_seconds", "others"]  # columns on which the run of an offline method depends
 
 
 class MixedRunsError(ValueError):
     """Runs that cannot be combined in one table."""
 
 
-@dataclass(frozen=True)
-class Cell:
-    """The returns of one method in one task, by seed.
-
-    Args:
-        returns: mean return of each run.
-        within: standard deviation over each run's episodes.
-        seconds: mean length of each run's episodes, s.
-    """
-
-    returns: dict[int, float] = field(default_factory=dict)
-    within: dict[int, float] = field(default_factory=dict)
-    seconds: dict[int, float] = field(default_factory=dict)
-
-    def text(self) -> str:
-        """Format mean ± standard deviation over seeds (for one seed, over its episodes), and the number of seeds."""
-        values = list(self.returns.values())
-        spread = statistics.stdev(values) if len(values) > 1 else next(iter(self.within.values()))
-        return f"{statistics.mean(values):,.0f} ± {spread:,.0f} ({len(values)})"
-
-    def lasts(self) -> str:
-        """Format the mean length of an episode, in s."""
-        return f"{statistics.mean(self.seconds.values()):.1f}" if self.seconds else ""
-
-    def score(self, reference: Reference) -> str:
-        """Format the normalised score of the mean return."""
-        return f"{normalised(statistics.mean(self.returns.values()), reference):.1f}" if self.returns else ""
-
-
-#: columns in which the variants of H2O+ differ in the ablations, and their labels in tables
-VARIANTS = {"backbone": "", "mixing": "λ", "ratio": "ratio"}
-#: overrides that change how often a policy is evaluated during training, and nothing in the last policy
-EVALUATION = ("eval_every=", "eval_episodes=", "trial_episodes=")
-
-
-def task_of(row: Row) -> Task:
+def task_of(row: Mapping[str, Any]) -> Task:
     """Return the task of a row: environment, data, gap, variant and other overrides. Methods are compared per task."""
-    variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
+    variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row[key]]
     gap = f"{row['gap']} {float(row['strength']):g}" if row["gap"] else ""
-    others = [_without_evaluation(row.get("others") or "")]
-    others += [f"{name}={row[name]}" for name in ("data_seconds", "mend") if row.get(name)]
-    return (row["env"], row["data"], gap, *variant, *filter(None, others))
+    others = row["others"]
+    if "keep=" not in others:  # a run that keeps its last policy is the same however often it is evaluated
+        others = " ".join(override for override in others.split() if not override.startswith(EVALUATION))
+    settings = [others, *(f"{name}={row[name]}" for name in ("data_seconds", "mend") if row[name])]
+    return (row["env"], row["data"], gap, *variant, *filter(None, settings))
 
 
-def _without_evaluation(others: str) -> str:
-    """Leave out overrides that have no effect on the policy of a run that keeps its last one."""
-    if "keep=" in others:
-        return others
-    return " ".join(override for override in others.split() if not override.startswith(EVALUATION))
+def placed(runs: pd.DataFrame, variants: bool) -> pd.DataFrame:
+    """Arrange runs by task, with numbers as numbers.
 
-
-def placed(rows: Iterable[Row], variants: bool) -> list[Row]:
-    """Repeat each row of an offline method for every gap of its data, since that run counts for all of them.
+    The run of an offline method is repeated for every gap of its data, since it counts for all of them.
 
     Args:
-        rows: rows of a results file.
+        runs: rows of a results file, or of its learning curves.
         variants: whether runs that differ in backbone, λ or ratio belong to different tasks, as in the ablations.
             If False, these columns are ignored.
+
+    Returns:
+        The runs, with the further column ``task``.
     """
-    rows = [dict(row) if variants else {**row, **dict.fromkeys(VARIANTS, "")} for row in rows]
-    gaps = {(*_data_of(row), row["gap"], row["strength"]) for row in rows if row["gap"]}
-    read = []
-    for row in rows:
-        present = [gap[4:] for gap in sorted(gaps) if gap[:4] == _data_of(row)]
-        if row["method"] in OFFLINE and not row["gap"] and present:
-            read += [{**row, "gap": gap, "strength": strength} for gap, strength in present]
-        else:
-            read.append(row)
-    return read
+    runs = runs if variants else runs.assign(**dict.fromkeys(VARIANTS, ""))
+    gaps = runs.loc[runs["gap"] != "", [*DATA, "gap", "strength"]].drop_duplicates()
+    offline = runs["method"].isin(OFFLINE) & (runs["gap"] == "")
+    repeated = runs[offline].drop(columns=["gap", "strength"]).merge(gaps, how="left", on=DATA).fillna("")
+    runs = pd.concat([runs[~offline], repeated], ignore_index=True)
+    runs["task"] = [task_of(row) for row in runs.to_dict("records")]
+    numbers = {"seed": int, "return_mean": float, "return_std": float, "at": int}
+    runs = runs.astype({column: kind for column, kind in numbers.items() if column in runs})
+    return runs.assign(seconds=pd.to_numeric(runs["seconds"]))
 
 
-def _data_of(row: Row) -> tuple[str, str, str, str]:
-    """Return what the run of an offline method depends on."""
-    return (row["env"], row["data"], row.get("data_seconds", ""), row["others"])
-
-
-def cells(rows: Iterable[Row]) -> dict[Task, dict[str, Cell]]:
-    """Collect rows returned by :func:`placed` into cells by task and method.
+def require_distinct(runs: pd.DataFrame) -> None:
+    """Require that no method has two runs of a seed in a task.
 
     Raises:
-        MixedRunsError: if a method has two runs of a seed in a task.
+        MixedRunsError: if one has.
     """
-    table: dict[Task, dict[str, Cell]] = defaultdict(dict)
-    for row in rows:
-        cell, seed = table[task_of(row)].setdefault(row["method"], Cell()), int(row["seed"])
-        if seed in cell.returns:
-            raise MixedRunsError(
-                f"{row['method']} has two runs of seed {seed} in {' '.join(filter(None, task_of(row)))} that differ in "
-                f"{', '.join(VARIANTS)}: record them in a separate file with results=..."
-            )
-        cell.returns[seed] = float(row["return_mean"])
-        cell.within[seed] = float(row["return_std"])
-        cell.seconds[seed] = float(row["seconds"])
-    return dict(table)
+    for row in runs[runs.duplicated(["task", "method", "seed"])].to_dict("records"):
+        task = " ".join(filter(None, row["task"]))
+        raise MixedRunsError(
+            f"{row['method']} has two runs of seed {row['seed']} in {task} that differ in "
+            f"{', '.join(VARIANTS)}: record them in a separate file with results=..."
+        )
 
 
-def normalised(value: float, reference: Reference) -> float:
+def normalised(value: Any, reference: Reference) -> Any:
     """Score of a return, linear in the return, with score 0 and score 100 at the two returns of ``reference``."""
     low, high = reference
     return 100 * (value - low) / (high - low)
 
 
+def cell(runs: pd.DataFrame) -> str:
+    """Format mean ± standard deviation over seeds (for one seed, over its episodes), and the number of seeds."""
+    spread = runs["return_mean"].std() if len(runs) > 1 else runs["return_std"].iloc[0]
+    return f"{runs['return_mean'].mean():,.0f} ± {spread:,.0f} ({len(runs)})"
+
+
 def markdown(
-    table: dict[Task, dict[str, Cell]],
+    runs: pd.DataFrame,
     titles: Mapping[str, str],
-    paper: dict[Task, dict[str, str]],
+    paper: Mapping[Task, Mapping[str, str]],
     references: Mapping[str, Reference] = REFERENCES,
 ) -> str:
     """Format the table as Markdown, our results above the paper's.
 
     Args:
-        table: from :func:`cells`.
+        runs: from :func:`placed`.
         titles: titles of the methods, in the order of the columns.
         paper: the paper's cells by task and method, as text.
         references: by environment, the returns with score 0 and score 100; other environments get no scores.
     """
-    present = [name for name in titles if any(name in methods for methods in table.values())]
-    head = ["environment", "data", "gap", "variant", "", *(titles[name] for name in present)]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-    for task in sorted(table):
+    present = [name for name in titles if (runs["method"] == name).any()]
+    lines = []
+    for task in sorted(runs["task"].unique()):
+        of_task = runs[runs["task"] == task]
+        own = dict(list(of_task.groupby("method")))
         env, data, gap, *variant = task
-        ours = [table[task][name].text() if name in table[task] else "" for name in present]
-        first = [env, data, gap, ", ".join(variant)]
-        lines.append("| " + " | ".join([*first, "ours", *ours]) + " |")
-        if len({seconds for cell in table[task].values() for seconds in cell.seconds.values()}) > 1:
-            lasts = [table[task].get(name, Cell()).lasts() for name in present]
-            lines.append("| " + " | ".join(["", "", "", "", "lasts, s", *lasts]) + " |")
+
+        def line(what: str, shown: Mapping[str, str], start: tuple[str, ...] = ("",) * 4) -> list[str]:
+            return [*start, what, *(shown.get(name, "") for name in present)]
+
+        first = (env, data, gap, ", ".join(variant))
+        lines.append(line("ours", {name: cell(of_method) for name, of_method in own.items()}, first))
+        if of_task["seconds"].nunique() > 1:
+            lines.append(line("lasts, s", {name: f"{x['seconds'].mean():.1f}" for name, x in own.items()}))
         if env in references:
-            scores = [table[task].get(name, Cell()).score(references[env]) for name in present]
-            lines.append("| " + " | ".join(["", "", "", "", "score", *scores]) + " |")
+            scores = {name: normalised(x["return_mean"].mean(), references[env]) for name, x in own.items()}
+            lines.append(line("score", {name: f"{score:.1f}" for name, score in scores.items()}))
         if task in paper:
-            theirs = [paper[task].get(name, "") for name in present]
-            lines.append("| " + " | ".join(["", "", "", "", "paper", *theirs]) + " |")
-    return "\n".join(lines)
+            lines.append(line("paper", paper[task]))
+    return markdown_table(["environment", "data", "gap", "variant", "", *(titles[name] for name in present)], lines)

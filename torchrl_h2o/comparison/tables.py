@@ -1,23 +1,17 @@
 """Writes a group's table, learning curves and aggregate scores, with the paper's numbers for comparison."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import pandas as pd
 
 from torchrl_h2o.comparison import data_size
 from torchrl_h2o.comparison.aggregates import BASE, Scores, common_scores, improvements, interquartile_means
 from torchrl_h2o.comparison.data_size_figure import draw_data_size
 from torchrl_h2o.comparison.figures import draw_aggregates, draw_curves
+from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.results_file import curves_of, read_rows
-from torchrl_h2o.comparison.scores import (
-    VARIANTS,
-    MixedRunsError,
-    Reference,
-    Row,
-    Task,
-    cells,
-    markdown,
-    placed,
-)
+from torchrl_h2o.comparison.scores import VARIANTS, MixedRunsError, Reference, Task, markdown, placed, require_distinct
 from torchrl_h2o.comparison.seed_table import seed_tables
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.whole_file import write_text
@@ -30,78 +24,82 @@ SCORES = (
 ABLATIONS = ("mixing", "backbones")  # groups that compare variants of H2O+
 
 
-def of_one_budget(rows: list[Row], updates: int | None, group: str) -> list[Row]:
+def of_one_budget(runs: pd.DataFrame, updates: int | None, group: str) -> pd.DataFrame:
     """Select the runs trained for one number of updates, so that only equal budgets are compared.
 
     Raises:
         MixedRunsError: if runs differ in their number of updates and ``updates`` is None.
     """
-    budgets = sorted({int(row["updates"]) for row in rows})
+    budgets = sorted(map(int, runs["updates"].unique()))
     if updates is None and len(budgets) > 1:
         raise MixedRunsError(f"{group}.csv holds runs of {budgets} updates: choose one with updates=...")
-    return [row for row in rows if updates is None or int(row["updates"]) == updates]
+    return runs if updates is None else runs[runs["updates"] == str(updates)]
 
 
-def report(group: str, rows: list[Row], results: Path, to: Path, references: dict[str, Reference], reps: int) -> None:
+def report(
+    group: str,
+    runs: pd.DataFrame,
+    results: Path,
+    to: Path,
+    references: Mapping[str, Reference],
+    paper: pd.DataFrame,
+    reps: int,
+) -> None:
     """Write a group's table, learning curves and aggregate scores, and print the table.
 
     Args:
         group: name of the table or figure.
-        rows: rows of its results file, all with the same number of updates.
+        runs: rows of its results file, all with the same number of updates.
         results: folder of the results files.
         to: folder to write to.
         references: by environment, the returns with score 0 and score 100.
+        paper: the paper's results.
         reps: number of bootstrap samples.
 
     Raises:
         MixedRunsError: if a method has two runs of a seed in a task.
     """
-    variants = group in ABLATIONS
-    table = cells(placed(rows, variants))
-    theirs = paper_cells(read_rows(results / "paper.csv"), group, table)
+    table = placed(runs, group in ABLATIONS)
+    require_distinct(table)
+    theirs = paper_cells(paper, group, set(table["task"]))
     lines = [markdown(table, TITLES, theirs, references), ""]
     lines.append(
         "Returns in reality: mean ± standard deviation over seeds (number of seeds); for one seed, over its episodes."
     )
-    kept = "" if any("keep=" in row["others"] for row in rows) else ", with the last policy"
-    lines.append(f"After {int(rows[0]['updates']):,} updates{kept}.")
+    kept = "" if runs["others"].str.contains("keep=").any() else ", with the last policy"
+    lines.append(f"After {int(runs['updates'].iloc[0]):,} updates{kept}.")
     if theirs:
         lines.append("The paper's results: five seeds, 1,000,000 updates, D4RL's data.")
     lines.append(SCORES)
     (to / f"{group}_aggregates.png").unlink(missing_ok=True)  # it may show earlier runs
-    if unknown := sorted({task[0] for task in table} - references.keys()):
+    if unknown := sorted(set(table["env"]) - references.keys()):
         lines.append(f"Scores need the returns that score 0 and 100: +references.{unknown[0]}=[...,...].")
-    elif len({name for methods in table.values() for name in methods}) > 1:
-        lines += ["", *aggregate_lines(group, common_scores(table, references), len(table), to, reps)]
-    text = "\n".join(lines) + "\n"
-    to.mkdir(parents=True, exist_ok=True)
-    write_text(to / f"{group}.md", text)
-    print(f"\n{group}\n\n{text}")
-    budget = {row["updates"] for row in rows}
-    curves = [row for row in read_rows(curves_of(results / f"{group}.csv")) if row["updates"] in budget]
-    if curves:
-        draw_curves(to / f"{group}_curves.png", placed(curves, variants), TITLES)
+    elif table["method"].nunique() > 1:
+        num_tasks = table["task"].nunique()
+        lines += ["", *aggregate_lines(group, common_scores(table, references), num_tasks, to, reps)]
+    _write(to, group, "\n".join(lines) + "\n")
+    curves = read_rows(curves_of(results / f"{group}.csv"))
+    curves = curves[curves["updates"].isin(set(runs["updates"]))]
+    if len(curves):
+        draw_curves(to / f"{group}_curves.png", placed(curves, group in ABLATIONS), TITLES)
 
 
-def report_data_size(rows: list[Row], to: Path, reps: int) -> None:
+def report_data_size(runs: pd.DataFrame, to: Path, reps: int) -> None:
     """Write data_size.md and data_size.png, and print the table.
 
     Args:
-        rows: rows of the results file of ``figure=data_size``; any part of the grid.
+        runs: rows of the results file of ``figure=data_size``; any part of the grid.
         to: folder to write to.
         reps: number of bootstrap samples.
 
     Raises:
         MixedRunsError: if two runs differ in settings that the figure does not show.
     """
-    points = data_size.points_of(rows)
-    if not points:
+    points = data_size.points_of(runs)
+    if not len(points):
         raise MixedRunsError("data_size.csv holds no run of the figure that uses real data")
-    budgets = " or ".join(f"{int(updates):,}" for updates in sorted({row["updates"] for row in rows}, key=int))
-    text = f"{data_size.markdown(points)}\nAfter {budgets} updates, with the last policy.\n"
-    to.mkdir(parents=True, exist_ok=True)
-    write_text(to / "data_size.md", text)
-    print(f"\ndata_size\n\n{text}")
+    budgets = " or ".join(f"{updates:,}" for updates in sorted(map(int, runs["updates"].unique())))
+    _write(to, "data_size", f"{data_size.markdown(points)}\nAfter {budgets} updates, with the last policy.\n")
     draw_data_size(to / "data_size.png", points, reps)
 
 
@@ -117,9 +115,13 @@ def report_seeds(results: Path, group: str, to: Path, at: Sequence[int]) -> None
     text = seed_tables(read_rows(results / f"{group}.csv"))
     if at:
         text += "\nDuring training:\n\n" + seed_tables(read_rows(curves_of(results / f"{group}.csv")), at)
+    _write(to, f"{group}_by_seed", text)
+
+
+def _write(to: Path, name: str, text: str) -> None:
     to.mkdir(parents=True, exist_ok=True)
-    write_text(to / f"{group}_by_seed.md", text)
-    print(f"\n{group} by seed\n\n{text}")
+    write_text(to / f"{name}.md", text)
+    print(f"\n{name.replace('_by_seed', ' by seed')}\n\n{text}")
 
 
 def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: int) -> list[str]:
@@ -138,28 +140,25 @@ def aggregate_lines(group: str, scores: Scores, num_tasks: int, to: Path, reps: 
 
 def aggregate_table(means: dict, better: dict) -> str:
     """Format interquartile means and probabilities of improvement as a Markdown table, one line per method."""
-    lines = ["| method | interquartile mean of the normalised score | P(H2O+ does better) |", "| --- | --- | --- |"]
-    for name in (name for name in TITLES if name in means):
-        chance = better[name].text() if name in better else ""
-        lines.append(f"| {TITLES[name]} | {means[name].text()} | {chance} |")
-    return "\n".join(lines)
+    head = ["method", "interquartile mean of the normalised score", "P(H2O+ does better)"]
+    names = [name for name in TITLES if name in means]
+    rows = [[TITLES[name], means[name].text(), better[name].text() if name in better else ""] for name in names]
+    return markdown_table(head, rows)
 
 
-def paper_cells(rows: Sequence[Row], group: str, table: dict[Task, dict]) -> dict[Task, dict[str, str]]:
+def paper_cells(results: pd.DataFrame, group: str, tasks: set[Task]) -> dict[Task, dict[str, str]]:
     """Format the paper's results for the tasks of a table, as text by task and method.
 
     Args:
-        rows: rows of results/paper.csv.
+        results: rows of recipes/paper.csv.
         group: name of the table or figure.
-        table: our cells.
+        tasks: the tasks of the table.
     """
     cells: dict[Task, dict[str, str]] = {}
-    for row in rows:
-        if row["group"] != group:
-            continue
+    for row in results[results["group"] == group].to_dict("records"):
         asked = (row["env"], row["data"], f"{row['gap']} {float(row['strength']):g}")
         variant = [f"{name} {row[key]}".strip() for key, name in VARIANTS.items() if row.get(key)]
-        for task in table:
+        for task in tasks:
             if task[:3] == asked and all(part in task[3:] for part in variant):
                 text = f"{float(row['return_mean']):,.0f} ± {float(row['return_std']):,.0f}"
                 cells.setdefault(task, {})[row["method"]] = text

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from cases import draw_case
-from families import FAMILIES
 from machine_cases import judge_machine
+from running import FAMILIES
 
 from torchrl_h2o.effects import ActionBias, ActionLag, Gravity, JointForce, JointSpring, ObservationDelay
 from torchrl_h2o.residuals import Measured, residuals

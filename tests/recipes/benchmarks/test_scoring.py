@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cases import draw_case
-from families import FAMILIES
+from running import FAMILIES
 from scoring import (
     is_exact_set,
     is_listed_set,

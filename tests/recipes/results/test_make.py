@@ -1,0 +1,119 @@
+"""The tables of stored runs: they come from one commit, and each run is stored without folders of the machine."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchrl_h2o.comparison.records import Record, read_records
+
+HERE = Path(__file__).parents[3] / "recipes" / "results"
+MADE_BY = {"commit": "abc1234", "dirty": False, "cpu_s": 120.0, "versions": {}, "threads": 1, "instruction_set": "AVX2"}
+
+
+@pytest.fixture(scope="module")
+def make():
+    sys.path.insert(0, str(HERE))
+    try:
+        spec = importlib.util.spec_from_file_location("make_results", HERE / "make.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        yield module
+    finally:
+        sys.path.remove(str(HERE))
+
+
+def drawn(family, number, ok, seed=0, **made_by):
+    values = {"family": family, "number": number, "seed": seed, "ok": ok, "name": "", "truth": "mass", "found": "gain"}
+    return Record("drawn", f"{family}_{number}_{seed}", MADE_BY | made_by, values)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "page.md").write_text("# Page\n<!-- table: drawn -->\nold\n<!-- end -->\nafter\n")
+    return tmp_path
+
+
+def saved(folder, *records):
+    for record in records:
+        record.save(folder / "runs")
+
+
+def test_draws_that_chose_something_are_counted_apart_with_their_intervals(make, folder):
+    held = [drawn("slow", number, ok=number != 4) for number in (4, 6, 8, 9)]
+    saved(folder, *held, drawn("slow", 0, ok=True), drawn("slow", 0, ok=False, seed=1))
+    assert make.make(folder) == ["page.md"]
+    page = (folder / "page.md").read_text()
+    (line,) = [line for line in page.splitlines() if line.startswith("| `slow`")]
+    # by Wilson's formula: 3 of 5 is [23, 88 %], 1 of 1 is [21, 100 %]
+    assert "| 3 of 5 [23, 88 %] | 1 of 1 [21, 100 %] | 5 | 2 | abc1234 |" in line
+    assert "| `decoy` " in page
+    assert "not run on this code" in page
+    assert page.startswith("# Page\n")
+    assert page.endswith("<!-- end -->\nafter\n")
+    assert make.make(folder, check=True) == []
+
+
+@pytest.mark.parametrize("other", [{"commit": "def5678"}, {"dirty": True}, {"dirty": None}])
+def test_rows_of_different_code_make_no_table(make, folder, other):
+    saved(folder, drawn("slow", 4, ok=True), drawn("slow", 6, ok=True, **other))
+    before = (folder / "page.md").read_text()
+    with pytest.raises(ValueError, match=r"(?s)drawn: its rows must come from one commit.*slow_6_0"):
+        make.make(folder)
+    assert (folder / "page.md").read_text() == before
+
+
+def test_a_marker_of_no_table_is_refused(make, folder):
+    (folder / "page.md").write_text("<!-- table: drwan -->\n<!-- end -->\n")
+    with pytest.raises(ValueError, match=r"page.md: there is no table drwan; choose from"):
+        make.make(folder)
+
+
+def report_of(*effects, **others):
+    verdict = {"kind": "explained", "recommended": True}
+    told = {"unfinished": None, "made_by": MADE_BY, "effects": list(effects), "verdict": verdict, "audit": None}
+    return told | {"others": [], "sentence": "", "ended_in": None, "wall_s": 1.0} | others
+
+
+def friction(value, joint, interval=None):
+    effect = {"effect": "JointFrictionLoss", "frictionloss": value, "joints": joint}
+    parameters = {"frictionloss": {"value": value, "unit": "N·m", "ci95": interval}}
+    return {"effect": effect, "parameters": parameters, "words": f"dry friction of {joint}"}
+
+
+def test_found_values_stand_beside_the_known_ones(make, tmp_path):
+    run = tmp_path / "double_pendulum"
+    run.mkdir()
+    found = [friction(0.1, "*", [0.09, 0.11]), friction(0.05, "shoulder"), friction(0.02, "ankle")]
+    (run / "report.json").write_text(json.dumps(report_of(*found)))
+    (record,) = make.records_of(run)
+    assert (record.table, record.name) == ("machines", "double_pendulum")
+    table = make.tables_of([record])["machines"]
+    assert "| 0.15: right, 3 % off | explained | 2 | abc1234 | yes |" in table  # 0.146 N·m known; found as a sum
+    assert "| 0.1 [0.09, 0.11]: right, 18 % off |" in table  # 0.122 N·m at the elbow
+    assert "| not found |" in table  # the rotor
+    assert "| *besides* | dry friction of ankle |" in table
+
+
+@pytest.mark.parametrize("name", ["unknown_machine", "double_pendulum"])
+def test_reports_that_cannot_be_placed_are_refused(make, tmp_path, name):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "report.json").write_text(json.dumps(report_of(unfinished="search")))
+    with pytest.raises(ValueError, match="not finished" if name == "double_pendulum" else "machines.yaml"):
+        make.records_of(tmp_path / name)
+    with pytest.raises(ValueError, match=r"has no report.json, summary.json or records"):
+        make.records_of(tmp_path)
+
+
+def test_records_have_no_folder_of_the_machine(tmp_path):
+    told = {"found": "failed: no file /home/me/logs/a.txt", "rates": [1.0], "unit": "N·m/rad"}
+    path = Record("drawn", "a", MADE_BY, told).save(tmp_path)
+    assert "/home" not in path.read_text()
+    (record,) = read_records(tmp_path)
+    assert record.values == told | {"found": "failed: no file logs/a.txt"}
+
+
+def test_the_pages_that_ship_are_those_that_the_stored_runs_make(make):
+    assert make.make(HERE, check=True) == []
