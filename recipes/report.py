@@ -20,7 +20,7 @@ from torchrl_h2o.comparison.grids import FIGURES, TABLES
 from torchrl_h2o.comparison.options import ReportOptions
 from torchrl_h2o.comparison.results_file import RESULTS, read_rows, require_groups
 from torchrl_h2o.comparison.robot_figures import draw_robot
-from torchrl_h2o.comparison.robot_trajectories import kept_results
+from torchrl_h2o.comparison.robot_trajectories import robot_results
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
 from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_seeds
 
@@ -47,7 +47,7 @@ def main(cfg: DictConfig) -> None:
             refused.append(str(error))
             continue
         if group == "wheel_legged":
-            draw_robot(to, kept_results(results / f"{group}_figures.npz", Path(cfg.runs) / group, rows))
+            draw_robot(to, robot_results(Path(cfg.runs) / group, rows))
     for group in cfg.by_seed:
         report_seeds(results, group, to, tuple(cfg.at))
     if refused:

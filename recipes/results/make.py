@@ -11,6 +11,7 @@ from one commit without changes; otherwise no page is written, and the commits a
 
 import json
 import re
+import shlex
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -18,6 +19,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import pages
+from omegaconf import OmegaConf
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.commands.one_line_errors import one_line_errors
@@ -71,6 +73,10 @@ def _values_of_report(report: dict) -> dict:
 
 def _record_of_training(folder: Path) -> Record:
     summary, cfg = json.loads((folder / "summary.json").read_text()), load_config(folder)
+    OmegaConf.set_struct(cfg, False)
+    cfg.method = cfg.get("method", "h2o_plus")  # h2o_plus.py has no other
+    words = shlex.split(summary["command"])
+    cfg.overrides = [word for word in words if "=" in word and not word.startswith("hydra")]
     values = run_row(cfg, summary) | {"compiled": str(cfg.compiled), "device": cfg.get("device", "cpu")}
     made_by = {key: summary[key] for key in ("commit", "dirty", "versions", "cpu_s", "threads", "instruction_set")}
     settings = [str(values[key]) for key in pages.SETTINGS] + [made_by["instruction_set"]]

@@ -2,14 +2,13 @@
 
 import json
 import math
-import shutil
 
 import numpy as np
 import pytest
 
 from torchrl_h2o.comparison.results_file import append_run, read_rows
 from torchrl_h2o.comparison.robot_figures import draw_robot, draw_trajectories
-from torchrl_h2o.comparison.robot_trajectories import EVERY, counted, kept_results, simulated_states, spread_entropy
+from torchrl_h2o.comparison.robot_trajectories import EVERY, counted, robot_results, simulated_states, spread_entropy
 from torchrl_h2o.envs.wheel_legged.env import MAX_PITCH
 from torchrl_h2o.training.job import run_job
 from torchrl_h2o.training.methods import METHODS
@@ -24,10 +23,8 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     run_job(cfg, folder, [METHODS["h2o_plus"]])
     append_run(tmp_path / "wheel_legged.csv", cfg, folder)
     rows = read_rows(tmp_path / "wheel_legged.csv")
-    kept = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
-    (run,) = {key.partition(" ")[2] for key in kept}
-    assert run.startswith("h2o_plus wheel_legged/standing_still recorded - - - - 0 20 expectile 0.1 True ")
-    way, states = kept[f"way {run}"], kept[f"states {run}"]
+    found = robot_results(tmp_path / "runs", rows)
+    (way,), (states,) = (found[kind]["standing_still", "h2o_plus"] for kind in ("way", "states"))
     assert way.shape == (5, 7)  # 1.5 s
     lasts = json.loads((folder / "summary.json").read_text())["return_real"]["mean_length"] * cfg.env.seconds_per_step
     seen = (~np.isnan(way)).sum() / 5 * EVERY
@@ -41,11 +38,8 @@ def test_what_is_shown_is_the_run_s_table_and_its_data_in_their_units(compose, t
     assert abs(rate[0]) <= 0.05 + 1e-3
     assert 0.05 < abs(pitch).max() < 1.5 * MAX_PITCH  # rad; episodes end at MAX_PITCH
 
-    shutil.rmtree(folder)
-    again = kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows)
-    np.testing.assert_equal(again, kept)
-    assert not kept_results(tmp_path / "kept.npz", tmp_path / "runs", rows.assign(mixing="0.9"))
-    draw_robot(tmp_path, again)
+    assert robot_results(tmp_path / "runs", rows.assign(mixing="0.9")) == {"way": {}, "states": {}}
+    draw_robot(tmp_path, found)
     for name in ("wheel_legged_trajectories.png", "wheel_legged_diversity.png"):
         assert (tmp_path / name).stat().st_size > 10_000
 

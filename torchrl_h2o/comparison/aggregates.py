@@ -60,8 +60,8 @@ def common_scores(placed: pd.DataFrame, references: Mapping[str, Reference] = RE
         placed: runs from :func:`~torchrl_h2o.comparison.scores.placed`.
         references: by environment, the returns with score 0 and score 100.
     """
-    returns = placed.pivot(index="seed", columns=["task", "method"], values="return_mean")
-    has = {key: set(returns.index[returns[key].notna()]) for key in returns}  # seeds by task and method
+    returns = {key: runs.set_index("seed")["return_mean"] for key, runs in placed.groupby(["task", "method"])}
+    has = {key: set(values.index) for key, values in returns.items()}  # seeds by task and method
     present = sorted({method for _, method in has})
     methods = [name for name in SIX if name in present] or present
     tasks = sorted(task for task in {task for task, _ in has} if all((task, name) in has for name in methods))
@@ -75,7 +75,7 @@ def common_scores(placed: pd.DataFrame, references: Mapping[str, Reference] = RE
         # an offline method's run does not depend on the gap
         seen = [(*task[:2], "" if name in OFFLINE else task[2], *task[3:]) for task in tasks]
         own = dict(zip(seen, tasks, strict=True))  # one task for each distinct run
-        scores = [normalised(returns.loc[seeds, (task, name)], references[task[0]]) for task in own.values()]
+        scores = [normalised(returns[task, name][seeds].to_numpy(), references[task[0]]) for task in own.values()]
         runs[name] = np.array(scores).T
         columns[name] = np.array([list(own).index(run) for run in seen], dtype=int)
     return Scores(runs, columns, tasks, seeds)

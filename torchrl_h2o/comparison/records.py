@@ -9,14 +9,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from torchrl_h2o.provenance import provenance
 from torchrl_h2o.whole_file import write_text
-
-FOLDER = "records"  # of a benchmark's run, and below it one folder for each table
 
 
 @dataclass(frozen=True)
@@ -61,9 +59,11 @@ class Record:
 
 
 def read_records(folder: Path, table: str = "*") -> Iterator[Record]:
-    """Read the records below a folder, of one table or of all, in the order of their names."""
+    """Read the records below a folder, of one table or of all, in the order of their names; other files are ignored."""
+    names = {field.name for field in fields(Record)}
     for path in sorted(folder.glob(f"{table}/*.json")):
-        yield Record(**json.loads(path.read_text()))
+        if (entries := json.loads(path.read_text())).keys() == names:
+            yield Record(**entries)
 
 
 def shorten_paths(text: str) -> str:

@@ -174,7 +174,7 @@ def append_rows(path: Path, rows: pd.DataFrame) -> None:
         if len(earlier) and set(earlier.columns) != set(rows.columns):
             raise ValueError(f"{path} has the columns {', '.join(earlier.columns)}, so it is no file of such results")
         with whole_file(path) as partial:
-            pd.concat([earlier, rows]).to_csv(partial, index=False, columns=list(rows.columns))
+            pd.concat([earlier, rows.astype(str)]).to_csv(partial, index=False, columns=list(rows.columns))
 
 
 def adopt_runs(path: Path, runs: Iterable[Mapping[str, str]]) -> None:

@@ -18,21 +18,17 @@ LIMITS = {"standing_still": (-1.0, 1.0), "moving_forward": (-0.5, 1.0)}
 LABELS = {"standing_still": "displacement (m)", "moving_forward": "velocity (m/s)"}
 
 
-def draw_robot(to: Path, kept: Mapping[str, np.ndarray]) -> None:
+def draw_robot(to: Path, results: Mapping[str, Mapping[tuple[str, str], list[np.ndarray]]]) -> None:
     """Draw wheel_legged_trajectories.png and wheel_legged_diversity.png.
 
     Args:
         to: folder to write to.
-        kept: arrays from :func:`~torchrl_h2o.comparison.robot_trajectories.kept_results`.
+        results: from :func:`~torchrl_h2o.comparison.robot_trajectories.robot_results`.
     """
-    by_kind: dict[str, dict[tuple[str, str], list[np.ndarray]]] = {"way": {}, "states": {}}
-    for key, array in sorted(kept.items()):
-        kind, method, env, *_ = key.split(" ")
-        by_kind[kind].setdefault((env.rpartition("/")[2], method), []).append(array)
-    if by_kind["way"]:
-        draw_trajectories(to / "wheel_legged_trajectories.png", by_kind["way"])
-    if by_kind["states"]:
-        draw_diversity(to / "wheel_legged_diversity.png", by_kind["states"])
+    if results["way"]:
+        draw_trajectories(to / "wheel_legged_trajectories.png", results["way"])
+    if results["states"]:
+        draw_diversity(to / "wheel_legged_diversity.png", results["states"])
 
 
 def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray]]) -> None:

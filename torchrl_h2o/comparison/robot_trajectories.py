@@ -1,11 +1,6 @@
-"""Extracts the data of the paper's Figures 3 and 4 from runs: trajectories in reality, states in the simulator.
+"""Reads the data of the paper's Figures 3 and 4 from run folders: motion in reality, states in the simulator."""
 
-The data are stored in wheel_legged_figures.npz beside the results, because run folders are temporary. The NPZ file has
-two arrays per run: ``way <run>``, trajectories ``[episodes, T]`` sampled every 0.2 s with NaN after a fall, and
-``states <run>``, a histogram ``[pitch, pitch rate]`` (H2O and H2O+ only). ``<run>`` is the run's identity in the CSV
-file, with ``-`` for empty columns.
-"""
-
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -17,7 +12,7 @@ from omegaconf import DictConfig
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_h2o.comparison.results_file import IDENTITY, identity
+from torchrl_h2o.comparison.results_file import identity, recorded
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
 from torchrl_h2o.training.checkpoint import load_checkpoint
 from torchrl_h2o.training.config_file import load_config
@@ -26,7 +21,6 @@ from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import SEED
 from torchrl_h2o.training.run_folder import checkpoint_folder
 from torchrl_h2o.training.trained_policy import load_policy
-from torchrl_h2o.whole_file import whole_file
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
 EVERY = 0.2  # s
@@ -35,31 +29,25 @@ COMPARED = ("h2o", "h2o_plus")  # the methods whose simulated data the paper com
 BINS = (np.linspace(-0.55, 0.55, 56), np.linspace(-8.0, 8.0, 65))  # of pitch (rad) and pitch rate (rad/s)
 
 
-def kept_results(path: Path, runs: Path, told: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Add requested runs that the NPZ file does not have from their folders, and return the arrays of these runs.
+def robot_results(runs: Path, told: pd.DataFrame) -> dict[str, dict[tuple[str, str], list[np.ndarray]]]:
+    """Read the requested runs from their folders.
 
     Args:
-        path: NPZ file, created if missing.
         runs: folder of the group's runs.
         told: rows of the results file for the requested runs; other runs are ignored.
 
     Returns:
-        Arrays by the keys ``way <run>`` and ``states <run>``.
+        By task and method a list of arrays, one per run: ``way``, trajectories ``[episodes, T]`` sampled every 0.2 s
+        with NaN after a fall, and ``states``, histograms ``[pitch, pitch rate]`` (H2O and H2O+ only).
     """
-    who = told[list(IDENTITY)]
-    asked = {tuple(row): " ".join(value or "-" for value in row) for row in who.itertuples(index=False, name=None)}
-    arrays = dict(np.load(path)) if path.exists() else {}
+    asked, found = recorded(told), {"way": defaultdict(list), "states": defaultdict(list)}
     for summary in sorted(runs.glob("*/summary.json")):
-        cfg = load_config(summary.parent)
-        name = asked.get(tuple(identity(cfg).values()))
-        if name is not None and f"way {name}" not in arrays:
-            arrays[f"way {name}"] = ways(cfg, summary.parent)
+        cfg, folder = load_config(summary.parent), summary.parent
+        if tuple(identity(cfg).values()) in asked:
+            found["way"][cfg.env.make.task, cfg.method].append(ways(cfg, folder))
             if cfg.method in COMPARED:
-                arrays[f"states {name}"] = counted(simulated_states(cfg, summary.parent))
-    if arrays:
-        with whole_file(path) as partial:
-            np.savez_compressed(partial, **arrays)
-    return {key: array for key, array in arrays.items() if key.partition(" ")[2] in asked.values()}
+                found["states"][cfg.env.make.task, cfg.method].append(counted(simulated_states(cfg, folder)))
+    return {kind: dict(arrays) for kind, arrays in found.items()}
 
 
 def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
