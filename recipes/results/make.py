@@ -14,7 +14,7 @@ import re
 import shlex
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from pathlib import Path
 
@@ -79,7 +79,8 @@ def _record_of_training(folder: Path) -> Record:
     cfg.overrides = [word for word in words if "=" in word and not word.startswith("hydra")]
     values = run_row(cfg, summary) | {"compiled": str(cfg.compiled), "device": cfg.get("device", "cpu")}
     made_by = {key: summary[key] for key in ("commit", "dirty", "versions", "cpu_s", "threads", "instruction_set")}
-    settings = [str(values[key]) for key in pages.SETTINGS] + [made_by["instruction_set"]]
+    del values["commit"], values["versions"]
+    settings = [str((values | made_by)[key]) for key in pages.SETTINGS]
     names = (values["method"], values["env"].replace("/", "-"), sha256(" ".join(settings).encode()).hexdigest()[:8])
     return Record("training", "_".join((*names, f"seed{values['seed']}")), made_by, values)
 
@@ -105,8 +106,8 @@ def tables_of(records: Sequence[Record]) -> dict[str, str]:
         by_table[record.table].append(record)
     for table, its in by_table.items():
         require_one_commit(table, its)
-    makers: dict[str, Callable[[dict[str, list[Record]]], str]] = pages.TABLES
-    return {name: make(by_table) for name, make in makers.items()}
+    runs = {table: pages.frame(its) for table, its in by_table.items()}
+    return {name: make_table(runs) for name, make_table in pages.TABLES.items()}
 
 
 def fill(text: str, tables: dict[str, str], page: str) -> str:

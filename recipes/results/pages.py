@@ -1,12 +1,10 @@
-"""The tables of the pages in this folder, each a function from the stored records, by table, to Markdown."""
+"""The tables of the pages in this folder, each a function from the stored runs, by table, to Markdown."""
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
-from statistics import mean, stdev
 from typing import Any
 
 import pandas as pd
@@ -16,15 +14,24 @@ from scipy.stats import binomtest
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.comparison.results_file import IDENTITY
-from torchrl_h2o.comparison.seed_table import seed_tables
+from torchrl_h2o.comparison.seed_table import EPISODE, seed_tables
 
 HERE = Path(__file__).parent
 NOT_RUN = "not run on this code"
 CLOSE = 0.25  # relative error up to which a value counts as right
-WHOLE_EPISODE = 30.0  # s, an episode of the robot without a fall
 #: values that make a training another line of the table
-SETTINGS = (*(key for key in IDENTITY if key != "seed"), "compiled", "device")
-Records = Mapping[str, Sequence[Record]]  # by table
+SETTINGS = [*(key for key in IDENTITY if key != "seed"), "compiled", "device", "instruction_set"]
+Runs = Mapping[str, pd.DataFrame]  # by table, a row for each record
+
+
+def frame(records: Iterable[Record]) -> pd.DataFrame:
+    """Arrange the records of one table as rows: their names, values, commits, processors and CPU minutes."""
+    made_by = ("commit", "instruction_set")
+    rows = []
+    for record in records:
+        told = {key: record.made_by[key] or "unknown" for key in made_by}
+        rows.append({"run": record.name, **record.values, **told, "minutes": record.made_by["cpu_s"] / 60})
+    return pd.DataFrame(rows)
 
 
 @cache
@@ -46,7 +53,7 @@ def share(right: int, of: int) -> str:
     """
     if not of:
         return ""
-    low, high = binomtest(right, of).proportion_ci(method="wilson")
+    low, high = binomtest(int(right), int(of)).proportion_ci(method="wilson")
     return f"{right} of {of} [{100 * low:.0f}, {100 * high:.0f} %]"
 
 
@@ -54,92 +61,68 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-def minutes(records: Iterable[Record]) -> str:
-    return number(sum(record.made_by["cpu_s"] for record in records) / 60)
-
-
-def commit(record: Record) -> str:
-    return record.made_by["commit"] or "unknown"
-
-
 # What it finds
-def machines_table(records: Records) -> str:
+def machines_table(runs: Runs) -> str:
     """A line for each known value of each machine, with what its report says."""
-    found = {record.name: record for record in records.get("machines", ())}
+    found = {row["run"]: row for row in runs["machines"].to_dict("records")} if "machines" in runs else {}
     head = ["machine", "known", "found [95 % interval]", "verdict", "CPU min", "commit", "set with this log"]
     rows = []
     for name, machine in machines().items():
         told = [f"{known['what']} {_value(known)} ({known['by']})" for known in machine["known"]]
+        set_with = "yes" if machine["set_with"] else "no"
         if name not in found:
-            rows.append([machine["machine"], "; ".join(told) or "nothing", NOT_RUN, "", "", "", _yes(machine)])
+            rows.append([machine["machine"], "; ".join(told) or "nothing", NOT_RUN, "", "", "", set_with])
             continue
-        record = found[name]
-        effects = record.values["effects"]
-        lines = [[words, _found(effects, known)] for words, known in zip(told, machine["known"], strict=True)]
-        if others := _not_known(effects, machine["known"]):
+        run = found[name]
+        lines = [[words, _found(run["effects"], known)] for words, known in zip(told, machine["known"], strict=True)]
+        if others := _not_known(run["effects"], machine["known"]):
             lines.append(["*besides*" if lines else "nothing", others])
         first, *rest = lines or [["nothing", "nothing"]]
-        rows.append(
-            [machine["machine"], *first, verdict(record.values), minutes([record]), commit(record), _yes(machine)]
-        )
+        rows.append([machine["machine"], *first, verdict(run), number(run["minutes"]), run["commit"], set_with])
         rows += [["", *line, "", "", "", ""] for line in rest]
     return markdown_table(head, rows)
-
-
-def _yes(machine: Mapping) -> str:
-    return "yes" if machine["set_with"] else "no"
 
 
 def _value(known: Mapping) -> str:
     return f"× {known['value']}" if known["unit"] == "×" else f"{known['value']} {known['unit']}"
 
 
-def verdict(values: Mapping) -> str:
+def verdict(run: Mapping) -> str:
     """The verdict of a report, in a few words."""
-    if values["severe"]:
-        return f"stopped by the audit: {values['severe'][0]}"
-    parts = [str(values["verdict"]).replace("_", " ")]
-    if values["effects"] and not values["recommended"]:
+    if run["severe"]:
+        return f"severe finding of the audit: {run['severe'][0]}"
+    parts = [str(run["verdict"]).replace("_", " ")]
+    if run["effects"] and not run["recommended"]:
         parts.append("not recommended")
-    if values["other_sets"]:
-        parts.append(f"{values['other_sets']} other sets explain the log as well")
-    if values["ended_in"]:
-        parts.append("time was up")
-    return "; ".join(parts)
+    if run["other_sets"]:
+        parts.append(f"{run['other_sets']} other sets explain the log as well")
+    return "; ".join([*parts, *(["time was up"] if run["ended_in"] else [])])
 
 
 def _matching(effects: Iterable[Mapping], known: Mapping) -> list[Mapping]:
     """The effects of a report that act where a known value does."""
-    return [
-        effect
-        for effect in effects
-        if effect["effect"]["effect"] == known.get("effect")
-        and ("on" not in known or any(fnmatch(str(known["on"]), name) for name in _selected(effect["effect"])))
-    ]
 
+    def acts(effect: Mapping) -> bool:
+        chosen = [value for key, value in effect.items() if key != "effect" and isinstance(value, str | list)]
+        names = [name for value in chosen for name in ([value] if isinstance(value, str) else value)]
+        return "on" not in known or any(fnmatch(str(known["on"]), str(name)) for name in names)
 
-def _selected(effect: Mapping) -> list[str]:
-    chosen = [value for key, value in effect.items() if key != "effect" and isinstance(value, str | list)]
-    return [str(name) for value in chosen for name in (value if isinstance(value, list) else [value])]
+    return [each for each in effects if each["effect"]["effect"] == known.get("effect") and acts(each["effect"])]
 
 
 def _found(effects: Iterable[Mapping], known: Mapping) -> str:
     if "effect" not in known:
         return "not compared"
-    parameters = [_parameter(effect, known) for effect in _matching(effects, known)]
+    found = [effect["parameters"] for effect in _matching(effects, known)]
+    parameters = [entries[known.get("parameter", next(iter(entries)))] for entries in found]
     if not parameters:
         return "not found"
     values = [parameter["value"] for parameter in parameters]
     value = math.prod(values) if known["unit"] == "×" else sum(values)
     interval = parameters[0]["ci95"] if len(parameters) == 1 else None
     error = abs(abs(value) / abs(known["value"]) - 1.0)
-    words = f"{number(value)}" + (f" [{number(interval[0])}, {number(interval[1])}]" if interval else "")
+    words = number(value) + (f" [{number(interval[0])}, {number(interval[1])}]" if interval else "")
     return f"{words}: {'right' if error <= CLOSE else '**wrong**'}, {100 * error:.0f} % off"
-
-
-def _parameter(effect: Mapping, known: Mapping) -> Mapping:
-    parameters = effect["parameters"]
-    return parameters[known.get("parameter", next(iter(parameters)))]
 
 
 def _not_known(effects: Sequence[Mapping], known: Iterable[Mapping]) -> str:
@@ -147,24 +130,23 @@ def _not_known(effects: Sequence[Mapping], known: Iterable[Mapping]) -> str:
     return "; ".join(effect["words"] for effect in effects if effect not in compared)
 
 
-def sources_table(records: Records) -> str:
-    rows = [[entry["machine"], entry["source"], f"`{c}`" if (c := entry.get("command")) else ""]
-            for entry in machines().values()]  # fmt: skip
+def sources_table(runs: Runs) -> str:
+    told = [(entry, entry.get("command")) for entry in machines().values()]
+    rows = [[entry["machine"], entry["source"], f"`{command}`" if command else ""] for entry, command in told]
     return markdown_table(["machine", "source of the log", "command"], rows)
 
 
 # How often it is right
-def _chose(record: Record) -> bool:
-    """Whether something was chosen with this draw; draws of other seeds are always held back."""
-    values = record.values
-    return values["seed"] == 0 and values["number"] in drawn_families()[values["family"]]["chose"]
+def _draws(runs: Runs) -> pd.DataFrame:
+    """All drawn cases, with the column ``held``: whether nothing was chosen with them, as with all of other seeds."""
+    draws = runs.get("drawn", pd.DataFrame(columns=["family", "number", "seed", "ok"]))
+    chose = {(family, 0, draw) for family, told in drawn_families().items() for draw in told["chose"]}
+    keys = draws[["family", "seed", "number"]].itertuples(index=False, name=None)
+    return draws.assign(held=[key not in chose for key in keys])
 
 
-def drawn_table(records: Records) -> str:
+def drawn_table(runs: Runs) -> str:
     """A line for each family: draws that chose something and draws held back, apart."""
-    by_family = defaultdict(list)
-    for record in records.get("drawn", ()):
-        by_family[record.values["family"]].append(record)
     head = [
         "family",
         "right is",
@@ -174,142 +156,136 @@ def drawn_table(records: Records) -> str:
         "CPU min a draw",
         "commit",
     ]
-    rows = []
+    rows, draws = [], _draws(runs)
     for name, family in drawn_families().items():
-        own = by_family.get(name, [])
-        chose = [record for record in own if _chose(record)]
-        held = [r for r in own if r not in chose]
-        counts = [share(sum(r.values["ok"] for r in part), len(part)) for part in (held, chose)]
-        left = family["draws"] - len({r.values["number"] for r in own if r.values["seed"] == 0})
-        last = [number(float(minutes(own)) / len(own)), commit(own[0])] if own else ["", ""]
-        rows.append([f"`{name}`", family["right"], *(counts if own else [NOT_RUN, ""]), str(left or ""), *last])
+        own = draws[draws["family"] == name]
+        held, chose = own.loc[own["held"], "ok"], own.loc[~own["held"].astype(bool), "ok"]
+        counts, cost, commit = [NOT_RUN, ""], "", ""
+        if len(own):
+            counts = [share(part.sum(), len(part)) for part in (held, chose)]
+            cost, commit = number(own["minutes"].mean()), own["commit"].iloc[0]
+        left = family["draws"] - own.loc[own["seed"] == 0, "number"].nunique()
+        rows.append([f"`{name}`", family["right"], *counts, str(left or ""), cost, commit])
     return markdown_table(head, rows)
 
 
-def audit_table(records: Records) -> str:
+def audit_table(runs: Runs) -> str:
     head = ["logs", "right", "refused by the reader", "CPU s of the longest audit", "commit"]
-    rows = []
-    for r in records.get("audit", ()):
-        values, refused = r.values, r.values["refused"] or ""
-        cells = [r.name.replace("_", " "), share(values["right"], values["logs"]), str(refused)]
-        rows.append([*cells, number(values["longest_cpu_s"]), commit(r)])
+    rows = [
+        [run["run"].replace("_", " "), share(run["right"], run["logs"]), str(run["refused"] or ""),
+         number(run["longest_cpu_s"]), run["commit"]]
+        for run in (runs["audit"].to_dict("records") if "audit" in runs else ())
+    ]  # fmt: skip
     return markdown_table(head, rows or [["damaged and good logs", NOT_RUN, "", "", ""]])
 
 
 # Where it fails
-def failures_table(records: Records) -> str:
+def failures_table(runs: Runs) -> str:
     """All draws and logs of the tables above that are wrong, with what was found."""
-    rows = []
-    for values in [record.values for record in records.get("drawn", ()) if not record.values["ok"]]:
-        case = f"`{values['family']}` {values['number']}, {values['name']}"
-        rows.append([case, values["truth"], values["found"], str(values.get("verdict", ""))])
-    for record in records.get("machines", ()):
-        for known in machines()[record.name]["known"]:
-            found = _found(record.values["effects"], known)
+    draws = _draws(runs)
+    rows = [
+        [
+            f"`{draw['family']}` {draw['number']}, {draw['name']}",
+            draw["truth"],
+            draw["found"],
+            str(draw.get("verdict", "")),
+        ]
+        for draw in draws[~draws["ok"].astype(bool)].to_dict("records")
+    ]
+    for run in runs["machines"].to_dict("records") if "machines" in runs else ():
+        for known in machines()[run["run"]]["known"]:
+            found = _found(run["effects"], known)
             if "wrong" in found or found == "not found":
                 told = f"{known['what']} {_value(known)}"
-                rows.append([machines()[record.name]["machine"], told, found, verdict(record.values)])
-    for record in records.get("audit", ()):
-        rows += [[record.name.replace("_", " "), *wrong.partition(": ")[::2], ""] for wrong in record.values["wrong"]]
-    number_of_cases = sum(len(records.get(table, ())) for table in ("drawn", "machines", "audit"))
-    return markdown_table(["case", "true", "found", "verdict"], rows or [[f"none of {number_of_cases}", "", "", ""]])
+                rows.append([machines()[run["run"]]["machine"], told, found, verdict(run)])
+    for run in runs["audit"].to_dict("records") if "audit" in runs else ():
+        rows += [[run["run"].replace("_", " "), *wrong.partition(": ")[::2], ""] for wrong in run["wrong"]]
+    cases = sum(len(runs[table]) for table in ("drawn", "machines", "audit") if table in runs)
+    return markdown_table(["case", "true", "found", "verdict"], rows or [[f"none of {cases}", "", "", ""]])
 
 
 # Training
-def _groups(records: Records) -> dict[tuple, list[Record]]:
-    groups = defaultdict(list)
-    for record in records.get("training", ()):
-        processor = record.made_by["instruction_set"]
-        groups[(*(str(record.values[key]) for key in SETTINGS), processor)].append(record)
-    return dict(sorted(groups.items()))
+def _trainings(runs: Runs) -> pd.DataFrame:
+    if "training" not in runs:
+        return pd.DataFrame(columns=[*SETTINGS, "seconds"])
+    told = runs["training"]
+    numbers = ["return_mean", "return_data", "seconds", "max_abs_x"]
+    return told.assign(**{column: pd.to_numeric(told[column], errors="coerce") for column in numbers})
 
 
-def training_table(records: Records) -> str:
+def training_table(runs: Runs) -> str:
     """A line for each task, method and settings: seeds that stand, return, distance."""
     head = ["task", "method and settings", "processor", "whole episodes", "return", "data's return", "farthest, m"]
     rows = []
-    for key, own in _groups(records).items():
-        told, values = dict(zip(SETTINGS, key, strict=False)), [record.values for record in own]
-        shown = ("data", "data_seconds", "gap", "mend", "updates", "others")
-        settings = [f"{name} {told[name]}" for name in shown if told[name] not in ("", "recorded")]
-        stands = sum(float(run["seconds"] or 0) >= WHOLE_EPISODE for run in values)
-        whole = share(stands, len(own)) if told["env"].startswith("wheel_legged") else f"{len(own)} seeds"
-        ended = [run for run in values if run["return_mean"] != ""]
-        returns = [float(run["return_mean"]) for run in ended]
-        spread = f" ± {stdev(returns):,.0f}" if len(returns) > 1 else ""
-        far = [f"{float(run['max_abs_x']):.2f}" for run in ended if run["max_abs_x"] != ""]
-        method = "; ".join([told["method"], *settings])
-        processor = f"{told['device']} {key[-1]}, compiled={told['compiled']}"
-        found = f"{mean(returns):,.0f}{spread}" if returns else "diverged"
-        of_data = f"{float(ended[0]['return_data']):,.0f}" if ended else ""
-        cost = number(float(minutes(own)) / len(own))
-        rows.append([told["env"], method, processor, whole, found, of_data, max(far, default=""), cost, commit(own[0])])
+    for key, own in _trainings(runs).groupby(SETTINGS):
+        told = dict(zip(SETTINGS, key, strict=True))
+        shown = [name for name in ("data", "data_seconds", "gap", "mend", "updates", "others") if told[name]]
+        settings = [f"{name} {told[name]}" for name in shown if told[name] != "recorded"]
+        is_robot, returns = told["env"].startswith("wheel_legged"), own["return_mean"].dropna()
+        spread = f" ± {returns.std():,.0f}" if len(returns) > 1 else ""
+        processor = f"{told['device']} {told['instruction_set']}, compiled={told['compiled']}"
+        whole = share((own["seconds"] >= EPISODE).sum(), len(own)) if is_robot else f"{len(own)} seeds"
+        found = f"{returns.mean():,.0f}{spread}" if len(returns) else "diverged"
+        of_data = f"{own['return_data'].mean():,.0f}" if len(returns) else ""
+        far = f"{own['max_abs_x'].max():.2f}" if own["max_abs_x"].notna().any() else ""
+        last = [number(own["minutes"].mean()), own["commit"].iloc[0]]
+        rows.append([told["env"], "; ".join([told["method"], *settings]), processor, whole, found, of_data, far, *last])
     empty = ["wheel_legged/standing_still", "h2o_plus", "", NOT_RUN, *[""] * 5]
     return markdown_table([*head, "CPU min a run", "commit"], rows or [empty])
 
 
-def by_seed_table(records: Records) -> str:
+def by_seed_table(runs: Runs) -> str:
+    told = runs.get("training", pd.DataFrame({"env": []}))
+    of_robot = told[told["env"].astype(str).str.startswith("wheel_legged")]
+    if not len(of_robot):
+        return NOT_RUN
+    processor = "compiled=" + of_robot["compiled"] + " " + of_robot["instruction_set"]
+    return seed_tables(of_robot.astype(str).assign(others=(of_robot["others"] + " " + processor).str.strip()))
+
+
+def speed_table(runs: Runs) -> str:
     rows = [
-        {key: str(value) for key, value in record.values.items()} | {"others": _others(record)}
-        for record in records.get("training", ())
-        if record.values["env"].startswith("wheel_legged")
-    ]
-    return seed_tables(pd.DataFrame(rows)) if rows else NOT_RUN
-
-
-def _others(record: Record) -> str:
-    told = [record.values["others"], f"compiled={record.values['compiled']}", record.made_by["instruction_set"]]
-    return " ".join(filter(None, told))
-
-
-def speed_table(records: Records) -> str:
-    rows = [
-        [record.values["device"], name, f"{rate:,.1f}", commit(record)]
-        for record in records.get("speed", ())
-        for name, rate in record.values["updates_per_second"].items()
+        [run["device"], name, f"{rate:,.1f}", run["commit"]]
+        for run in (runs["speed"].to_dict("records") if "speed" in runs else ())
+        for name, rate in run["updates_per_second"].items()
     ]
     return markdown_table(["device", "what", "updates per second", "commit"], rows or [["", "H2O+", NOT_RUN, ""]])
 
 
-def ratio_table(records: Records) -> str:
-    groups = defaultdict(list)
-    for record in records.get("ratio", ()):
-        groups[tuple(str(record.values[key]) for key in ("system", "estimator", "rows", "steps"))].append(record)
-    shown = ("unclamped", "clamped", "ess", "accuracy", "correlation", "slope")
+def ratio_table(runs: Runs) -> str:
+    """Means over seeds, a line for each system and estimator."""
+    by = ["system", "estimator", "rows", "steps"]
+    shown = ["unclamped", "clamped", "ess", "accuracy", "correlation", "slope"]
     rows = []
-    for key, own in sorted(groups.items()):
-        values = [[r.values[name] for r in own if name in r.values] for name in shown]
-        rows.append(
-            [*key, *(f"{mean(column):.2f}" if column else "" for column in values), str(len(own)), commit(own[0])]
-        )
-    head = ["system", "estimator", "simulated rows", "updates", "mean ratio", "clamped", "effective share", "accuracy",
-            "correlation", "slope", "seeds", "commit"]  # fmt: skip
-    return markdown_table(head, rows or [["", "", "", "", NOT_RUN, *[""] * 7]])
+    for key, own in runs["ratio"].groupby(by) if "ratio" in runs else ():
+        means = own.reindex(columns=shown).mean()
+        cells = ["" if math.isnan(value) else f"{value:.2f}" for value in means]
+        rows.append([*map(str, key), *cells, str(len(own)), own["commit"].iloc[0]])
+    head = ["system", "estimator", "simulated rows", "updates", "mean ratio", "clamped", "effective share", *shown[3:]]
+    return markdown_table([*head, "seeds", "commit"], rows or [["", "", "", "", NOT_RUN, *[""] * 7]])
 
 
 # The overview
-def overview_table(records: Records) -> str:
-    drawn = records.get("drawn", ())
-    held = [record.values["ok"] for record in drawn if not _chose(record)]
-    of_robot = [r.values for r in records.get("training", ()) if r.values["env"].startswith("wheel_legged")]
-    stands = [float(values["seconds"] or 0) >= WHOLE_EPISODE for values in of_robot]
-    wrong = sum(not record.values["ok"] for record in drawn)
+def overview_table(runs: Runs) -> str:
+    draws, trainings = _draws(runs), _trainings(runs)
+    held, stands = draws.loc[draws["held"], "ok"], trainings["seconds"] >= EPISODE
+    stands = stands[trainings["env"].astype(str).str.startswith("wheel_legged")]
     rows = [
+        ["machines", "what it finds in logs of machines", f"{len(runs.get('machines', ()))} of {len(machines())} run"],
+        ["drawn", "how often it is right", f"{share(held.sum(), len(held))} draws held back" if len(held) else NOT_RUN],
+        ["failures", "where it fails", f"{len(draws) - draws['ok'].sum()} of {len(draws)} draws"],
         [
-            "machines",
-            "what it finds in logs of machines",
-            f"{len(records.get('machines', ()))} of {len(machines())} run",
+            "training",
+            "training",
+            f"robot stands in {share(stands.sum(), len(stands))} runs" if len(stands) else NOT_RUN,
         ],
-        ["drawn", "how often it is right", f"{share(sum(held), len(held))} draws held back" if held else NOT_RUN],
-        ["failures", "where it fails", f"{wrong} of {len(drawn)} draws"],
-        ["training", "training", f"robot stands in {share(sum(stands), len(stands))} runs" if stands else NOT_RUN],
     ]
     return markdown_table(
         ["page", "what is in it", "now"], [[f"[{page}.md]({page}.md)", *rest] for page, *rest in rows]
     )
 
 
-TABLES: dict[str, Callable[[Records], str]] = {
+TABLES: dict[str, Callable[[Runs], str]] = {
     "overview": overview_table,
     "machines": machines_table,
     "sources": sources_table,
