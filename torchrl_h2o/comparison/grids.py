@@ -48,17 +48,16 @@ class Grid:
         Args:
             seeds: seeds of the runs.
         """
+        worlds = [*product(self.datasets, self.gaps, self.strengths), *product(self.tasks, (None,), (None,))]
         for seed in seeds:
-            worlds = [*product(self.datasets, self.gaps, self.strengths), *product(self.tasks, (None,), (None,))]
-            done = set()
+            runs = {}  # each once
             for (world, gap, strength), method, variant in product(worlds, self.methods, self.variants):
-                # chosen_grid has checked that data sets name an environment.
+                # chosen_grid has checked that data sets name an environment
                 env, data = (world, None) if world in self.tasks else (cast(str, env_of(world)), world)
-                gap = None if method in OFFLINE else gap
-                overrides = _run(env, data, gap, strength, method, variant, seed)
-                if overrides is not None and tuple(overrides) not in done:
-                    done.add(tuple(overrides))
-                    yield overrides
+                run = _run(env, data, None if method in OFFLINE else gap, strength, method)
+                if run is not None:
+                    runs[(*run, *variant, f"seed={seed}")] = None
+            yield from map(list, runs)
 
 
 def env_of(data: str) -> str | None:
@@ -66,17 +65,16 @@ def env_of(data: str) -> str | None:
     return next((env for env in ENVS if env in data), None)
 
 
-def _run(
-    env: str, data: str | None, gap: str | None, strength: float | None, method: str, variant: tuple, seed: int
-) -> list[str] | None:
+def _run(env: str, data: str | None, gap: str | None, strength: float | None, method: str) -> list[str] | None:
+    """Overrides of a run without its variant and seed; None for a gap that the environment does not have."""
     chosen = [f"method={method}", f"env={env}"]
-    if data is not None:
-        if gap is not None and ENVS[env] not in PAPER_GAPS[gap].tasks:
-            return None
-        chosen += [f"data={data}", f"gap={'null' if gap is None else gap}"]
-        if gap is not None and strength is not None:
-            chosen.append(f"gap_strength={strength}")
-    return [*chosen, *variant, f"seed={seed}"]
+    if data is None:
+        return chosen
+    if gap is None:
+        return [*chosen, f"data={data}", "gap=null"]
+    if ENVS[env] not in PAPER_GAPS[gap].tasks:
+        return None
+    return [*chosen, f"data={data}", f"gap={gap}", *([] if strength is None else [f"gap_strength={strength}"])]
 
 
 WHOLE = 83.0  # s, all real data: the recording and the real robot's log both have 16,588 rows, 82.94 s
@@ -148,29 +146,20 @@ class DataSizeGrid:
         Args:
             seeds: seeds of the runs.
         """
+        tasks = [task for task in self.tasks if task != LOG or self.log is not None]
+        worlds = [(task, size) for task in tasks for size in DATA_SIZE_TASKS[task] if size in self.sizes]
         for seed in seeds:
-            done = set()
-            for task in self.tasks:
-                for size in (size for size in DATA_SIZE_TASKS[task] if size in self.sizes):
-                    for method in self.methods:
-                        run = tuple(self._run(task, size, method, seed))
-                        if run not in done and not (task == LOG and self.log is None):
-                            done.add(run)
-                            yield list(run)
+            runs = [(*self._run(*world, method), f"seed={seed}") for world in worlds for method in self.methods]
+            yield from map(list, dict.fromkeys(runs))
 
-    def _run(self, task: str, size: float, method: str, seed: int) -> list[str]:
+    def _run(self, task: str, size: float, method: str) -> list[str]:
         name, suffix = split_suffix(method)
+        env = "wheel_legged" if task == LOG else task
         if name == "sac" and not suffix:
-            env = "wheel_legged_forward" if task == "wheel_legged_forward" else "wheel_legged"
-            return [f"method={name}", f"env={env}", f"seed={seed}"]
-        chosen = [f"method={name}", f"env={'wheel_legged' if task == LOG else task}"]
-        if task == LOG:
-            chosen.append(f"data={self.log}")
-        if size != WHOLE:
-            chosen.append(f"data_seconds={size:g}")
-        if suffix:
-            chosen.append(f"mend={MEND[suffix]}")
-        return [*chosen, f"seed={seed}"]
+            return [f"method={name}", f"env={env.removesuffix('_poor')}"]
+        chosen = [f"method={name}", f"env={env}", *([f"data={self.log}"] if task == LOG else [])]
+        chosen += [f"data_seconds={size:g}"] if size != WHOLE else []
+        return chosen + ([f"mend={MEND[suffix]}"] if suffix else [])
 
 
 WITHOUT_RATIO = ("mixing=0.1", "ratio=false")
