@@ -50,7 +50,7 @@ def test_without_next_observations_no_row_links_two_episodes(tmp_path, log_messa
     assert "3 of 8 rows dropped" in log_messages[-1]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(st.integers(2, 5), st.booleans()), min_size=1, max_size=6))
 def test_observations_chain_inside_episodes_only(tmp_path_factory, drawn):
     lengths, endings = zip(*drawn, strict=True)
@@ -79,7 +79,7 @@ def test_episode_cut_by_the_end_of_the_file_is_truncated(tmp_path):
     assert td["next", "truncated"].flatten().tolist() == [False, False, True, False, False, True]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=7, deadline=None)
 @given(st.lists(st.integers(1, 4), min_size=1, max_size=5))
 def test_episodes_without_flags_are_not_linked(tmp_path_factory, lengths):
     made = make_arrays(lengths, [False] * len(lengths))
@@ -148,7 +148,7 @@ def test_array_of_the_wrong_kind_is_refused(tmp_path):
         read_d4rl(write(tmp_path / "c.hdf5", next_observations=np.zeros((8, 2))))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=7, deadline=None)
 @given(
     st.integers(0, 7),
     st.sampled_from([("observations", 2), ("actions", 1), ("rewards", None)]),

@@ -71,7 +71,7 @@ def test_rows_behind_the_end_have_to_be_declared(tmp_path):
     ]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.booleans(), min_size=2, max_size=12))
 def test_no_transition_leaves_a_done_row_or_links_two_runs(tmp_path_factory, done):
     lines = [f"{1000 * i} 0 {int(ended)}\n" for i, ended in enumerate(done)]
@@ -197,7 +197,7 @@ def test_trailing_zero_rows_are_dropped_only_when_asked(tmp_path, log_messages):
         read_robot_log(timed(tmp_path, [(0, 0, 0)] * 5), changed(TIMED, drop_trailing_zero_rows=True))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     row=st.integers(0, 5),
     column=st.integers(0, 2),

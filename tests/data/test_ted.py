@@ -31,7 +31,7 @@ def test_entries_have_ted_names_shapes_and_dtypes():
     assert td["next", "reward"].shape == (8, 1)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=7, deadline=None)
 @given(recordings())
 def test_episodes_survive_a_memory_map(td):
     with tempfile.TemporaryDirectory() as folder:
@@ -146,7 +146,7 @@ def test_failed_write_leaves_nothing(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     row=st.integers(0, 7),
     column=st.integers(0, 1),
@@ -238,7 +238,7 @@ def test_entry_that_is_no_vector_a_step_is_refused(key, shape):
     assert caught.value.column == key
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=7, deadline=None)
 @given(recordings())
 def test_whole_episodes_are_continuous(td):
     require_continuous(td)

@@ -12,7 +12,7 @@ from torchrl_h2o.commands.column_names import as_key
 from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
-from torchrl_h2o.data.readers.guess.layout_text import guess_layout
+from torchrl_h2o.data.readers.guess.layout import guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
 from torchrl_h2o.effects.model.servo import is_servo
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names

@@ -27,7 +27,7 @@ def motion(time):
     return np.sin(3 * time) + 0.5 * np.sin(11 * time + 1), 3 * np.cos(3 * time) + 5.5 * np.cos(11 * time + 1)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     dt=st.sampled_from([0.002, 0.005, 0.01]),
     noise=st.sampled_from([1e-4, 1e-3, 1e-2]),

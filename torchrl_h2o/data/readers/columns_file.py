@@ -10,37 +10,19 @@ from collections.abc import Mapping
 from dataclasses import fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import yaml
 
 from torchrl_h2o.data.readers.error import DataError
-
-Layout = TypeVar("Layout")
+from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 
 LARGEST_FILE = 2**20  # bytes of a column description
 MOST_ENTRIES = 20_000  # entries of a column description after its aliases are expanded
 
 
-def read_layout(source: str | Path | Mapping[str, Any], layout: type[Layout], column: type) -> Layout:
-    """Read a YAML file, or its entries, into a dataclass whose field ``columns`` is a tuple of another dataclass.
-
-    Both classes are arguments, so that :class:`LogColumns` can call this function without a circular import.
-
-    Args:
-        source: a YAML file, the name of a layout in the package, or the entries of such a file.
-        layout: the class of the layout, :class:`LogColumns`.
-        column: the class of a column, :class:`Column`, with the field ``name``.
-
-    Raises:
-        DataError: a missing file, invalid YAML, an unknown, duplicate or invalid entry, or contradicting entries.
-
-    Example:
-        >>> from torchrl_h2o.data.readers.columns_file import read_layout
-        >>> from torchrl_h2o.data.readers.log_columns import Column, LogColumns
-        >>> read_layout("simple_pendulum", LogColumns, Column).action
-        ('torque',)
-    """
+def read_layout(source: str | Path | Mapping[str, Any]) -> LogColumns:
+    """Read a layout; see :meth:`LogColumns.load`."""
     if isinstance(source, Mapping):
         entries, source = dict(source), "columns"
     elif isinstance(source, str | Path):
@@ -48,14 +30,14 @@ def read_layout(source: str | Path | Mapping[str, Any], layout: type[Layout], co
     else:
         problem = f"columns={source!r} describes no columns"
         raise DataError(problem, "give LogColumns, the path of a YAML file, or its entries as a mapping")
-    known = _known_entries(layout, entries, source)
-    if not isinstance(known.get("columns"), list) or not known["columns"]:
+    known = _known_entries(LogColumns, entries, source)
+    if not isinstance(known.get("columns"), list | tuple) or not known["columns"]:
         raise DataError("'columns' is not a list", "list the file's columns", source=source)
-    columns = tuple(
-        _build_column(column, {"name": f"column {number}", **_known_entries(column, entry, source)}, source)
-        for number, entry in enumerate(known["columns"], start=1)
-    )
-    return _build(layout, {**known, "columns": columns}, source)
+    columns = []
+    for number, entry in enumerate(known["columns"], start=1):
+        named = {"name": f"column {number}", **_known_entries(Column, entry, source)}
+        columns.append(_build(Column, named, source, column=str(named["name"])))
+    return _build(LogColumns, {**known, "columns": tuple(columns)}, source)
 
 
 def _entries_of(source: str | Path) -> Any:
@@ -140,23 +122,13 @@ def _known_entries(kind: type, entries: Any, source: str | Path) -> dict[str, An
     return entries
 
 
-def _build_column(kind: type, entries: dict[str, Any], source: str | Path) -> Any:
-    return _build(kind, entries, source, column=str(entries["name"]))
-
-
 def _build(kind: type, entries: dict[str, Any], source: str | Path, column: str | None = None) -> Any:
-    convert = {
-        "dt": lambda name, value: None if value is None else _number(name, value),
-        "resample": lambda name, value: None if value is None else _number(name, value),
-        "scale": _number,
-        "offset": _number,
-        "time_tolerance": _number,
-        "bounds": _pair,
-        "observation": _names,
-        "action": _names,
-    }
     try:
-        values = {name: convert[name](name, value) if name in convert else value for name, value in entries.items()}
+        values = {
+            name: _CONVERTED[name](name, value) if name in _CONVERTED else value
+            for name, value in entries.items()
+            if value is not None or name not in _MAY_BE_NULL
+        }
         return kind(**values)
     except (ValueError, TypeError) as error:
         raise DataError(str(error), "correct the column description", source=source, column=column) from error
@@ -172,17 +144,18 @@ def _number(name: str, value: Any) -> float:
     raise ValueError(f"{name}: {value!r} is not a number; give the unit in its own entry, and dt in s")
 
 
-def _pair(name: str, value: Any) -> tuple[float, float] | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != 2:
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, list | tuple) or len(value) != 2:
         raise ValueError(f"{name}: {value!r} must be [lowest, highest]")
     return _number(name, value[0]), _number(name, value[1])
 
 
 def _names(name: str, value: Any) -> tuple[str, ...]:
-    if value is None:
-        return ()
-    if not isinstance(value, list) or not all(isinstance(entry, str) for entry in value):
+    if not isinstance(value, list | tuple) or not all(isinstance(entry, str) for entry in value):
         raise ValueError(f"{name}: {value!r} must be a list of column names; quote on, off and numbers")
     return tuple(value)
+
+
+_MAY_BE_NULL = ("dt", "resample", "bounds", "observation", "action")
+_NUMBERS = ("dt", "resample", "scale", "offset", "time_tolerance")
+_CONVERTED = {**dict.fromkeys(_NUMBERS, _number), "bounds": _pair, "observation": _names, "action": _names}

@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from torchrl_h2o.data.readers.units import to_si
 
 _MOST_JUMPS = 0.3  # share of rows that may differ from the row before by more than half a turn of the angle
-ROLES = ("observation", "action", "reward", "done", "time", "run", "ignore")
+Role = Literal["observation", "action", "reward", "done", "time", "run", "ignore"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Column:
     """
 
     name: str
-    role: Literal["observation", "action", "reward", "done", "time", "run", "ignore"]
+    role: Role
     unit: str = "1"
     scale: float = 1.0
     offset: float = 0.0
@@ -60,8 +60,8 @@ class Column:
     def __post_init__(self):
         if not isinstance(self.name, str):
             raise ValueError(f"name {self.name!r} is not a string: quote it (YAML reads on, off, yes, no as booleans)")
-        if self.role not in ROLES:
-            raise ValueError(f"unknown role {self.role!r}; choose from {', '.join(ROLES)}")
+        if self.role not in get_args(Role):
+            raise ValueError(f"unknown role {self.role!r}; choose from {', '.join(get_args(Role))}")
         try:
             si_unit, _ = to_si(self.unit)
         except KeyError as error:
@@ -215,17 +215,9 @@ class LogColumns:
             )
         if not 0 < self.time_tolerance < math.inf:
             raise ValueError(f"time_tolerance {self.time_tolerance} must be positive")
-        for name, allowed in (
-            ("outside_bounds", ("error", "clip")),
-            ("on_time_jump", ("error", "split")),
-            ("after_done", ("error", "drop", "new_episode")),
-            ("header", (True, False)),
-            ("decimal", (".", ",")),
-            ("other_columns", ("error", "ignore")),
-            ("drop_trailing_zero_rows", (True, False)),
-            ("free_motion", (True, False)),
-        ):
-            if getattr(self, name) not in allowed:
+        for name, kind in get_type_hints(type(self)).items():
+            allowed = (True, False) if kind is bool else get_args(kind) if get_origin(kind) is Literal else None
+            if allowed is not None and getattr(self, name) not in allowed:
                 raise ValueError(f"{name} {getattr(self, name)!r} must be one of {allowed}")
 
     def _check_resample(self, step: float) -> None:
@@ -286,7 +278,7 @@ class LogColumns:
             >>> LogColumns.load("wheel_legged_standing_still").observation
             ('theta', 'theta_dot', 'x', 'v')
         """
-        # imported here, because a layout written in code does not need yaml
+        # imported here, because it imports this file, and a layout written in code does not need yaml
         from torchrl_h2o.data.readers.columns_file import read_layout
 
-        return read_layout(source, cls, Column)
+        return read_layout(source)

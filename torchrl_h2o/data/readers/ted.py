@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from typing import NoReturn, cast
 
 import numpy as np
 import torch
@@ -172,37 +172,24 @@ def require_continuous(td: TensorDictBase, *, source: str | Path = "transitions"
 
 
 def _require_shapes(td: TensorDictBase, keys: set, source: str | Path) -> None:
+    def refuse(key: str | tuple, problem: str, remedy: str) -> NoReturn:
+        raise DataError(problem, remedy, source=source, column=entry_name(key))
+
     for key in [("next", "reward"), *_FLAGS, *(("next", flag) for flag in _FLAGS)]:
         if key in keys and td.get(key).shape != (len(td), 1):
-            raise DataError(
-                f"the shape is {list(td.get(key).shape)}, expected {[len(td), 1]}",
-                "add the last dimension",
-                source=source,
-                column=entry_name(key),
-            )
+            refuse(key, f"the shape is {list(td.get(key).shape)}, expected {[len(td), 1]}", "add the last dimension")
     for key in ("observation", "action"):
         if td.get(key).ndim != 2:
-            raise DataError(
-                f"the shape is {list(td.get(key).shape)}, expected [{len(td)}, n]",
-                "flatten the values of one step into one vector of at least one entry",
-                source=source,
-                column=key,
-            )
-    if td["observation"].shape != td["next", "observation"].shape:
-        raise DataError(
-            f"shape {list(td['next', 'observation'].shape)}, observation has {list(td['observation'].shape)}",
-            "both must have the same shape",
-            source=source,
-            column="next.observation",
-        )
+            remedy = "flatten the values of one step into one vector of at least one entry"
+            refuse(key, f"the shape is {list(td.get(key).shape)}, expected [{len(td)}, n]", remedy)
+    shape, following = td["observation"].shape, td["next", "observation"].shape
+    if shape != following:
+        problem = f"shape {list(following)}, observation has {list(shape)}"
+        refuse(("next", "observation"), problem, "both must have the same shape")
     for key in ("observation", ("next", "observation")):
         if not td.get(key).is_floating_point():
-            raise DataError(
-                f"the dtype is {td.get(key).dtype}",
-                "observations must be real numbers: convert them with .float(), or encode them one-hot",
-                source=source,
-                column=entry_name(key),
-            )
+            remedy = "observations must be real numbers: convert them with .float(), or encode them one-hot"
+            refuse(key, f"the dtype is {td.get(key).dtype}", remedy)
 
 
 def _require_flags(td: TensorDictBase, source: str | Path) -> None:
@@ -211,17 +198,12 @@ def _require_flags(td: TensorDictBase, source: str | Path) -> None:
         flags = {name: inner.get(name) for name in _FLAGS if name in inner.keys()}
         for name, values in flags.items():
             if values.dtype != torch.bool:
-                raise DataError(
-                    f"the dtype is {values.dtype}, expected torch.bool",
-                    "convert the flags with .bool()",
-                    source=source,
-                    column=entry_name((*prefix, name)),
-                )
-        done = flags.get("done")
+                problem, place = f"the dtype is {values.dtype}, expected torch.bool", entry_name((*prefix, name))
+                raise DataError(problem, "convert the flags with .bool()", source=source, column=place)
         for name in ("terminated", "truncated"):
-            if done is None or name not in flags:
+            if "done" not in flags or name not in flags:
                 continue
-            loose = (flags[name] & ~done).flatten().nonzero().flatten()
+            loose = (flags[name] & ~flags["done"]).flatten().nonzero().flatten()
             if len(loose):
                 raise DataError(
                     f"{name} is true but done is false",

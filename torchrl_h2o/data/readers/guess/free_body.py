@@ -21,36 +21,9 @@ _KINDS = {  # words beside an axis; the first kind that fits
     PLACE: ("pos", "position", "pose", "p", "translation"),
 }
 _NO_STATE = (  # a column with such a word is no state of the body
-    *(
-        "acc",
-        "accel",
-        "acceleration",
-        "cmd",
-        "command",
-        "commanded",
-        "des",
-        "desired",
-        "ref",
-        "reference",
-        "target",
-        "goal",
-    ),
-    *(
-        "setpoint",
-        "sp",
-        "err",
-        "error",
-        "bias",
-        "offset",
-        "std",
-        "cov",
-        "var",
-        "foot",
-        "feet",
-        "wind",
-        "force",
-        "torque",
-    ),
+    *("acc", "accel", "acceleration", "cmd", "command", "commanded", "des", "desired", "ref", "reference"),
+    *("target", "goal", "setpoint", "sp", "err", "error", "bias", "offset", "std", "cov", "var", "foot", "feet"),
+    *("wind", "force", "torque"),
 )
 _TURNS = {"x": "roll", "y": "pitch", "z": "yaw"}  # as the model's angular velocities are named
 _NOTES = {

@@ -23,19 +23,7 @@ _WORDS = {
     "command": ("cmd", "command", "commanded"),
     "desired": ("des", "desired", "ref", "reference", "target", "goal", "setpoint", "sp"),
     "velocity": (
-        "vel",
-        "velocity",
-        "velocities",
-        "dot",
-        "qd",
-        "dq",
-        "qdot",
-        "omega",
-        "speed",
-        "rate",
-        "gyro",
-        "v",
-        "w",
+        *("vel", "velocity", "velocities", "dot", "qd", "dq", "qdot", "omega", "speed", "rate", "gyro", "v", "w"),
     ),
     "action": (*_FORCES, *_VOLTS, *_DUTY, "u", "input", "action", "act"),
     "position": (
@@ -53,6 +41,7 @@ _NO_COMMANDS = (
 )
 _COMPUTED = ("cos", "sin", "squared", "square", "sq", "err", "error", "errors")  # of another column
 _NEVER_COMMANDS = ("squared", "square", "err", "error", "errors")
+PERHAPS = "perhaps an action"  # the note of a column that may be one
 _STEADY = 0.3  # a voltage with one sign that usually changes by less than this share is a supply's
 LARGEST_ANGLE = 8 * np.pi  # rad; beyond it, degrees are more likely
 _SHORTEST_RUN = 5  # rows that the usual run of a log has at least
