@@ -237,7 +237,7 @@ def test_misshapen_file_is_refused(tmp_path, text, column, row, message):
 
 
 def test_done_other_than_zero_and_one_is_refused(tmp_path):
-    with pytest.raises(DataError, match="done is 2") as caught:
+    with pytest.raises(DataError, match="the flag is 2") as caught:
         read_robot_log(write(tmp_path, "0 0 0\n1 0 2\n"), WHEELS)
     assert (caught.value.column, caught.value.row) == ("done", 2)
 

@@ -95,10 +95,10 @@ def test_a_joint_at_rest_is_recognised_by_its_place_and_the_note_says_so(tmp_pat
 
 
 def test_a_log_may_begin_at_rest(tmp_path):
-    still = np.zeros((5000, 2))
-    time = TIME[0] + 0.01 * np.arange(6000)
+    still = np.zeros((7000, 2))
+    time = TIME[0] + 0.01 * np.arange(8000)
     later = [np.vstack([still + part[0], part]) for part in (Q, V * [[0.0], *[[1.0]] * 999], TORQUE)]
-    assert roles(tmp_path, time, *later, RNG.standard_normal(6000)) == expected(0, (1, 2), (3, 4), (5, 6))
+    assert roles(tmp_path, time, *later, RNG.standard_normal(8000)) == expected(0, (1, 2), (3, 4), (5, 6))
 
 
 def test_a_free_swing_of_as_many_columns_as_coordinates_and_actuators_has_a_time(tmp_path):

@@ -115,14 +115,6 @@ def require_finite(
 
     Raises:
         DataError: with file, column and row.
-
-    Example:
-        >>> import numpy as np
-        >>> from torchrl_h2o.data.readers.error import require_finite
-        >>> require_finite(np.array([[0.0, np.nan]]), ["x", "v"], source="a.csv")
-        Traceback (most recent call last):
-        ...
-        torchrl_h2o.data.readers.error.DataError: a.csv, column 'v', row 1: the value is nan; ...
     """
     plausible = np.abs(values) <= largest  # false for NaN
     if plausible.all():
@@ -150,14 +142,6 @@ def require_real(values: np.ndarray, column: str, *, source: str | Path) -> None
 
     Raises:
         DataError: for complex numbers, text, objects or structures.
-
-    Example:
-        >>> import numpy as np
-        >>> from torchrl_h2o.data.readers.error import require_real
-        >>> require_real(np.array([1j]), "actions", source="a.hdf5")
-        Traceback (most recent call last):
-        ...
-        torchrl_h2o.data.readers.error.DataError: a.hdf5, column 'actions': the values are complex128, ...
     """
     if values.dtype.kind not in "fiub":
         raise DataError(
@@ -168,22 +152,19 @@ def require_real(values: np.ndarray, column: str, *, source: str | Path) -> None
         )
 
 
-def require_flags(values: np.ndarray, column: str, *, source: str | Path) -> np.ndarray:
+def require_flags(
+    values: np.ndarray, column: str, *, source: str | Path, row_of: Callable[[int], int] = lambda index: index + 1
+) -> np.ndarray:
     """Return flags as booleans.
 
     Args:
         values: flags, (T,), each 0 or 1.
         column: their name.
         source: the file of the values.
+        row_of: converts an index to the row number for the message.
 
     Raises:
         DataError: for any other value, such as 2, 0.5 or NaN, with its row.
-
-    Example:
-        >>> import numpy as np
-        >>> from torchrl_h2o.data.readers.error import require_flags
-        >>> require_flags(np.array([0.0, 1.0]), "terminals", source="a.hdf5").tolist()
-        [False, True]
     """
     require_real(values, column, source=source)
     wrong = np.flatnonzero((values != 0) & (values != 1))
@@ -193,6 +174,6 @@ def require_flags(values: np.ndarray, column: str, *, source: str | Path) -> np.
             "it must be 0 or 1",
             source=source,
             column=column,
-            row=int(wrong[0]) + 1,
+            row=row_of(int(wrong[0])),
         )
     return values.astype(bool)

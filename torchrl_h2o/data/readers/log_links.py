@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.error import DataError, require_flags
 from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 from torchrl_h2o.data.readers.log_table import LogTable
 
@@ -95,16 +95,7 @@ def done_rows(table: LogTable, layout: LogColumns) -> np.ndarray:
     if column is None:
         return np.zeros(len(table.rows), bool)
     values = table.columns([column.name])[:, 0]
-    wrong = np.flatnonzero((values != 0) & (values != 1))
-    if len(wrong):
-        raise DataError(
-            f"done is {values[wrong[0]]:g}",
-            "it must be 0 or 1",
-            source=table.source,
-            column=column.name,
-            row=int(table.rows[wrong[0]]),
-        )
-    return values.astype(bool)
+    return require_flags(values, column.name, source=table.source, row_of=lambda index: int(table.rows[index]))
 
 
 def same_episode(table: LogTable, layout: LogColumns, done: np.ndarray) -> np.ndarray:

@@ -102,21 +102,13 @@ def estimated_velocities(td: TensorDictBase, layout: LogColumns) -> tuple[Estima
         layout: the layout that they were read with.
     """
     units = {column.name: to_si(column.unit)[0] for column in layout.columns}
-    return tuple(
-        EstimatedVelocity(name, position, _rms(td["observation_std"][:, _place(layout.observation, name)]), unit)
-        for name, position in layout.derivatives.items()
-        for unit in [velocity_unit(units[position])]
-    )
+    found = []
+    for name, position in layout.derivatives.items():
+        std = td["observation_std"][:, layout.observation.index(name)].double().square().mean().sqrt()
+        found.append(EstimatedVelocity(name, position, float(std), velocity_unit(units[position])))
+    return tuple(found)
 
 
 def velocity_unit(unit: str) -> str:
     """Return the unit of the derivative of a quantity: ``rad/s`` for ``rad``."""
     return "1/s" if unit == "1" else f"{unit}/s"
-
-
-def _place(names: Sequence[str], name: str) -> int:
-    return list(names).index(name)
-
-
-def _rms(values) -> float:
-    return float(values.double().square().mean().sqrt())

@@ -54,27 +54,17 @@ def check_specs(td: TensorDictBase, env: EnvBase, *, source: str | Path = "trans
     for key, composite in specs.items():
         names = list(composite.keys())
         if key not in names:
-            raise DataError(
-                f"the environment has no entry {key!r}, it has {names}",
-                "wrap it in TransformedEnv with CatTensors or RenameTransform",
-                source=source,
-                column=key,
-            )
-        spec, values = composite[key], td[key]
+            problem = f"the environment has no entry {key!r}, it has {names}"
+            remedy = "wrap it in TransformedEnv with CatTensors or RenameTransform"
+            raise DataError(problem, remedy, source=source, column=key)
+        spec, values, problem = composite[key], td[key], None
         if values.shape[1:] != spec.shape:
-            raise DataError(
-                f"the data have {list(values.shape[1:])} dimensions, the environment has {list(spec.shape)}",
-                "choose the environment that was recorded, or other columns",
-                source=source,
-                column=key,
-            )
-        if values.is_floating_point() != spec.dtype.is_floating_point:
-            raise DataError(
-                f"the data are {values.dtype}, the environment uses {spec.dtype}",
-                "choose the environment that was recorded",
-                source=source,
-                column=key,
-            )
+            problem = f"the data have {list(values.shape[1:])} dimensions, the environment has {list(spec.shape)}"
+        elif values.is_floating_point() != spec.dtype.is_floating_point:
+            problem = f"the data are {values.dtype}, the environment uses {spec.dtype}"
+        if problem is not None:
+            remedy = "choose the environment that was recorded, or other columns"
+            raise DataError(problem, remedy, source=source, column=key)
     _require_bounds(td["action"], specs["action"]["action"], source)
 
 
