@@ -1,11 +1,12 @@
 """The paper's grids, and those of our own: which runs they have."""
 
 from collections import Counter
+from functools import cache
 
 import hydra
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import open_dict
+from omegaconf import OmegaConf, open_dict
 
 from tests.small_runs import ROOT
 from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
@@ -13,15 +14,28 @@ from torchrl_h2o.comparison.options import PaperOptions
 from torchrl_h2o.comparison.results_file import identity
 from torchrl_h2o.options import check_options
 
+#: options that identity() reads
+IDENTIFYING = ["method", "env", "data", "data_seconds", "mend", "mended", "gap", "gap_strength", "seed", "updates"]
+IDENTIFYING += ["backbone", "mixing", "ratio", "overrides"]
+
 
 def chosen(runs, key):
     values = [override.partition("=")[2] for run in runs for override in run if override.startswith(f"{key}=")]
     return Counter(values)
 
 
-def paper(*overrides):
+@cache
+def composed(*overrides):
     with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
         return hydra.compose("paper", list(overrides))
+
+
+def paper(*overrides):
+    """The grid's configuration with options, composed once."""
+    cfg = composed().copy()
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        cfg[override.key_or_group] = override.value()
+    return cfg
 
 
 def test_the_main_table_has_every_cell_once_and_methods_without_simulator_once_a_data_set():
@@ -112,12 +126,10 @@ def test_what_each_run_says_for_itself_is_no_override_of_all(grid, override, sai
 
 @pytest.mark.parametrize("grid", [TABLES["mixing"], TABLES["gaps"], FIGURES["data_size"]])
 def test_runs_that_differ_have_different_identities(grid):
-    composed, found = {}, {}
+    found = {}
     for run in grid.runs((0,)):
         env = next(override for override in run if override.startswith("env="))
-        if env not in composed:
-            composed[env] = paper("figure=wheel_legged", env)
-        cfg = composed[env].copy()
+        cfg = OmegaConf.masked_copy(composed(env), IDENTIFYING)
         with open_dict(cfg):
             cfg.overrides = run
             for override in OverridesParser.create().parse_overrides(run):

@@ -61,14 +61,19 @@ def test_the_truth_explains_the_data_of_a_paper_gap_and_the_gap_does_not():
 
 
 def test_a_case_is_drawn_from_the_seed_and_its_number_alone():
-    drawn = [draw_case(FAMILIES, "several", 2, SEED) for _ in range(2)]
-    other = draw_case(FAMILIES, "several", 2, SEED + 1)
+    drawn = [draw_case(FAMILIES, "slow", 2, SEED) for _ in range(2)]
+    other = draw_case(FAMILIES, "slow", 2, SEED + 1)
     assert drawn[0].truth == drawn[1].truth != other.truth
     assert (short_case(drawn[0], 20).measure() == short_case(drawn[1], 20).measure()).all()
 
 
 @pytest.mark.parametrize(
-    ("number", "seed"), [(2, SEED), (3, SEED), (15, 0)], ids=["pendulum", "wheel_legged", "one would be hidden"]
+    ("number", "seed"),
+    [
+        pytest.param(2, SEED, id="pendulum"),
+        pytest.param(3, SEED, id="wheel_legged", marks=pytest.mark.slow),
+        pytest.param(15, 0, id="one would be hidden", marks=pytest.mark.slow),
+    ],
 )
 def test_every_one_of_several_effects_can_be_seen_and_explains_the_data(number, seed):
     case = draw_case(FAMILIES, "several", number, seed)
@@ -90,7 +95,7 @@ def test_what_cannot_be_seen_is_not_drawn():
     )
 
 
-@pytest.mark.parametrize("number", range(5))
+@pytest.mark.parametrize("number", [0, *(pytest.param(number, marks=pytest.mark.slow) for number in range(1, 5))])
 def test_an_undeclared_effect_is_no_entry_of_the_catalogue_and_can_be_seen(number):
     case = draw_case(FAMILIES, "undeclared", number, SEED)
     simulation = case.simulation()

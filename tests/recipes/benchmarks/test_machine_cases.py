@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.report.document import Report
 SEED = 5
 
 
-@pytest.mark.parametrize("number", [0, 2, 6, 8, 10, 14, 16])
+@pytest.mark.parametrize("number", [0, *(pytest.param(each, marks=pytest.mark.slow) for each in (2, 6, 8, 10, 14, 16))])
 def test_the_faults_of_a_machine_explain_its_log(number):
     """100 ms ahead, with the true faults and the filter's delay; the library did not simulate the log."""
     case = draw_case(FAMILIES, "machines", number, SEED)
