@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from torchrl_h2o.comparison.aggregates import mean_of_runs
 from torchrl_h2o.comparison.data_size import TITLES, panels_of
+from torchrl_h2o.comparison.figures import save_figure
 from torchrl_h2o.comparison.grids import DATA_SIZE_METHODS, MENDED, POSTERIOR, split_suffix
 from torchrl_h2o.training.learning_curve import COLOURS
 from torchrl_h2o.training.methods import METHODS
-from torchrl_h2o.whole_file import whole_file
 
 LOWEST = -4.0  # returns below are drawn here: a policy that struggles for long can return -100
 #: column of the points, label of the axis and its limits, by row of the figure
@@ -47,8 +47,7 @@ def draw_data_size(path: Path, points: pd.DataFrame, reps: int) -> None:
     number = f"{counts.min()}" if counts.min() == counts.max() else f"{counts.min()} to {counts.max()}"
     seeds = "seed" if counts.max() == 1 else "seeds"
     figure.suptitle(f"Mean of {number} {seeds}, 95 % bootstrap intervals; returns below 0 are cut off", fontsize=9)
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=130)
+    save_figure(figure, path)
 
 
 def _draw_methods(axis: Axes, points: pd.DataFrame, quantity: str, reps: int) -> None:

@@ -50,7 +50,7 @@ def draw_curves(path: Path, rows: pd.DataFrame, titles: Mapping[str, str]) -> No
     figure.legend([handles[label] for label in labels], labels, **legend)
     title = "The policy at each evaluation during training;\nbands from the lowest seed to the highest"
     figure.suptitle(title, fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_band(axis: Axes, rows: pd.DataFrame, title: str) -> None:
@@ -84,7 +84,7 @@ def draw_aggregates(
     right.axvline(0.5, color="0.6", ls="--", lw=1)
     right.set(xlabel="P(H2O+ does better)", xlim=(-0.02, 1.02))
     figure.suptitle(note, fontsize=9)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_intervals(axis: Axes, intervals: Mapping[str, Interval], titles: Mapping[str, str]) -> None:
@@ -98,6 +98,7 @@ def _draw_intervals(axis: Axes, intervals: Mapping[str, Interval], titles: Mappi
     axis.spines[["top", "right"]].set_visible(False)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
     with whole_file(path) as partial:
         figure.savefig(partial, dpi=130)

@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchrl_h2o.comparison.figures import save_figure
 from torchrl_h2o.comparison.robot_trajectories import BINS, COMPARED, EVERY, SHOWN, spread_entropy
 from torchrl_h2o.envs.wheel_legged.env import TARGET_VELOCITY
 from torchrl_h2o.training.learning_curve import COLOURS
 from torchrl_h2o.training.methods import METHODS
-from torchrl_h2o.whole_file import whole_file
 
 LIMITS = {"standing_still": (-1.0, 1.0), "moving_forward": (-0.5, 1.0)}
 LABELS = {"standing_still": "displacement (m)", "moving_forward": "velocity (m/s)"}
@@ -58,7 +58,7 @@ def draw_trajectories(path: Path, ways: Mapping[tuple[str, str], list[np.ndarray
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
     figure.suptitle("In reality: one line per episode; ×: the robot fell; dashed line: target", fontsize=9)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_episode(axis: Axes, value: np.ndarray, limits: tuple[float, float], colour: str | None) -> None:
@@ -93,9 +93,4 @@ def draw_diversity(path: Path, states: Mapping[tuple[str, str], list[np.ndarray]
             axis.set_title(title, fontsize=9)
             axis.set(xlabel="pitch (rad)", ylabel="pitch rate (rad/s)")
     figure.colorbar(drawn, ax=axes, label="simulated transitions, all runs")
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=130)
+    save_figure(figure, path)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from running import FAMILIES
 
 from torchrl_h2o.comparison.records import Record, read_records
 
@@ -117,3 +118,9 @@ def test_records_have_no_folder_of_the_machine(tmp_path):
 
 def test_the_pages_that_ship_are_those_that_the_stored_runs_make(make):
     assert make.make(HERE, check=True) == []
+
+
+def test_the_families_of_the_page_are_those_of_the_benchmark(make):
+    told = {name: family["draws"] for name, family in make.pages.drawn_families().items()}
+    assert told == {name: family.size for name, family in FAMILIES.items()}
+    assert all(draw < told[name] for name, family in make.pages.drawn_families().items() for draw in family["chose"])
