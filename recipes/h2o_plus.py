@@ -23,7 +23,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.commands.hydra_main import hydra_main
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate, make_actor, make_qvalue, total_loss
+from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, make_actor, make_qvalue, total_loss
 from torchrl_h2o.options import RunOptions
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
@@ -109,7 +109,6 @@ def train(cfg: DictConfig, folder: Path) -> None:
     bellman_loss = MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing)
     loss = H2OPlusLoss(bellman_loss, value_loss, ratio_loss, weighted=cfg.ratio, target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
-    accelerate(loss)  # optional: computes the same losses faster
     loss_fn = at_precision(loss, cfg.precision)
     loss_fn = maybe_compiled(loss_fn, cfg.compiled, cfg.updates, parameters=loss.parameters())
 

@@ -85,7 +85,7 @@ class Parts:
 
 def _split(kwargs: dict) -> tuple[dict, dict]:
     """Splits keyword arguments into those of H2OPlusLoss and those of its MixedBellmanLoss."""
-    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "target_entropy", "num_real") if key in kwargs}
+    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "target_entropy") if key in kwargs}
     return own, {key: value for key, value in kwargs.items() if key not in own}
 
 

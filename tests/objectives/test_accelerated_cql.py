@@ -22,7 +22,7 @@ def losses_and_gradients(loss_class, layer_norm=False, **kwargs):
     return {**terms.detach(), "next random number": torch.rand(())}, found
 
 
-@pytest.mark.parametrize("rows", [1, 20, 1024])
+@pytest.mark.parametrize("rows", [20, 1024])
 @pytest.mark.parametrize(
     "kwargs",
     [{}, {"temperature": 2.0, "num_random": 3, "min_q_weight": 5.0}, {"layer_norm": True}, {"with_lagrange": True}],

@@ -19,7 +19,6 @@ from torchrl_h2o.objectives import (
     ExpectileValueLoss,
     ImportanceWeightedLoss,
     MixedBellmanLoss,
-    accelerate,
     make_actor,
     make_qvalue,
     make_value,
@@ -33,11 +32,10 @@ def weighted_td3(parts):
 
 LOSSES = {
     **conftest.LOSSES,
-    "accelerated": lambda parts: accelerate(parts.h2o_plus()),
     "sac": lambda parts: parts.sac(),
 }
 losses = pytest.mark.parametrize("name", LOSSES)
-bootstrapping = pytest.mark.parametrize("name", ["bellman", "h2o_plus", "accelerated", "sac", "conservative"])
+bootstrapping = pytest.mark.parametrize("name", ["bellman", "h2o_plus", "sac", "conservative"])
 
 
 def full_batch(**kwargs):

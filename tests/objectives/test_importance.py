@@ -3,11 +3,11 @@
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
-from torchrl.modules import MLP
-from torchrl.objectives import IQLLoss, SACLoss, SoftUpdate, TD3Loss
+from torchrl.modules import MLP, OneHotCategorical, ProbabilisticActor, QValueActor
+from torchrl.objectives import DiscreteSACLoss, DQNLoss, IQLLoss, REDQLoss, SACLoss, SoftUpdate, TD3Loss
 
 from tests.objectives.conftest import ACTION_DIM, OBSERVATION_DIM, Parts, make_batch
-from torchrl_h2o.objectives import ImportanceWeightedLoss
+from torchrl_h2o.objectives import ImportanceWeightedLoss, total_loss
 
 
 def sac(parts):
@@ -123,3 +123,84 @@ def test_a_loss_that_reduces_is_refused():
 def test_a_batch_without_weights_says_where_they_come_from(batch):
     with pytest.raises(KeyError, match="DynamicsRatioEstimator"):
         ImportanceWeightedLoss(sac(Parts()))(batch)
+
+
+def redq(parts, reduction, networks):
+    return REDQLoss(parts.actor, parts.qvalues[0], num_qvalue_nets=networks, sub_sample_len=2, reduction=reduction)
+
+
+@pytest.mark.parametrize("networks", [4, 7], ids=["4 networks", "as many networks as rows"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_rows_of_an_ensemble_are_weighted_not_its_networks(batch, networks, masked):
+    inner = redq(Parts(), "none", networks)
+    weights, kept = torch.linspace(0.0, 2.0, 7, dtype=torch.float64), torch.ones(7, dtype=torch.bool)
+    batch["real"][:], batch["dynamics_ratio"] = False, weights
+    torch.manual_seed(1)
+    terms = inner(batch.copy())["loss_qvalue"]
+    assert terms.shape == (networks, 7)
+    if masked:
+        batch["collector"] = {"mask": torch.arange(7)[:, None] != 3}
+        kept[3] = False
+    for reduction, expected in (("mean", (terms * weights)[:, kept].mean()), ("none", (terms * weights * kept))):
+        torch.manual_seed(1)
+        got = ImportanceWeightedLoss(inner, terms=["loss_qvalue"], reduction=reduction)(batch.copy())["loss_qvalue"]
+        torch.testing.assert_close(got, expected)
+
+
+def dqn(parts, reduction="none"):
+    network = MLP(OBSERVATION_DIM, ACTION_DIM, num_cells=[8]).double()
+    actor = QValueActor(network, in_keys=["observation"], action_space="one_hot")
+    return DQNLoss(actor, action_space="one_hot", reduction=reduction)
+
+
+def discrete_sac(parts, reduction="none"):
+    logits = TensorDictModule(MLP(OBSERVATION_DIM, ACTION_DIM).double(), in_keys=["observation"], out_keys=["logits"])
+    actor = ProbabilisticActor(logits, in_keys=["logits"], distribution_class=OneHotCategorical)
+    values = TensorDictModule(
+        MLP(OBSERVATION_DIM, ACTION_DIM).double(), in_keys=["observation"], out_keys=["action_value"]
+    )
+    kwargs = {"action_space": "one-hot", "num_actions": ACTION_DIM, "loss_function": "l2"}
+    return DiscreteSACLoss(actor, values, reduction=reduction, scalar_output_mode="exclude", **kwargs)
+
+
+@pytest.mark.parametrize("build", [dqn, discrete_sac])
+def test_losses_of_discrete_actions_are_weighted(batch, build):
+    batch["action"] = torch.eye(ACTION_DIM, dtype=torch.bool)[torch.arange(7) % ACTION_DIM]
+    batch["real"][:], batch["dynamics_ratio"] = False, torch.linspace(0.0, 2.0, 7, dtype=torch.float64)
+    inner = build(Parts())
+    terms, losses = inner(batch.copy()), ImportanceWeightedLoss(inner)(batch.copy())
+    key = "loss" if build is dqn else "loss_qvalue"
+    torch.testing.assert_close(losses[key], (terms[key] * batch["dynamics_ratio"]).mean())
+    assert total_loss(losses).requires_grad
+
+
+def test_a_loss_without_terms_is_refused():
+    inner = sac(Parts())
+    inner.out_keys = ["alpha", "entropy"]
+    with pytest.raises(ValueError, match=r"SACLoss has no term named 'loss\.\.\.' to weigh, but only"):
+        ImportanceWeightedLoss(inner)
+
+
+def reduced_sac(parts):
+    return SACLoss(parts.actor, parts.qvalues)
+
+
+def reduced_iql(parts):
+    return IQLLoss(parts.actor, parts.qvalues, parts.value)
+
+
+@pytest.mark.parametrize(
+    ("rowwise", "reduced", "masked"),
+    [(sac, reduced_sac, False), (sac, reduced_sac, True), (iql, reduced_iql, False)],
+    ids=["sac", "sac with a mask", "iql"],  # TorchRL's IQL loses the mask on its way to Q
+)
+def test_weights_of_one_are_the_loss_itself_with_priority_weights(batch, rowwise, reduced, masked):
+    batch["real"][:], batch["dynamics_ratio"] = False, torch.ones(7, dtype=torch.float64)
+    batch["priority_weight"] = torch.linspace(0.1, 2.0, 7, dtype=torch.float64)
+    if masked:
+        batch["collector"] = {"mask": torch.arange(7)[:, None] != 3}
+    loss, inner = ImportanceWeightedLoss(rowwise(Parts())), reduced(Parts())
+    torch.manual_seed(1)
+    got = loss(batch.copy())
+    torch.manual_seed(1)
+    torch.testing.assert_close(got, inner(batch.copy()).select(*got.keys()))

@@ -1,6 +1,7 @@
 """The checks of TorchRL's own test base for loss modules, applied to these losses."""
 
 import copy
+import re
 
 import pytest
 import torch
@@ -164,8 +165,70 @@ def test_estimators_are_accepted_in_every_form_that_torchrl_accepts(build):
         loss.make_value_estimator(TD0Estimator, gamma=0.9, average_rewards=True)
     with pytest.raises(TypeError, match="lmbda"):
         loss.make_value_estimator(gamma=0.9, lmbda=0.5)
-    with pytest.raises(NotImplementedError, match="computes its targets itself"):
-        _ = loss.value_estimator
+
+
+@with_q
+def test_the_value_estimator_is_a_td0_estimator_of_equation_7(build, batch):
+    loss = getattr(Parts(), build)()
+    batch["steps_to_next_obs"] = torch.arange(1, 8)[:, None]
+    loss.set_keys(steps_to_next_obs="n", reward="pay", done="ended")
+    batch.rename_key_("steps_to_next_obs", "n")
+    batch["next"].rename_key_("reward", "pay").rename_key_("done", "ended")
+    loss.make_value_estimator(gamma=0.5)
+    estimator, bellman = loss.value_estimator, getattr(loss, "bellman_loss", loss)
+    assert isinstance(estimator, TD0Estimator)
+    assert estimator.gamma == 0.5
+    assert loss.make_value_estimator(estimator) is loss
+    torch.manual_seed(4)
+    target = estimator.value_estimate(batch)
+    torch.testing.assert_close(target.squeeze(-1), seeded(bellman.mixed_target, batch))
+    batch["state_value"] = torch.ones(7, 1, dtype=torch.float64)
+    torch.manual_seed(4)
+    torch.testing.assert_close(estimator(batch)["advantage"], target - 1.0)
+    assert not target.requires_grad
+
+
+MASKED = (("next", "reward"), "observation", ("next", "observation"), "action", "state_action_value", "dynamics_ratio")
+
+
+@pytest.mark.parametrize("name", [*LOSSES, "weighted_sac"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_masked_rows_may_hold_anything(name, value):
+    """Without the mend, NaN times a weight of zero is NaN in the gradients."""
+    parts, batch = Parts(), full_batch()
+    if name == "weighted_sac":
+        sac = SACLoss(parts.actor, parts.qvalues, reduction="none", scalar_output_mode="exclude")
+        loss = ImportanceWeightedLoss(sac)
+    else:
+        loss = LOSSES[name](parts)
+    loss.loss_mask_key = "valid"
+    batch["valid"] = torch.arange(7)[:, None] != 2
+    batch["dynamics_ratio"] = torch.ones(7, dtype=torch.float64)
+    seeded(loss, batch)  # a ratio loss has no noise that depends on the values
+    found = []
+    for given in (batch, batch.clone()):
+        for key in MASKED if given is not batch else ():
+            given[key][2] = value
+        loss.zero_grad()
+        terms = seeded(loss, given)
+        sum(term.sum() for key, term in terms.items() if key.startswith("loss")).backward()
+        found.append([p.grad.clone() for p in loss.parameters() if p.grad is not None])
+    assert all(gradient.isfinite().all() for gradient in found[1])
+    torch.testing.assert_close(*found)
+
+
+def test_the_td_error_of_masked_batches_is_written_into_the_batch(batch):
+    for loss in (Parts().bellman(), Parts().h2o_plus(), ConservativeLoss(Parts().sac())):
+        loss.loss_mask_key, given = "valid", batch.copy()
+        given["valid"] = torch.arange(7) != 2
+        loss(given)
+        assert given["td_error"].isfinite().all()
+
+
+def test_messages_name_the_whole_key(batch):
+    for key in (("next", "reward"), ("next", "terminated")):
+        with pytest.raises(KeyError, match=rf"reads {re.escape(repr(key))} and finds"):
+            Parts().bellman()(batch.exclude(key))
 
 
 def test_exploration_keys_can_be_renamed(batch):

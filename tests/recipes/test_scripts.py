@@ -17,6 +17,7 @@ SCRIPTS = [
     ("swap_backbone.py", ["--backbone", "exponential", "--updates", "200"]),
     ("weighted_td3.py", ["--updates", "200"]),
     ("compose_losses.py", ["--updates", "200"]),
+    ("pixels.py", ["100"]),
 ]
 
 

@@ -10,7 +10,6 @@ from torchrl.data import Bounded
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import total_loss
-from torchrl_h2o.objectives.relu_perceptron import relu
 from torchrl_h2o.training.compiling import PAYS_FROM, compiled, maybe_compiled
 from torchrl_h2o.training.methods import h2o, h2o_plus, weighted_td3
 from torchrl_h2o.training.one_graph import OneGraph
@@ -106,7 +105,7 @@ def test_what_one_start_compiles_the_next_one_finds():
         for _ in range(2):
             torch._dynamo.reset()  # a new process has no compiled functions
             counters.clear()
-            total_loss(compiled(lambda x: {"loss_relu": relu(x).square().sum()}, [x])(x)).backward()
+            total_loss(compiled(lambda x: {"loss_relu": x.relu().square().sum()}, [x])(x)).backward()
             found.append(counters["aot_autograd"]["autograd_cache_hit"])
     assert found == [0, 1]
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.objectives.conftest import Parts, make_batch
-from torchrl_h2o.objectives import accelerate, total_loss
+from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.training import precision
 from torchrl_h2o.training.precision import at_precision
 
@@ -15,7 +15,7 @@ def bf16(monkeypatch):
 
 
 def losses(chosen, **kwargs):
-    loss = accelerate(Parts(dtype=torch.float32).h2o_plus(**kwargs))
+    loss = Parts(dtype=torch.float32).h2o_plus(**kwargs)
     torch.manual_seed(0)
     terms = at_precision(loss, chosen)(make_batch(dtype=torch.float32))
     total_loss(terms).backward()

@@ -1,6 +1,5 @@
 """Losses of H2O+, and the additional terms of DARC and H2O. Needs only torch, tensordict and torchrl."""
 
-from torchrl_h2o.objectives.accelerated import accelerate
 from torchrl_h2o.objectives.accelerated_cql import AcceleratedCQLLoss
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
 from torchrl_h2o.objectives.conservative import ConservativeLoss, DynamicsDivergence
@@ -39,7 +38,6 @@ __all__ = [
     "InSampleValueLoss",
     "MixedBellmanLoss",
     "SparseValueLoss",
-    "accelerate",
     "fit_change_scale",
     "make_actor",
     "make_dynamics_ratio_estimator",

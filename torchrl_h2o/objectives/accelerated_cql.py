@@ -13,9 +13,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss
 
-from torchrl_h2o.objectives.accelerated import PerceptronCalls
-
-_CALLS = PerceptronCalls()
 ROWS = 1024  # state-action pairs per call of Q; the activations of more do not fit in a processor's cache
 
 
@@ -69,8 +66,8 @@ class AcceleratedCQLLoss(CQLLoss):
     def _sampled(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Draw ``num_random`` actions in each state, ``[B * num_random, action_dim]``, and their log-probabilities."""
         network, distribution = cast(tuple[TensorDictModule, ProbabilisticTensorDictModule], self.actor_network.module)
-        params = self.actor_network_params.get(("module", "0"))
-        out = _CALLS.outputs(network, states, params)
+        with self.actor_network_params.get(("module", "0")).to_module(network, preserve_module_state=False):
+            out = network(states.select(*network.in_keys))
         repeated = {key: out.get(key).repeat_interleave(self.num_random, 0) for key in network.out_keys}
         with set_exploration_type(ExplorationType.RANDOM):
             dist = distribution.get_dist(TensorDict(repeated, [len(states) * self.num_random]))
@@ -84,6 +81,6 @@ class AcceleratedCQLLoss(CQLLoss):
             pairs = {key: some.get(key).repeat_interleave(self.num_random, 0) for key in self.actor_network.in_keys}
             pairs[self.tensor_keys.action] = their_actions
             batch = TensorDict(pairs, [len(their_actions)])
-            out = _CALLS.outputs(self.qvalue_network, batch, self.qvalue_network_params)
+            out = self._vmap_qvalue_networkN0(batch, self.qvalue_network_params)
             parts.append(out.get(self.tensor_keys.state_action_value).squeeze(-1))
         return torch.cat(parts, -1)

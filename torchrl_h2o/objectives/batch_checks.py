@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import MLP
@@ -42,7 +42,8 @@ class NetworkInput:
             ValueError: for another total width, or another dtype.
         """
         for key, value in zip(self.keys, values, strict=True):
-            if not _fits(value, dtype):
+            any_float = dtype is None or torch.is_autocast_enabled(value.device.type)
+            if value.dtype != dtype and not (any_float and value.is_floating_point()):
                 expected = dtype or torch.get_default_dtype()
                 raise ValueError(
                     f"{reader}: {key!r} is {value.dtype}, and its network was built for {expected}: convert the data "
@@ -119,13 +120,19 @@ def separated(inputs: Iterable[NetworkInput]) -> tuple[NetworkInput, ...]:
     return tuple(smallest)
 
 
-def require_boolean(value: Tensor, key: NestedKey, reader: str) -> Tensor:
-    """Return a mark of rows, such as ``real`` or ``terminated``, if it is boolean.
+def entry(tensordict: TensorDictBase, key: NestedKey, reader: str) -> Tensor:
+    """Return an entry of a batch, or raise a KeyError that names it."""
+    value = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"{reader} reads {key!r} and finds {sorted(tensordict.keys(True, True), key=str)}. Add it, or name the "
+            "entry that holds it with set_keys."
+        )
+    return value
 
-    Args:
-        value: the entry.
-        key: its key, for the message.
-        reader: name of the loss, for the message.
+
+def require_boolean(value: Tensor, key: NestedKey, reader: str) -> Tensor:
+    """Return a mark of rows, such as ``real`` or ``terminated``.
 
     Raises:
         ValueError: for another dtype. Converted, 0.5 and NaN would count as True.
@@ -142,18 +149,20 @@ def one_per_row(value: Tensor, shape: torch.Size, key: NestedKey, reader: str) -
     """Return an entry with one value per row as ``[*B]``.
 
     Args:
-        value: the entry, ``[*B]`` or ``[*B, 1]``.
-        shape: the shape of the rows, ``[*B]``.
+        value: the entry, ``[*B]`` or ``[*B, 1]``. Of rows with several agents, ``[*B, agents]``, a value ``[*B]`` is
+            for all agents.
+        shape: the shape of the rows.
         key: the entry's key, for the message.
         reader: name of the loss, for the message.
 
     Raises:
         ValueError: for another shape, which could be broadcast without an error.
     """
-    if value.shape == shape:
-        return value
-    if value.shape == (*shape, 1):
-        return value.squeeze(-1)
+    squeezed = value.squeeze(-1) if value.ndim > 1 and value.shape != shape else value
+    if squeezed.shape == shape:
+        return squeezed
+    if 0 < squeezed.ndim < len(shape) and squeezed.shape == shape[: squeezed.ndim]:
+        return squeezed.reshape(*squeezed.shape, *(1,) * (len(shape) - squeezed.ndim)).expand(shape)
     raise ValueError(
         f"{reader}: {key!r} has the shape {list(value.shape)}, expected one value per row, {list(shape)} or "
         f"{[*shape, 1]}."
@@ -161,47 +170,6 @@ def one_per_row(value: Tensor, shape: torch.Size, key: NestedKey, reader: str) -
 
 
 def require_rows(value: Tensor, reader: str) -> None:
-    """Check that a batch has rows, because the mean over no rows is NaN.
-
-    Args:
-        value: an entry with one value per row.
-        reader: name of the loss, for the message.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """Raise a ValueError for a batch without rows, because the mean over no rows is NaN."""
     if not value.numel():
         raise ValueError(f"{reader}: the batch has the shape {list(value.shape)}, so it is empty: give at least a row.")
-
-
-def rows_in_words(mask: Tensor, longest: int = 4) -> str:
-    """Name the rows of a mask ``[B]``, with a verb, for a message.
-
-    Args:
-        mask: True for the rows to name.
-        longest: number of groups of successive rows that are named; the further rows are counted.
-
-    Examples:
-        >>> rows_in_words(torch.tensor([True, True, True, False, True]))
-        'rows 0 to 2 and 4 of 5 are'
-    """
-    chosen = mask.nonzero().flatten().tolist()
-    if not chosen:
-        return f"none of {len(mask)} rows is"
-    groups: list[list[int]] = []
-    for row in chosen:
-        if groups and row == groups[-1][-1] + 1:
-            groups[-1].append(row)
-        else:
-            groups.append([row])
-    named = [str(rows[0]) if len(rows) == 1 else f"{rows[0]} to {rows[-1]}" for rows in groups[:longest]]
-    if more := sum(map(len, groups[longest:])):
-        named.append(f"{more} more")
-    words = " and ".join(filter(None, [", ".join(named[:-1]), named[-1]]))
-    return f"row{'s' * (len(chosen) != 1)} {words} of {len(mask)} {'is' if len(chosen) == 1 else 'are'}"
-
-
-def _fits(value: Tensor, dtype: torch.dtype | None) -> bool:
-    if dtype is None or torch.is_autocast_enabled(value.device.type):
-        return value.is_floating_point()
-    return value.dtype == dtype

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase, dispatch
-from torch import Tensor
-from torchrl.data import Composite
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
@@ -19,7 +18,8 @@ from torchrl.objectives import ValueEstimators
 from torchrl_h2o.objectives.batch_checks import NetworkInput, network_inputs, require_boolean, separated
 from torchrl_h2o.objectives.exploration import EntropyBonus
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
-from torchrl_h2o.objectives.one_step import ValueType, one_step_discount
+from torchrl_h2o.objectives.policy import action_dim_of, action_key_of, check_policy
+from torchrl_h2o.objectives.value_estimator import MixedTD0Estimator, ValueType, one_step_discount
 
 if TYPE_CHECKING:
 
@@ -45,8 +45,12 @@ class MixedBellmanLoss(HybridLoss):
     next states, but not from terminated ones. Only the Q network receives gradients; the policy and V are constants.
     γ is 0.99 by default; ``loss.make_value_estimator(gamma=...)`` changes it, as in TorchRL.
 
+    Actions are continuous. Several agents may share the networks, with entries such as ``("agents", "action")``,
+    ``[*B, agents, action_dim]``: each has rewards, targets and errors of its own.
+
     Args:
-        actor_network (ProbabilisticTensorDictSequential): π(a|s), with a reparameterised distribution.
+        actor_network (ProbabilisticTensorDictSequential): π(a|s), with a reparameterised distribution that has a
+            density, such as ``TanhNormal``.
         qvalue_network (TensorDictModule or list of them): Q(s, a); writes ``"state_action_value"``, ``[*B, 1]``. A
             list is an ensemble of independent initialisations; one module is expanded to ``num_qvalue_nets``.
         value_network (TensorDictModule, optional): V(s); writes ``"state_value"``, ``[*B, 1]``. Required unless
@@ -60,10 +64,16 @@ class MixedBellmanLoss(HybridLoss):
         alpha_init (float, optional): β. Defaults to 1.0.
         num_qvalue_nets (int, optional): size of the ensemble. The target uses the minimum over the ensemble. Defaults
             to 2.
+        separate_losses (bool, optional): if ``True``, parameters that Q or V share with the policy, such as those of
+            an image encoder, are trained by the policy's loss only, and those that Q shares with V by V's loss. By
+            default all losses train them. To share parameters, give Q as a list of networks.
+        deactivate_vmap (bool, optional): whether to replace ``vmap`` over the ensemble by a plain loop, for networks
+            that ``vmap`` does not support, such as ``nn.GRU``. Defaults to ``False``.
         reduction (str, optional): see :class:`~torchrl_h2o.objectives.HybridLoss`.
 
     Raises:
-        ValueError: if λ is outside [0, 1], if λ > 0 and ``value_network`` is None, or if β is not positive.
+        ValueError: if λ is outside [0, 1], if λ > 0 and ``value_network`` is None, if β is not positive, if Q has no
+            parameters, or if the policy is deterministic, discrete or composed of several actions.
 
     Reads observation, action, ``real`` ``[*B]``, ``("next", ...)`` observation, reward ``[*B, 1]`` and terminated
     ``[*B, 1]``. Reads if present: ``dynamics_ratio`` ``[*B]`` (default 1), ``priority_weight`` ``[*B]`` and
@@ -109,6 +119,7 @@ class MixedBellmanLoss(HybridLoss):
             state_action_value: Q(s, a), written by the Q network. Defaults to ``"state_action_value"``.
             reward: below ``"next"``. Defaults to ``"reward"``.
             terminated: below ``"next"``. Defaults to ``"terminated"``.
+            done: accepted as by TorchRL's losses, and not read: a truncated episode bootstraps. Defaults to ``"done"``.
             dynamics_ratio: P / P̂ of the simulated rows. Defaults to ``"dynamics_ratio"``.
             steps_to_next_obs: n of an n-step transition. Defaults to ``"steps_to_next_obs"``.
             priority: the td error, written into the input. Defaults to ``"td_error"``.
@@ -122,6 +133,7 @@ class MixedBellmanLoss(HybridLoss):
         state_action_value: NestedKey = "state_action_value"
         reward: NestedKey = "reward"
         terminated: NestedKey = "terminated"
+        done: NestedKey = "done"
         dynamics_ratio: NestedKey = "dynamics_ratio"
         steps_to_next_obs: NestedKey = "steps_to_next_obs"
         priority: NestedKey = "td_error"
@@ -131,6 +143,7 @@ class MixedBellmanLoss(HybridLoss):
 
     tensor_keys: _AcceptedKeys
     default_value_estimator = ValueEstimators.TD0
+    _checked_network = "qvalue_network"
     _schedulable_buffers = frozenset({"mixing", "gamma"})
 
     actor_network: ProbabilisticTensorDictSequential
@@ -150,13 +163,15 @@ class MixedBellmanLoss(HybridLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule] | nn.ModuleList,
         value_network: TensorDictModule | None = None,
         mixing: float = 0.1,
         *,
         exploration: TensorDictModuleBase | None = None,
         alpha_init: float = 1.0,
         num_qvalue_nets: int = 2,
+        separate_losses: bool = False,
+        deactivate_vmap: bool = False,
         reduction: str = "mean",
     ) -> None:
         super().__init__(reduction=reduction)
@@ -166,23 +181,47 @@ class MixedBellmanLoss(HybridLoss):
             raise ValueError(f"alpha_init must be positive, not {alpha_init}.")
         if value_network is None and mixing:
             raise ValueError(f"mixing={mixing} weighs V(s'), and there is no value network: pass one, or mixing=0.0.")
-        self._network_inputs = _inputs_of(actor_network, qvalue_network, value_network)
+        check_policy(actor_network)
+        qvalues = list(qvalue_network) if isinstance(qvalue_network, Sequence | nn.ModuleList) else qvalue_network
+        self._network_inputs = _inputs_of(actor_network, qvalues, value_network)
+        self.deactivate_vmap = deactivate_vmap
         self.convert_to_functional(actor_network, "actor_network")
-        self.tensor_keys.action = _action_key(actor_network)
-        if isinstance(qvalue_network, Sequence):
-            num_qvalue_nets = len(qvalue_network)
-        # TorchRL accepts a sequence of networks, although it annotates one.
-        qvalues = cast(TensorDictModule, qvalue_network)
-        self.convert_to_functional(qvalues, "qvalue_network", num_qvalue_nets, create_target_params=True)
+        self.tensor_keys.action = action_key_of(actor_network)
+        if isinstance(qvalues, list):
+            num_qvalue_nets = len(qvalues)
+        # TorchRL accepts a list of networks, although it annotates one.
+        self.convert_to_functional(
+            cast(TensorDictModule, qvalues), "qvalue_network", num_qvalue_nets, create_target_params=True
+        )
         self.value_network = None
         if value_network is not None:
             self.convert_to_functional(value_network, "value_network")
+        if separate_losses:
+            self._separate(actor_network, value_network, qvalues)
         self.exploration = EntropyBonus() if exploration is None else exploration
-        dtype = next(iter(self.qvalue_network_params.values(True, True))).dtype
+        dtype = self._dtype_of("qvalue_network")
         self.register_coeff_buffer("mixing", mixing, dtype=dtype)
         self.register_coeff_buffer("gamma", 0.99, dtype=dtype)
         _ = self.vmap_randomness  # TorchRL sets it at the first access, which must not be inside a compiled forward
         self.register_buffer("log_alpha", torch.tensor(math.log(alpha_init), dtype=dtype))
+
+    def _separate(self, actor: nn.Module, value: nn.Module | None, qvalues: nn.Module | list[TensorDictModule]) -> None:
+        """Note which parameters V shares with the policy, and Q with either."""
+        shared = {parameter.data_ptr() for parameter in actor.parameters()}
+        self._constants = {}
+        for name, network in (("value_network", value), ("qvalue_network", qvalues)):
+            if network is None:
+                continue
+            if isinstance(network, nn.Module):
+                of_network = {parameter.data_ptr() for parameter in network.parameters()}
+                if name == "qvalue_network" and shared & of_network:
+                    raise ValueError(
+                        "one Q network is copied with new parameters for each member of the ensemble, so it cannot "
+                        "share any: give a list of networks that hold the shared module."
+                    )
+            leaves = getattr(self, f"{name}_params").items(True, True)
+            self._constants[name] = {key for key, leaf in leaves if leaf.data_ptr() in shared}
+            shared |= {leaf.data_ptr() for _, leaf in leaves}
 
     def make_value_estimator(self, value_type: ValueType = None, **hyperparams) -> MixedBellmanLoss:
         """Set γ of Eq. (7): ``loss.make_value_estimator(gamma=0.98)``.
@@ -200,6 +239,20 @@ class MixedBellmanLoss(HybridLoss):
         self.gamma = one_step_discount(value_type, hyperparams, default=float(self.gamma))
         self.value_type = ValueEstimators.TD0
         return self
+
+    @property
+    def value_estimator(self) -> MixedTD0Estimator:
+        """TD(0) estimator of Eq. (7). It follows this loss; change γ and keys here, not there."""
+        keys = self.tensor_keys
+        estimator = MixedTD0Estimator(self.gamma, self.mixed_next_value)
+        estimator.set_keys(
+            value=keys.value,
+            reward=keys.reward,
+            done=keys.done,
+            terminated=keys.terminated,
+            steps_to_next_obs=keys.steps_to_next_obs,
+        )
+        return estimator
 
     def set_keys(self, **kwargs) -> None:
         super().set_keys(**kwargs)
@@ -229,9 +282,6 @@ class MixedBellmanLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return ("loss_qvalue",)
 
-    def _network_dtype(self) -> torch.dtype:
-        return self.gamma.dtype
-
     @property
     def alpha(self) -> Tensor:
         """β, the weight of the entropy, as a constant."""
@@ -239,7 +289,10 @@ class MixedBellmanLoss(HybridLoss):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._output({"loss_qvalue": self.qvalue_loss(tensordict, self._rows(tensordict))}, tensordict)
+        batch = self._without_masked_rows(tensordict)
+        losses = {"loss_qvalue": self.qvalue_loss(batch, self._rows(batch))}
+        tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
+        return self._output(losses, tensordict)
 
     def qvalue_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Compute Eq. (8), reduced, and write the td error into ``tensordict``."""
@@ -250,31 +303,33 @@ class MixedBellmanLoss(HybridLoss):
         ratio = tensordict.get(self.tensor_keys.dynamics_ratio, None)
         if ratio is not None:
             ratio = self._one_per_row(ratio.detach(), terms, self.tensor_keys.dynamics_ratio)
-            terms = torch.where(rows.real, terms, ratio * terms)
+            terms = torch.where(rows.like(terms).real, terms, ratio * terms)
         return self._expectation(terms, rows)  # Eq. (8)
 
     @torch.no_grad()
     def mixed_target(self, tensordict: TensorDictBase) -> Tensor:
         """Compute Eq. (7), the target of Q(s, a), as a constant, ``[*B]``."""
         keys = self.tensor_keys
-        next_states = tensordict.get("next")
-        next_value = self._next_policy_value(next_states)
-        value_network = self.value_network
-        if value_network is not None:
-            value = self._next_value(value_network, next_states)
-            next_value = self.mixing * value + (1 - self.mixing) * next_value
-        reward = self._one_per_row(self._entry(next_states, keys.reward), next_value, ("next", keys.reward))
-        terminated, key = self._entry(next_states, keys.terminated), ("next", keys.terminated)
-        terminated = self._one_per_row(require_boolean(terminated, key, type(self).__name__), next_value, key)
+        reward_key, terminated_key = (unravel_key(("next", key)) for key in (keys.reward, keys.terminated))
+        next_value = self.mixed_next_value(tensordict)
+        reward = self._one_per_row(self._entry(tensordict, reward_key), next_value, reward_key)
+        terminated = require_boolean(self._entry(tensordict, terminated_key), terminated_key, type(self).__name__)
+        terminated = self._one_per_row(terminated, next_value, terminated_key)
         steps, discount = tensordict.get(keys.steps_to_next_obs, None), self.gamma
         if steps is not None:
             discount = self.gamma ** self._one_per_row(steps, next_value, keys.steps_to_next_obs)
         return reward + discount * torch.where(terminated, 0.0, next_value)  # Eq. (7)
 
-    def _next_value(self, value_network: TensorDictModule, next_states: TensorDictBase) -> Tensor:
-        """V(s') of the online value network, ``[*B]``."""
-        out = self.calls.outputs(value_network, next_states, self.value_network_params)
-        return self._entry(out, self.tensor_keys.value).squeeze(-1)
+    @torch.no_grad()
+    def mixed_next_value(self, tensordict: TensorDictBase) -> Tensor:
+        """Compute what Eq. (7) multiplies by γ, the mixture of V(s') and the policy's value, ``[*B]``."""
+        next_states = tensordict.get("next")
+        next_value = self._next_policy_value(next_states)
+        if self.value_network is None:
+            return next_value
+        out = self._call("value_network", next_states)
+        value = self._entry(out, self.tensor_keys.value).squeeze(-1)
+        return self.mixing * value + (1 - self.mixing) * next_value
 
     def _next_policy_value(self, next_states: TensorDictBase) -> Tensor:
         """Minimum of the target networks' Q̂(s', a') plus the exploration term, with a' ~ π(.|s'), ``[*B]``."""
@@ -288,39 +343,24 @@ class MixedBellmanLoss(HybridLoss):
 
     def sample_action(self, states: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Draw a reparameterised a ~ π(.|s), and return it with log π(a|s), ``[*B]``."""
-        with set_exploration_type(ExplorationType.RANDOM):
-            policy = self.calls.distribution(self.actor_network, states, self.actor_network_params)
+        stateful = self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
+        with set_exploration_type(ExplorationType.RANDOM), stateful:
+            policy = self.actor_network.get_dist(states.select(*self.actor_network.in_keys))
         return rsample_and_log_prob(policy)
 
     def qvalues(self, tensordict: TensorDictBase, params: TensorDictBase, *, frozen: bool = False) -> Tensor:
         """Q(s, a) of each ensemble member, ``[num_qvalue_nets, *B]``; ``frozen`` makes the parameters constants."""
-        out = self.calls.outputs(self.qvalue_network, tensordict, params, self.vmap_randomness, frozen=frozen)
+        out = self._call("qvalue_network", tensordict, params, frozen=frozen)
         return self._entry(out, self.tensor_keys.state_action_value).squeeze(-1)
-
-
-def _action_key(actor_network: ProbabilisticTensorDictSequential) -> NestedKey:
-    """The key under which the actor writes its action."""
-    keys = getattr(actor_network, "dist_sample_keys", None)
-    return keys[0] if keys else "action"
-
-
-def action_dim_of(actor_network: ProbabilisticTensorDictSequential, action_key: NestedKey) -> int | None:
-    """Size of the action from the actor's spec; None without a spec."""
-    spec = getattr(actor_network, "spec", None)
-    leaf = spec.get(action_key, None) if isinstance(spec, Composite) else spec
-    if leaf is None:
-        return None
-    batch_dims = spec.ndim if isinstance(spec, Composite) else 0
-    return leaf.shape[batch_dims:].numel()
 
 
 def _inputs_of(
     actor_network: ProbabilisticTensorDictSequential,
-    qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+    qvalue_network: TensorDictModule | list[TensorDictModule],
     value_network: TensorDictModule | None,
 ) -> tuple[NetworkInput, ...]:
     """Sizes of the entries that the loss reads, from its networks and the action's spec."""
-    read_by_q, key = network_inputs(qvalue_network), _action_key(actor_network)
+    read_by_q, key = network_inputs(qvalue_network), action_key_of(actor_network)
     states = [*network_inputs(actor_network), *network_inputs(value_network)]
     following = [*network_inputs(actor_network, "next"), *network_inputs(value_network, "next")]
     action_dim = action_dim_of(actor_network, key)

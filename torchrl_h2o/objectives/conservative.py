@@ -178,18 +178,17 @@ class ConservativeLoss(LossWrapper):
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        term = self.conservative_loss(tensordict, self._rows(tensordict))
-        return self._output({**self.loss(tensordict), "loss_conservative": term}, tensordict)
+        batch = self._without_masked_rows(tensordict)
+        term = self.conservative_loss(batch, self._rows(batch))
+        return self._output({**self._terms_inside(batch, tensordict), "loss_conservative": term}, tensordict)
 
     def conservative_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Compute the first bracket of Eq. (1), times α_c, ``[]``."""
         inside: Any = self.loss  # has a Q network, as the constructor checks
-        out = self.calls.outputs(
-            inside.qvalue_network, tensordict, inside.qvalue_network_params, inside.vmap_randomness
-        )
-        qvalues = out.get(inside.tensor_keys.state_action_value).squeeze(-1)
+        qvalues = self._call("qvalue_network", tensordict).get(inside.tensor_keys.state_action_value).squeeze(-1)
+        rows = rows.like(qvalues[0])
         of_sim = self._soft_maximum(qvalues, tensordict, rows).sum()
-        return self.alpha_c * (of_sim - self._expectation(qvalues, rows, rows.real))  # Eq. (1)
+        return self.alpha_c * (of_sim - self._expectation(qvalues.sum(0), rows, "real"))  # Eq. (1)
 
     def _soft_maximum(self, qvalues: Tensor, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """log Σ ω e^Q over the simulated rows, ``[num_qvalue_nets]``; zero without such rows."""

@@ -7,15 +7,15 @@ from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from tensordict.nn import dispatch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn.parameter import is_lazy
 from torchrl.objectives import LossModule
 
-from torchrl_h2o.objectives.batch_checks import rows_in_words
-from torchrl_h2o.objectives.bellman import MixedBellmanLoss, action_dim_of
+from torchrl_h2o.objectives.bellman import MixedBellmanLoss
 from torchrl_h2o.objectives.hybrid_loss import Rows
 from torchrl_h2o.objectives.loss_wrapper import LossWrapper
+from torchrl_h2o.objectives.policy import action_dim_of
 from torchrl_h2o.objectives.ratio import DynamicsRatioLoss
 from torchrl_h2o.objectives.value import InSampleValueLoss
 
@@ -28,6 +28,8 @@ class H2OPlusLoss(LossWrapper):
 
     Each term trains one part (the paper's equation in brackets): ``loss_value`` trains V (4), ``loss_qvalue`` Q (7, 8),
     ``loss_actor`` the policy (10), ``loss_alpha`` β, ``loss_ratio_sa`` and ``loss_ratio_sas`` the discriminators (9).
+    Actions are continuous. Parameters that networks share are trained by the losses of all of them, unless
+    ``bellman_loss`` has ``separate_losses=True``.
 
     Args:
         bellman_loss (MixedBellmanLoss): holds the policy, Q and β, and reads V. Its β becomes a trained parameter
@@ -42,12 +44,7 @@ class H2OPlusLoss(LossWrapper):
             still trained, but the weight is 1. Defaults to ``True``.
         fixed_alpha (bool, optional): whether β stays constant. Defaults to ``False``.
         target_entropy (float or "auto", optional): in nats. ``"auto"``, the default, is -dim(A), from the actor's
-            spec.
-        num_real (int, optional): a promise that the first ``num_real`` rows of each batch ``[B]`` are all its real
-            rows, as in :class:`~torchrl_h2o.data.HybridReplayBuffer`'s batches. The compiled loss then computes V on
-            the real rows only, and the ratio on the simulated rows only; the losses stay the same to rounding. For a
-            batch that breaks the promise, the compiled losses are NaN, and the uncompiled loss raises a ValueError.
-            Defaults to ``None``.
+            spec; of several agents, -dim(A) of one agent.
 
     Raises:
         ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if their reductions differ, or if the target
@@ -111,14 +108,12 @@ class H2OPlusLoss(LossWrapper):
         weighted: bool = True,
         fixed_alpha: bool = False,
         target_entropy: float | str = "auto",
-        num_real: int | None = None,
     ) -> None:
         _check_shared_value(bellman_loss, value_loss)
         super().__init__(bellman_loss, reduction=bellman_loss.reduction)
         self.value_loss = value_loss
         self.ratio_loss = ratio_loss
         self.weighted = weighted
-        self.num_real = num_real
         for part in self._parts:
             if part.reduction != self.reduction:
                 raise ValueError(
@@ -129,13 +124,20 @@ class H2OPlusLoss(LossWrapper):
             bellman_loss._has_update_associated |= ratio_loss._has_update_associated
             ratio_loss._has_update_associated = bellman_loss._has_update_associated
         if value_loss is not None:  # one container, so that conversions of dtype or device keep V shared
-            bellman_loss.value_network_params = value_loss.value_network_params
+            value_loss.value_network_params = bellman_loss.value_network_params
+            value_loss._constants = bellman_loss._constants
         if not fixed_alpha:
             log_alpha = bellman_loss.log_alpha.detach()
             del bellman_loss.log_alpha
             bellman_loss.log_alpha = nn.Parameter(log_alpha)
         if target_entropy == "auto":
-            target_entropy = -float(_action_dim(bellman_loss.actor_network, self.tensor_keys.action))
+            action_dim = action_dim_of(bellman_loss.actor_network, self.tensor_keys.action)
+            if action_dim is None:
+                raise ValueError(
+                    "target_entropy='auto' needs the action's spec: give it to the actor "
+                    "(ProbabilisticActor(..., spec=env.action_spec)), or pass target_entropy=-action_dim."
+                )
+            target_entropy = -float(action_dim)
         self.register_coeff_buffer("target_entropy", cast(float, target_entropy), dtype=bellman_loss.mixing.dtype)
 
     @property
@@ -178,9 +180,8 @@ class H2OPlusLoss(LossWrapper):
     def __getattr__(self, name: str) -> Any:
         if name in ("estimator_params", "target_estimator_params"):
             return getattr(self.ratio_loss, name)
-        reached = ("actor_network", "qvalue_network", "value_network", "log_alpha")
-        if name in reached and (inside := self._inside_if_set) is not None:
-            return getattr(inside, name)
+        if name == "log_alpha" and (inside := self._inside_if_set) is not None:
+            return inside.log_alpha
         return super().__getattr__(name)
 
     def _read_keys(self) -> Iterable[NestedKey]:
@@ -215,17 +216,11 @@ class H2OPlusLoss(LossWrapper):
         """Compute all losses.
 
         Args:
-            tensordict: transitions of both streams, ``[*B]``; ``[B]`` with ``num_real``. Its td error is written into
-                it.
+            tensordict: transitions of both streams, ``[*B]``. Its td error is written into it.
             pairs: transitions for the discriminators, ``[*C]``. Defaults to ``tensordict``.
-
-        Raises:
-            ValueError: with ``num_real``, for a batch of another number of dimensions and, uncompiled, for one whose
-                real rows are elsewhere.
         """
-        bellman, batch = self.bellman_loss, tensordict.copy()
+        bellman, batch = self.bellman_loss, self._without_masked_rows(tensordict).copy()
         rows = bellman._rows(batch)
-        misplaced = self._misplaced(rows)
         ratio_terms = self._ratio_terms(batch, rows, pairs)
         loss_qvalue = bellman.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
@@ -238,9 +233,6 @@ class H2OPlusLoss(LossWrapper):
             "loss_alpha": self.alpha_loss(log_prob, rows),
             **ratio_terms,
         }
-        if misplaced is not None:  # terms that are computed on the rows of one stream would be wrong
-            for name in [name for name in terms if name.startswith("loss_")]:
-                terms[name] = terms[name].masked_fill(misplaced, torch.nan)
         if self.reduction != "none":
             terms |= {"alpha": self.alpha, "entropy": self._metric(-log_prob, rows)}
         return self._output(terms, tensordict)
@@ -261,9 +253,7 @@ class H2OPlusLoss(LossWrapper):
             )
         terms = dict(self.ratio_loss(batch if pairs is None else pairs).items())
         if self.weighted:
-            log_ratio, ratio = self.ratio_loss.log_and_clamped_ratio(batch[self.num_real :] if self._splits else batch)
-            if self._splits:  # real rows are not weighted
-                log_ratio, ratio = (F.pad(values, (len(batch) - len(values), 0)) for values in (log_ratio, ratio))
+            log_ratio, ratio = self.ratio_loss.log_and_clamped_ratio(batch)
             batch.set(key, ratio)
             terms |= self._ratio_figures(log_ratio, ratio, rows)
         return terms
@@ -274,7 +264,7 @@ class H2OPlusLoss(LossWrapper):
             return {"dynamics_ratio": ratio, "unclamped_ratio": log_ratio.exp()}
 
         def mean_of_sim(values: Tensor) -> Tensor:
-            return self._expectation(values, rows, rows.sim, reduction="mean", prioritised=False)
+            return self._expectation(values, rows, "sim", reduction="mean", prioritised=False)
 
         mean, mean_square = mean_of_sim(ratio), mean_of_sim(ratio.square())
         return {
@@ -286,49 +276,13 @@ class H2OPlusLoss(LossWrapper):
 
     def _value_terms(self, batch: TensorDictBase, rows: Rows) -> dict[str, Tensor]:
         """Compute the loss of V, Eq. (4): regress V on the target Q at the actions in the data."""
-        value_loss = self.value_loss
+        value_loss, bellman = self.value_loss, self.bellman_loss
         if value_loss is None:
             return {}
-        if self._splits:
-            batch = cast(TensorDictBase, batch[: self.num_real])
-            rows = self.bellman_loss._rows(batch)
-        batch.set(value_loss.tensor_keys.state_action_value, self._data_qvalue(batch))
+        with torch.no_grad():
+            qvalue = bellman.qvalues(batch, bellman.target_qvalue_network_params).amin(0)
+        batch.set(value_loss.tensor_keys.state_action_value, qvalue)
         return {"loss_value": value_loss.value_loss(batch, rows)}
-
-    def _misplaced(self, rows: Rows) -> Tensor | None:
-        """Whether the compiled loss has real rows elsewhere than ``num_real`` says, ``[]``; None if that is excluded.
-
-        Raises:
-            ValueError: uncompiled, for such rows, and for a batch that has not one dimension.
-        """
-        if self.num_real is None:
-            return None
-        real, name = rows.real, f"{type(self).__name__}: num_real={self.num_real}"
-        if real.ndim != 1:
-            raise ValueError(
-                f"{name} is for batches of one dimension, and this batch has the shape {list(real.shape)}: flatten it "
-                "with batch.reshape(-1) and put the real rows first, or leave num_real out."
-            )
-        misplaced = rows.sim[: self.num_real].any() | real[self.num_real :].any()
-        if torch.compiler.is_compiling():  # a graph cannot raise an error that depends on values
-            return misplaced
-        if misplaced:
-            raise ValueError(
-                f"{name} promises that the first {self.num_real} rows of a batch are all its real rows, and "
-                f"{rows_in_words(real)} real: sort the rows such that the real ones come first, give their number, or "
-                "leave num_real out."
-            )
-        return None
-
-    @property
-    def _splits(self) -> bool:
-        """Whether terms of one stream are computed on its rows alone. Uncompiled, this would save no time."""
-        return bool(self.num_real) and self.reduction == "mean" and torch.compiler.is_compiling()
-
-    @torch.no_grad()
-    def _data_qvalue(self, batch: TensorDictBase) -> Tensor:
-        """Minimum of the target Q-values at the actions in the data, ``[*B]``."""
-        return self.bellman_loss.qvalues(batch, self.target_qvalue_network_params).amin(0)
 
     def actor_loss(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, Tensor]:
         """Compute the reduced loss of Eq. (10), and log π(a|s) of the sampled actions as a constant, ``[*B]``."""
@@ -361,14 +315,8 @@ def _check_shared_value(bellman_loss: MixedBellmanLoss, value_loss: InSampleValu
 
 def _are_shared(params: TensorDictBase, others: TensorDictBase) -> bool:
     keys = set(params.keys(True, True))
-    return keys == set(others.keys(True, True)) and all(params.get(key) is others.get(key) for key in keys)
-
-
-def _action_dim(actor_network: ProbabilisticTensorDictSequential, action_key: NestedKey) -> int:
-    action_dim = action_dim_of(actor_network, action_key)
-    if action_dim is None:
-        raise ValueError(
-            "target_entropy='auto' needs the action's spec: give it to the actor "
-            "(ProbabilisticActor(..., spec=env.action_spec)), or pass target_entropy=-action_dim."
-        )
-    return action_dim
+    pairs = [(params.get(key), others.get(key, None)) for key in keys]
+    # Parameters are the same objects; of a buffer, each loss holds another view.
+    return keys == set(others.keys(True, True)) and all(
+        one is other or (not is_lazy(one) and one.data_ptr() == other.data_ptr()) for one, other in pairs
+    )

@@ -18,8 +18,9 @@ class ImportanceWeightedLoss(LossWrapper):
     """Multiply every row's terms of a TorchRL loss by a weight from the batch.
 
     If the batch has ``real``, rows marked True keep weight 1, as in Eq. (8): measured rows need no correction. Only
-    ``loss_*`` terms are weighted, and gradients do not pass through the weights. ``SoftUpdate`` accepts this loss and
-    updates the targets of ``loss``.
+    terms named ``loss...`` are weighted, and gradients do not pass through the weights. With weights of one, the result
+    is that of ``loss`` with ``reduction="mean"``, also with the weights of a prioritised replay buffer. ``SoftUpdate``
+    accepts this loss and updates the targets of ``loss``.
 
     Args:
         loss (LossModule): built with ``reduction="none"`` (TorchRL's SACLoss and IQLLoss also need
@@ -28,12 +29,12 @@ class ImportanceWeightedLoss(LossWrapper):
 
     Keyword Args:
         terms (sequence of str, optional): the weighted terms, such as ``["loss_qvalue"]`` for only the Bellman
-            error. Defaults to every ``loss_*`` term.
+            error. Defaults to every term named ``loss...``. Terms are ``[*B]`` or, of an ensemble, ``[N, *B]``.
         reduction (str, optional): ``"none"`` | ``"mean"`` | ``"sum"`` of the weighted terms over all rows.
             Defaults to ``"mean"``.
 
     Raises:
-        ValueError: if ``loss`` reduces its terms, or does not write one of ``terms``.
+        ValueError: if ``loss`` reduces its terms, writes none named ``loss...``, or does not write one of ``terms``.
         KeyError: if the batch has no weights.
 
     Source:
@@ -74,6 +75,8 @@ class ImportanceWeightedLoss(LossWrapper):
             )
         self.key = key
         there = self._written_keys()
+        if not there:
+            raise ValueError(f"{type(loss).__name__} has no term named 'loss...' to weigh, but only {loss.out_keys}.")
         self.terms = tuple(there if terms is None else terms)
         if unknown := set(self.terms) - set(there):
             names = ", ".join(map(str, unknown))
@@ -86,14 +89,42 @@ class ImportanceWeightedLoss(LossWrapper):
         return (self.tensor_keys.real, self.tensor_keys.priority_weight)
 
     def _written_keys(self) -> Iterable[NestedKey]:
-        return tuple(key for key in self.loss.out_keys if str(key).startswith("loss_"))
+        return tuple(key for key in self.loss.out_keys if str(key).startswith("loss"))
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        weights = self._weights(tensordict)
-        terms = self.loss(tensordict).select(*self._written_keys())
-        weighted = {key: _scale(value, weights) if key in self.terms else value for key, value in terms.items()}
-        return self._output({key: self._reduce_loss(value, tensordict) for key, value in weighted.items()}, tensordict)
+        batch = self._without_masked_rows(tensordict)
+        weights, terms = self._weights(batch), self._terms_inside(batch, tensordict)
+        one, scale = torch.ones_like(weights), self._scale_of_mean(batch, weights)
+        weighted = {key: weights if key in self.terms else one for key in self._written_keys()}
+        return self._output({k: scale * self._reduced(k, terms[k], w, batch) for k, w in weighted.items()}, tensordict)
+
+    def _reduced(self, name: NestedKey, term: Tensor, weights: Tensor, batch: TensorDictBase) -> Tensor:
+        """Multiply a term by the weights ``[*B]`` and reduce it."""
+        rows, ndim = weights.shape, weights.ndim
+        if not ndim:
+            return self._reduce_loss(term * weights, batch)
+        # TorchRL stacks the networks of an ensemble in front of the batch, [N, *B]. Masks are expanded at the end.
+        ensemble = term.ndim > ndim and term.shape[-ndim:] == rows
+        first, last = tuple(range(ndim)), tuple(range(-ndim, 0))
+        term = term.movedim(last, first) if ensemble else term
+        if term.shape[:ndim] != rows:
+            raise ValueError(
+                f"{type(self.loss).__name__} writes {name!r} with the shape {list(term.shape)}, in which there is no "
+                f"batch of the shape {list(rows)}."
+            )
+        reduced = self._reduce_loss(term * weights.reshape(*rows, *(1,) * (term.ndim - ndim)), batch)
+        return reduced.movedim(first, last) if ensemble and self.reduction == "none" else reduced
+
+    def _scale_of_mean(self, batch: TensorDictBase, weights: Tensor) -> Tensor | float:
+        """One over the mean priority weight, by which TorchRL's losses divide their mean if they have one."""
+        if self.reduction != "mean" or not hasattr(self.loss.tensor_keys, "priority_weight"):
+            return 1.0
+        priority = self.loss._maybe_get_priority_weight(batch)
+        if priority is None:
+            return 1.0
+        key = self.loss.tensor_keys.priority_weight
+        return 1.0 / self._reduce_loss(one_per_row(priority, weights.shape, key, type(self).__name__), batch)
 
     def _weights(self, tensordict: TensorDictBase) -> Tensor:
         weights = tensordict.get(self.key, None)
@@ -105,15 +136,10 @@ class ImportanceWeightedLoss(LossWrapper):
         require_rows(weights, type(self).__name__)
         if tensordict.ndim:
             weights = one_per_row(weights, tensordict.batch_size, self.key, type(self).__name__)
+        elif weights.ndim > 1 and weights.shape[-1] == 1:  # called with tensors: the shape of the batch is not known
+            weights = weights.squeeze(-1)
         real = tensordict.get(self.tensor_keys.real, None)
         if real is not None:
             real = require_boolean(real, self.tensor_keys.real, type(self).__name__)
             weights = torch.where(self._expand_loss_mask(real, weights), 1.0, weights)
         return weights.detach()
-
-
-def _scale(terms: Tensor, weights: Tensor) -> Tensor:
-    """Multiply terms by weights, after trailing dimensions of size 1 are added to the weights, or one is removed."""
-    if weights.ndim > terms.ndim:
-        weights = weights.squeeze(-1)
-    return terms * weights.reshape(weights.shape + (1,) * (terms.ndim - weights.ndim))

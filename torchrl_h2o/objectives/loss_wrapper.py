@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
-import torch
-from tensordict import NestedKey
-from torch import nn
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from torchrl_h2o.objectives.batch_checks import NetworkInput
@@ -44,8 +43,24 @@ class LossWrapper(HybridLoss):
     def _network_inputs(self) -> tuple[NetworkInput, ...]:
         return getattr(self._inside, "_network_inputs", ())
 
-    def _network_dtype(self) -> torch.dtype | None:
-        return cast(HybridLoss, self._inside)._network_dtype()
+    @property
+    def _checked_network(self) -> str | None:
+        return getattr(self._inside, "_checked_network", None)
+
+    @property
+    def deactivate_vmap(self) -> bool:
+        return getattr(self._inside, "deactivate_vmap", False)
+
+    @property
+    def _constants(self) -> Mapping[str, set[tuple[str, ...]]]:
+        return getattr(self._inside, "_constants", {})
+
+    def _terms_inside(self, batch: TensorDictBase, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Compute the terms of the inner loss, and copy the td error that it writes into ``batch``."""
+        terms, key = dict(self._inside(batch).items()), getattr(self._inside.tensor_keys, "priority", None)
+        if batch is not tensordict and key is not None and (error := batch.get(key, None)) is not None:
+            tensordict.set(key, error)
+        return terms
 
     @property
     def _parts(self) -> list[LossModule]:
@@ -126,6 +141,6 @@ class LossWrapper(HybridLoss):
             yield from ((name, module) for name, module in part.named_children() if name.startswith("target_"))
 
     def __getattr__(self, name: str) -> Any:
-        if name.endswith("_params") and (inside := self._inside_if_set) is not None:
+        if name.endswith(("_params", "_network")) and (inside := self._inside_if_set) is not None:
             return getattr(inside, name)
         return super().__getattr__(name)

@@ -18,6 +18,24 @@ from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 HIDDEN = (256, 256)
 
 
+class _OutputLayer(nn.Linear):
+    """Linear layer that keeps its own precision in ``torch.autocast``: in bfloat16, a Q of 1000 is a multiple of 4."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        if not torch.is_autocast_enabled(input.device.type):
+            return super().forward(input)
+        with torch.autocast(input.device.type, enabled=False):
+            return super().forward(input.to(self.weight.dtype))
+
+
+def _with_output_layer(network: MLP) -> MLP:
+    last = cast(nn.Linear, network[-1])
+    output = nn.utils.skip_init(_OutputLayer, last.in_features, last.out_features)  # draws no random numbers
+    output.weight, output.bias = last.weight, last.bias
+    network[-1] = output
+    return network
+
+
 def _mlp(in_features: int, out_features: int, num_cells: Sequence[int], layer_norm: bool = False) -> MLP:
     norm = {}
     if layer_norm:
@@ -26,7 +44,7 @@ def _mlp(in_features: int, out_features: int, num_cells: Sequence[int], layer_no
     last = cast(nn.Linear, network[-1])
     nn.init.xavier_uniform_(last.weight, gain=1e-2)
     nn.init.zeros_(last.bias)
-    return network
+    return _with_output_layer(network)
 
 
 class GaussianParameters(nn.Module):
@@ -225,8 +243,9 @@ def make_dynamics_ratio_estimator(
     sa = None
     if with_sa_network:
         hidden = {"num_cells": list(num_cells), "activation_class": nn.ReLU}
-        sa = TensorDictModule(MLP(sa_dim, 2, **hidden), in_keys=keys[:2], out_keys=["sa_logits"])
-        network = MLP(sas_dim, 2, **hidden)
+        sa_network = _with_output_layer(MLP(sa_dim, 2, **hidden))
+        sa = TensorDictModule(sa_network, in_keys=keys[:2], out_keys=["sa_logits"])
+        network = _with_output_layer(MLP(sas_dim, 2, **hidden))
     else:
         network = _mlp(sas_dim, 2, num_cells)
     sas = TensorDictModule(network, in_keys=keys, out_keys=["sas_logits"])

@@ -11,9 +11,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_h2o.objectives.batch_checks import network_inputs, separated
+from torchrl_h2o.objectives.batch_checks import entry, network_inputs, separated
 from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
-from torchrl_h2o.objectives.network_calls import NetworkCalls
 
 Bound = float | None
 
@@ -33,7 +32,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
 
     Args:
         sa_network (TensorDictModule or None): reads observation and action, writes logits ``[*B, 2]``, (real,
-            simulated).
+            simulated), as its last entry.
         sas_network (TensorDictModule): the same, and reads the next observation too.
 
     Keyword Args:
@@ -127,54 +126,33 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
                 "entry that holds s' in both."
             )
 
-    def log_odds(
-        self, tensordict: TensorDictBase, params: TensorDictBase | None = None, calls: NetworkCalls | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def log_odds(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Compute the log-odds of real against simulated.
 
         Args:
             tensordict (TensorDictBase): transitions, ``[*B]``.
-            params (TensorDictBase, optional): used instead of this module's parameters.
-            calls (NetworkCalls, optional): runs the networks with ``params``. Defaults to TorchRL's method.
 
         Returns:
             The log-odds given (s, a) and given (s, a, s'), ``[*B]`` each. With ``residual`` the second includes the
             first. Without ``sa_network`` the first are zero.
         """
-        calls = NetworkCalls() if calls is None else calls
+        with_change = tensordict
+        if self.change_scale is not None:  # sas_network reads the normalised change of the observation instead of s'
+            change = tensordict.get(self.next_observation) - tensordict.get(self.observation)
+            with_change = tensordict.select(*self.in_keys).set(self.next_observation, change / self.change_scale)
+        sas = self._network_log_odds("sas_network", with_change)
         if self.sa_network is None:
-            sas = self._network_log_odds("sas_network", self._with_change(tensordict, params), params, calls)
             return torch.zeros_like(sas), sas
-        sa = self._network_log_odds("sa_network", tensordict, params, calls)
-        sas = self._network_log_odds("sas_network", self._with_change(tensordict, params), params, calls)
+        sa = self._network_log_odds("sa_network", tensordict)
         if not self.residual:
             return sa, sas
         return sa, sas + (sa.detach() if self.detach_residual else sa)
 
-    def _with_change(self, tensordict: TensorDictBase, params: TensorDictBase | None) -> TensorDictBase:
-        """Replace s' by the normalised change of the observation, if this estimator reads the change."""
-        scale = self.scale(params)
-        if scale is None:
-            return tensordict
-        change = tensordict.get(self.next_observation) - tensordict.get(self.observation)
-        return tensordict.select(*self.in_keys).set(self.next_observation, change / scale)
-
-    def scale(self, params: TensorDictBase | None = None) -> Tensor | None:
-        """Return ``change_scale``, ``[observation_dim]``, of this module or of ``params``; None if there is none."""
-        return self.change_scale if params is None or self.change_scale is None else params.get("change_scale")
-
-    def _network_log_odds(
-        self, name: str, tensordict: TensorDictBase, params: TensorDictBase | None, calls: NetworkCalls
-    ) -> Tensor:
-        network = getattr(self, name)
-        if params is None:
-            out = network(tensordict.select(*network.in_keys))
-        else:
-            out = calls.outputs(network, tensordict, params.get(name))
-        logits = out.get(network.out_keys[0])
+    def _network_log_odds(self, name: str, tensordict: TensorDictBase) -> Tensor:
+        network, bound = getattr(self, name), self._bounds[name]
+        logits = network(tensordict.select(*network.in_keys)).get(network.out_keys[-1])  # after those of an encoder
         if logits.shape[-1] != 2:
-            raise ValueError(f"a discriminator must write two logits (real, simulated), not {logits.shape[-1]}.")
-        bound = self._bounds[name]
+            raise ValueError(f"{name} must write two logits (real, simulated) last, not {logits.shape[-1]}.")
         if bound is not None:
             logits = bound * torch.tanh(logits)
         real, sim = logits.unbind(-1)
@@ -182,22 +160,21 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        name = type(self).__name__
         for one in self.network_inputs:
-            one.check([cast(Tensor, tensordict.get(key)) for key in one.keys], "DynamicsRatioEstimator", None)
+            one.check([entry(tensordict, key, name) for key in one.keys], name, None)
         log_ratio, ratio = self.ratio(tensordict)
         log_key, key = self.out_keys
         return tensordict.set(log_key, log_ratio).set(key, ratio)
 
     @torch.no_grad()
-    def ratio(
-        self, tensordict: TensorDictBase, params: TensorDictBase | None = None, calls: NetworkCalls | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Compute Eq. (9), with the arguments of :meth:`log_odds`.
+    def ratio(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Compute Eq. (9) of transitions ``[*B]``.
 
         Returns:
             The log ratio and the clamped ratio, constants, ``[*B]`` each.
         """
-        sa, sas = self.log_odds(tensordict, params, calls)
+        sa, sas = self.log_odds(tensordict)
         log_ratio = sas - sa  # Eq. (9)
         ratio = log_ratio.exp()
         return log_ratio, ratio if self.clamp is None else ratio.clamp(*self.clamp)
@@ -279,6 +256,7 @@ class DynamicsRatioLoss(HybridLoss):
         >>> (losses["loss_ratio_sa"] + losses["loss_ratio_sas"]).backward()
     """
 
+    _checked_network = "estimator"
     estimator: DynamicsRatioEstimator
     estimator_params: TensorDictParams
     target_estimator_params: TensorDictParams
@@ -312,9 +290,6 @@ class DynamicsRatioLoss(HybridLoss):
             return "loss_ratio_sas", "accuracy"
         return "loss_ratio_sa", "loss_ratio_sas", "accuracy_sa", "accuracy"
 
-    def _network_dtype(self) -> torch.dtype:
-        return cast(Tensor, next(iter(self.estimator_params.values(True, True)))).dtype
-
     def dynamics_ratio(self, tensordict: TensorDictBase) -> Tensor:
         """Compute the clamped ratio of Eq. (9), as a constant, ``[*B]``; see :meth:`log_and_clamped_ratio`."""
         return self.log_and_clamped_ratio(tensordict)[1]
@@ -325,14 +300,15 @@ class DynamicsRatioLoss(HybridLoss):
         With ``delay_estimator`` they are those of the target networks, otherwise of the current discriminators.
         """
         params = self.target_estimator_params if self.delay_estimator else self.estimator_params
-        return self.estimator.ratio(tensordict, params, self.calls)
+        with params.to_module(self.estimator, preserve_module_state=False):
+            return self.estimator.ratio(tensordict)
 
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        rows, inputs = self._rows(tensordict), tensordict.select(*self.estimator.in_keys)
-        if self.training and self._noise:
-            inputs = self._noisy(inputs)
-        sa, sas = self.estimator.log_odds(inputs, self.estimator_params, self.calls)
+        batch = self._without_masked_rows(tensordict)
+        rows, inputs = self._rows(batch), batch.select(*self.estimator.in_keys)
+        with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
+            sa, sas = self.estimator.log_odds(self._noisy(inputs) if self.training and self._noise else inputs)
         terms = {
             "loss_ratio_sa": self._cross_entropy(sa, rows),
             "loss_ratio_sas": self._cross_entropy(sas, rows),
@@ -345,7 +321,7 @@ class DynamicsRatioLoss(HybridLoss):
         return self._output({name: term for name, term in terms.items() if name in self._written_keys()}, tensordict)
 
     def _noisy(self, inputs: TensorDictBase) -> TensorDictBase:
-        """Add the noise of each entry, in the order of the entries in ``inputs``."""
+        """Add the noise of each entry, in the order of the entries in ``inputs``, with the parameters in use."""
         estimator, noisy = self.estimator, inputs.copy()
         for key in inputs.keys(True, True):
             std = self._noise.get(unravel_key(key))
@@ -354,7 +330,7 @@ class DynamicsRatioLoss(HybridLoss):
             x = cast(Tensor, inputs.get(key))
             # The same numbers as torch.randn_like. Compiled populations replace normal_ to supply recorded numbers.
             noise = std * torch.empty_like(x).normal_()
-            scale = estimator.scale(self.estimator_params) if unravel_key(key) == estimator.next_observation else None
+            scale = estimator.change_scale if unravel_key(key) == estimator.next_observation else None
             noisy.set(key, x + (noise if scale is None else scale * noise))
         return noisy
 
@@ -367,11 +343,11 @@ class DynamicsRatioLoss(HybridLoss):
         return 0.5 * self.weight_penalty * cast(Tensor, sum(weight.square().sum() for weight in weights))
 
     def _cross_entropy(self, log_odds: Tensor, rows: Rows) -> Tensor:
-        terms = F.softplus(torch.where(rows.real, -log_odds, log_odds))  # -log p(own stream)
+        terms = F.softplus(torch.where(rows.like(log_odds).real, -log_odds, log_odds))  # -log p(own stream)
         return self._expectation(terms, rows)
 
     def _accuracy(self, log_odds: Tensor, rows: Rows) -> Tensor:
-        hits = ((log_odds > 0) == rows.real).to(log_odds.dtype)
+        hits = ((log_odds > 0) == rows.like(log_odds).real).to(log_odds.dtype)
         return self._metric(hits, rows)
 
 

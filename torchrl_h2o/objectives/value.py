@@ -64,6 +64,7 @@ class InSampleValueLoss(HybridLoss):
         state_action_value: NestedKey = "state_action_value"
 
     tensor_keys: _AcceptedKeys
+    _checked_network = "value_network"
     value_network: TensorDictModule
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
@@ -87,20 +88,18 @@ class InSampleValueLoss(HybridLoss):
     def _written_keys(self) -> Iterable[NestedKey]:
         return ("loss_value",)
 
-    def _network_dtype(self) -> torch.dtype:
-        return next(iter(self.value_network_params.values(True, True))).dtype
-
     @dispatch(source="_dispatch_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._output({"loss_value": self.value_loss(tensordict, self._rows(tensordict))}, tensordict)
+        batch = self._without_masked_rows(tensordict)
+        return self._output({"loss_value": self.value_loss(batch, self._rows(batch))}, tensordict)
 
     def value_loss(self, tensordict: TensorDictBase, rows: Rows) -> Tensor:
         """Compute the reduced loss of Eq. (4)."""
-        out = self.calls.outputs(self.value_network, tensordict, self.value_network_params)
+        out = self._call("value_network", tensordict)
         value = self._entry(out, self.tensor_keys.value).squeeze(-1)
         qvalue = self._entry(tensordict, self.tensor_keys.state_action_value).detach()
         qvalue = self._one_per_row(qvalue, value, self.tensor_keys.state_action_value)
-        return self._expectation(self.penalty(qvalue - value), rows, rows.real)  # Eq. (4)
+        return self._expectation(self.penalty(qvalue - value), rows, "real")  # Eq. (4)
 
 
 class ExpectileValueLoss(InSampleValueLoss):

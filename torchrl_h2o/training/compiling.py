@@ -56,9 +56,6 @@ def compiled(losses_of: Callable, parameters: Iterable[nn.Parameter] | None = No
         parameters: the parameters that the losses train. With them, the losses and the gradients of their sum are one
             graph, which is faster, see :class:`~torchrl_h2o.training.one_graph.OneGraph`.
     """
-    # Without this, the compiler stores nothing of a function that contains a torch.autograd.Function, such as the ReLU
-    # of accelerate(). Stored results are looked up by the whole graph, so a changed ReLU is compiled again.
-    torch._functorch.config.autograd_cache_allow_custom_autograd_functions = True
     compile_function = partial(torch.compile, options={"fallback_random": True})
     return compile_function(losses_of) if parameters is None else OneGraph(losses_of, parameters, compile_function)
 

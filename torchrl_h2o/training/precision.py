@@ -19,7 +19,7 @@ def at_precision(losses_of: Callable, precision: str) -> Callable:
     Parameters, the last layer of each network, losses and the optimiser stay in float32.
 
     Args:
-        losses_of: an accelerated loss of this library, such as :class:`~torchrl_h2o.objectives.H2OPlusLoss`.
+        losses_of: a loss of this library, such as :class:`~torchrl_h2o.objectives.H2OPlusLoss`.
         precision: ``"float32"``, or ``"bf16"`` for ``torch.autocast`` with bfloat16.
 
     Raises:

@@ -14,7 +14,6 @@ from torchrl_h2o.objectives import (
     DynamicsDivergence,
     H2OPlusLoss,
     MixedBellmanLoss,
-    accelerate,
 )
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
@@ -35,8 +34,6 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     bellman_loss = MixedBellmanLoss(actor, qvalues, mixing=0.0, exploration=no_bonus)
     loss = ConservativeLoss(H2OPlusLoss(bellman_loss, target_entropy=cfg.target_entropy), alpha_c=cfg.h2o.alpha_c)
     loss.make_value_estimator(gamma=cfg.gamma)
-    for part in (loss, ratio_loss):
-        accelerate(part)
 
     def terms_of(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, torch.Tensor]:
         ratio_losses = ratio_loss(pairs)

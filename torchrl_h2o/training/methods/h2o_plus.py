@@ -13,7 +13,6 @@ from torchrl_h2o.objectives import (
     InSampleValueLoss,
     MixedBellmanLoss,
     SparseValueLoss,
-    accelerate,
     make_value,
 )
 from torchrl_h2o.training.learner import Learner, adam, make_networks
@@ -35,7 +34,6 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
         target_entropy=cfg.target_entropy,
     )
     loss.make_value_estimator(gamma=cfg.gamma)
-    accelerate(loss)
 
     def figures(batch: TensorDictBase, pairs: TensorDictBase) -> dict[str, float]:
         return {"ratio_of_sim": float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean())}

@@ -5,7 +5,7 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import SoftUpdate
 
 from torchrl_h2o.data import HybridReplayBuffer
-from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss, accelerate
+from torchrl_h2o.objectives import H2OPlusLoss, MixedBellmanLoss
 from torchrl_h2o.training.learner import Learner, adam, make_networks
 from torchrl_h2o.training.loop import Method
 
@@ -15,7 +15,6 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     actor, qvalues = make_networks(cfg, observation_dim, action_spec)
     loss = H2OPlusLoss(MixedBellmanLoss(actor, qvalues, mixing=0.0), target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
-    accelerate(loss)
     targets = SoftUpdate(loss, tau=cfg.tau)
     optimiser = adam(loss, lr=cfg.lr)
     return Learner(actor, {"loss": loss}, optimiser, targets, replay, [cfg.batch_size], loss, one_graph=True)

@@ -1,11 +1,43 @@
-"""Discount of a one-step target, from the arguments that TorchRL's ``make_value_estimator`` accepts."""
+"""Eq. (7) as TorchRL's TD(0) estimator, and its discount from the arguments of ``make_value_estimator``."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
 ValueType = ValueEstimators | ValueEstimatorBase | type[ValueEstimatorBase] | None
+
+
+class MixedTD0Estimator(TD0Estimator):
+    """TD(0) estimate whose next value is the mixture of Eq. (7), :math:`λV(s')+(1-λ)E[\\hat Q(s',a')-β\\log π(a'|s')]`.
+
+    Args:
+        gamma (Tensor): γ, ``[]``.
+        next_value (callable): computes the mixture, ``[*B]``, in the next states of a batch.
+    """
+
+    def __init__(self, gamma: Tensor, next_value: Callable[[TensorDictBase], Tensor]) -> None:
+        super().__init__(gamma=float(gamma), value_network=None)
+        self.gamma = gamma
+        self._mixture = next_value
+
+    @torch.no_grad()
+    def value_estimate(
+        self,
+        tensordict: TensorDictBase,
+        target_params: TensorDictBase | None = None,
+        next_value: Tensor | None = None,
+        **kwargs,
+    ) -> Tensor:
+        """Compute the target of Q(s, a), ``[*B, 1]``, as a constant."""
+        if next_value is None:
+            next_value = self._mixture(tensordict).unsqueeze(-1)
+        return super().value_estimate(tensordict, target_params, next_value, **kwargs)
 
 
 def one_step_discount(value_type: ValueType, hyperparams: dict, default: float) -> float:
@@ -23,7 +55,8 @@ def one_step_discount(value_type: ValueType, hyperparams: dict, default: float) 
     """
     if isinstance(value_type, type) and issubclass(value_type, TD0Estimator):
         value_type = value_type(**{"gamma": default, "value_network": None, **hyperparams})
-    if isinstance(value_type, TD0Estimator) and type(value_type).value_estimate is TD0Estimator.value_estimate:
+    known = (TD0Estimator.value_estimate, MixedTD0Estimator.value_estimate)
+    if isinstance(value_type, TD0Estimator) and type(value_type).value_estimate in known:
         if value_type.average_rewards:
             raise ValueError(
                 "average_rewards=True standardises rewards batch by batch, which Eq. (7) does not: normalise the "
