@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import cast
 
 import torch
@@ -81,6 +82,6 @@ class AcceleratedCQLLoss(CQLLoss):
             pairs = {key: some.get(key).repeat_interleave(self.num_random, 0) for key in self.actor_network.in_keys}
             pairs[self.tensor_keys.action] = their_actions
             batch = TensorDict(pairs, [len(their_actions)])
-            out = self._vmap_qvalue_networkN0(batch, self.qvalue_network_params)
+            out = cast(Callable, self._vmap_qvalue_networkN0)(batch, self.qvalue_network_params)
             parts.append(out.get(self.tensor_keys.state_action_value).squeeze(-1))
         return torch.cat(parts, -1)

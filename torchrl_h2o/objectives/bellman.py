@@ -21,6 +21,8 @@ from torchrl_h2o.objectives.hybrid_loss import HybridLoss, Rows
 from torchrl_h2o.objectives.policy import action_dim_of, action_key_of, check_policy
 from torchrl_h2o.objectives.value_estimator import MixedTD0Estimator, ValueType, one_step_discount
 
+Networks = TensorDictModule | list[TensorDictModule]
+
 if TYPE_CHECKING:
 
     class _ScheduledBuffer:
@@ -182,7 +184,8 @@ class MixedBellmanLoss(HybridLoss):
         if value_network is None and mixing:
             raise ValueError(f"mixing={mixing} weighs V(s'), and there is no value network: pass one, or mixing=0.0.")
         check_policy(actor_network)
-        qvalues = list(qvalue_network) if isinstance(qvalue_network, Sequence | nn.ModuleList) else qvalue_network
+        several = isinstance(qvalue_network, Sequence | nn.ModuleList)
+        qvalues = cast("Networks", list(qvalue_network) if several else qvalue_network)
         self._network_inputs = _inputs_of(actor_network, qvalues, value_network)
         self.deactivate_vmap = deactivate_vmap
         self.convert_to_functional(actor_network, "actor_network")
@@ -205,7 +208,7 @@ class MixedBellmanLoss(HybridLoss):
         _ = self.vmap_randomness  # TorchRL sets it at the first access, which must not be inside a compiled forward
         self.register_buffer("log_alpha", torch.tensor(math.log(alpha_init), dtype=dtype))
 
-    def _separate(self, actor: nn.Module, value: nn.Module | None, qvalues: nn.Module | list[TensorDictModule]) -> None:
+    def _separate(self, actor: nn.Module, value: TensorDictModule | None, qvalues: Networks) -> None:
         """Note which parameters V shares with the policy, and Q with either."""
         shared = {parameter.data_ptr() for parameter in actor.parameters()}
         self._constants = {}
@@ -356,7 +359,7 @@ class MixedBellmanLoss(HybridLoss):
 
 def _inputs_of(
     actor_network: ProbabilisticTensorDictSequential,
-    qvalue_network: TensorDictModule | list[TensorDictModule],
+    qvalue_network: Networks,
     value_network: TensorDictModule | None,
 ) -> tuple[NetworkInput, ...]:
     """Sizes of the entries that the loss reads, from its networks and the action's spec."""

@@ -47,9 +47,12 @@ class Rows:
             ValueError: if the marks do not fit the terms.
         """
         if terms.shape not in self._like:
-            masks = (self.real, self.sim, self.either, self.priority)
-            spread = [None if m is None else one_per_row(m, terms.shape, self.key, "the loss") for m in masks]
-            self._like[terms.shape] = Rows(cast(Tensor, spread[0]), cast(Tensor, spread[1]), *spread[2:], self.key)
+
+            def spread(mask: Tensor) -> Tensor:
+                return one_per_row(mask, terms.shape, self.key, "the loss")
+
+            either, priority = (None if mask is None else spread(mask) for mask in (self.either, self.priority))
+            self._like[terms.shape] = Rows(spread(self.real), spread(self.sim), either, priority, self.key)
         return self._like[terms.shape]
 
     def weights(self, dtype: torch.dtype, *, prioritised: bool = True) -> Tensor:
@@ -171,11 +174,12 @@ class HybridLoss(LossModule):
             A tensordict with the network's ``out_keys``, ``[*B]`` or ``[N, *B]``.
         """
         network, constants = getattr(self, name), self._constants.get(name)
-        params = getattr(self, f"{name}_params") if params is None else params
+        params = cast(TensorDictBase, getattr(self, f"{name}_params") if params is None else params)
         if frozen:
             params = params.detach()
         elif constants:
-            params = params.named_apply(lambda key, p: p.detach() if key in constants else p, nested_keys=True)
+            separate = params.named_apply(lambda key, p: p.detach() if key in constants else p, nested_keys=True)
+            params = cast(TensorDictBase, separate)
         inputs = tensordict.select(*network.in_keys)
         if (out := perceptron_output(network, inputs, params)) is not None:
             return out

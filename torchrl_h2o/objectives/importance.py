@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -96,7 +97,7 @@ class ImportanceWeightedLoss(LossWrapper):
         batch = self._without_masked_rows(tensordict)
         weights, terms = self._weights(batch), self._terms_inside(batch, tensordict)
         one, scale = torch.ones_like(weights), self._scale_of_mean(batch, weights)
-        weighted = {key: weights if key in self.terms else one for key in self._written_keys()}
+        weighted = {cast(str, key): weights if key in self.terms else one for key in self._written_keys()}
         return self._output({k: scale * self._reduced(k, terms[k], w, batch) for k, w in weighted.items()}, tensordict)
 
     def _reduced(self, name: NestedKey, term: Tensor, weights: Tensor, batch: TensorDictBase) -> Tensor:
@@ -123,7 +124,7 @@ class ImportanceWeightedLoss(LossWrapper):
         priority = self.loss._maybe_get_priority_weight(batch)
         if priority is None:
             return 1.0
-        key = self.loss.tensor_keys.priority_weight
+        key = self.tensor_keys.priority_weight
         return 1.0 / self._reduce_loss(one_per_row(priority, weights.shape, key, type(self).__name__), batch)
 
     def _weights(self, tensordict: TensorDictBase) -> Tensor:

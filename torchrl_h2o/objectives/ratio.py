@@ -160,7 +160,7 @@ class DynamicsRatioEstimator(TensorDictModuleBase):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        name = type(self).__name__
+        name = "DynamicsRatioEstimator"
         for one in self.network_inputs:
             one.check([entry(tensordict, key, name) for key in one.keys], name, None)
         log_ratio, ratio = self.ratio(tensordict)

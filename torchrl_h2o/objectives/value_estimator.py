@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
@@ -22,7 +24,8 @@ class MixedTD0Estimator(TD0Estimator):
     """
 
     def __init__(self, gamma: Tensor, next_value: Callable[[TensorDictBase], Tensor]) -> None:
-        super().__init__(gamma=float(gamma), value_network=None)
+        # TorchRL accepts None, although it annotates a module.
+        super().__init__(gamma=float(gamma), value_network=cast(TensorDictModule, None))
         self.gamma = gamma
         self._mixture = next_value
 
