@@ -165,6 +165,10 @@ class ConservativeLoss(LossWrapper):
         super().__init__(loss)
         self.alpha_c = alpha_c
 
+    @property
+    def qvalue_network(self) -> Any:
+        return self.loss.qvalue_network
+
     def _read_keys(self) -> Iterable[NestedKey]:
         return *self.loss.in_keys, self.tensor_keys.real
 

@@ -180,8 +180,9 @@ class H2OPlusLoss(LossWrapper):
     def __getattr__(self, name: str) -> Any:
         if name in ("estimator_params", "target_estimator_params"):
             return getattr(self.ratio_loss, name)
-        if name == "log_alpha" and (inside := self._inside_if_set) is not None:
-            return inside.log_alpha
+        reached = ("actor_network", "qvalue_network", "value_network", "log_alpha")
+        if name in reached and (inside := self._inside_if_set) is not None:
+            return getattr(inside, name)
         return super().__getattr__(name)
 
     def _read_keys(self) -> Iterable[NestedKey]:

@@ -141,6 +141,6 @@ class LossWrapper(HybridLoss):
             yield from ((name, module) for name, module in part.named_children() if name.startswith("target_"))
 
     def __getattr__(self, name: str) -> Any:
-        if name.endswith(("_params", "_network")) and (inside := self._inside_if_set) is not None:
+        if name.endswith("_params") and (inside := self._inside_if_set) is not None:
             return getattr(inside, name)
         return super().__getattr__(name)
