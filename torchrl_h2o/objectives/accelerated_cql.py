@@ -14,6 +14,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss
 
+from torchrl_h2o.objectives.perceptron import perceptron_output
+
 ROWS = 1024  # state-action pairs per call of Q; the activations of more do not fit in a processor's cache
 
 
@@ -82,6 +84,8 @@ class AcceleratedCQLLoss(CQLLoss):
             pairs = {key: some.get(key).repeat_interleave(self.num_random, 0) for key in self.actor_network.in_keys}
             pairs[self.tensor_keys.action] = their_actions
             batch = TensorDict(pairs, [len(their_actions)])
-            out = cast(Callable, self._vmap_qvalue_networkN0)(batch, self.qvalue_network_params)
+            out = perceptron_output(self.qvalue_network, batch, self.qvalue_network_params)
+            if out is None:
+                out = cast(Callable, self._vmap_qvalue_networkN0)(batch, self.qvalue_network_params)
             parts.append(out.get(self.tensor_keys.state_action_value).squeeze(-1))
         return torch.cat(parts, -1)
