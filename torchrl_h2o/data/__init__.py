@@ -4,7 +4,7 @@ Every reader returns a flat TensorDict in TorchRL's episode data format (TED) wi
 selects the reader.
 """
 
-from torchrl_h2o.data.audit import Audit, AuditSettings, Finding, audit
+from torchrl_h2o.data.audit import Audit, Finding, audit
 from torchrl_h2o.data.hybrid_replay import HybridReplayBuffer
 from torchrl_h2o.data.paired_transitions import PairedTransitions
 from torchrl_h2o.data.readers.d4rl import read_d4rl
@@ -20,7 +20,6 @@ from torchrl_h2o.data.readers.ted import episodes
 
 __all__ = [
     "Audit",
-    "AuditSettings",
     "Column",
     "DataError",
     "Finding",

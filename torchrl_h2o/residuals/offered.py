@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from torchrl_h2o.data.audit import AuditSettings
 from torchrl_h2o.data.audit.derivative import fit_derivative
 from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.effects import CatalogueEntry, ObservationDelay
@@ -24,11 +23,10 @@ def offered_entries(simulation: Simulation, measured: Measured) -> tuple[Catalog
     return entries if velocities_are_late(simulation, measured) else tuple(e for e in entries if not _is_partial(e))
 
 
-def velocities_are_late(simulation: Simulation, measured: Measured, settings: AuditSettings | None = None) -> bool:
+def velocities_are_late(simulation: Simulation, measured: Measured) -> bool:
     """Whether a velocity is late against the derivative of its position, by more than half a row."""
-    settings = AuditSettings() if settings is None else settings
     log = Log.of(measured, simulation)
-    return any(fit_derivative(log, pair, settings).lag > 0.5 for pair in log.pairs)
+    return any(fit_derivative(log, pair).lag > 0.5 for pair in log.pairs)
 
 
 def _is_partial(entry: CatalogueEntry) -> bool:

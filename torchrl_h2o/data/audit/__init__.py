@@ -2,6 +2,5 @@
 
 from torchrl_h2o.data.audit.audit import Audit, audit
 from torchrl_h2o.data.audit.finding import Finding, Rows
-from torchrl_h2o.data.audit.settings import AuditSettings
 
-__all__ = ["Audit", "AuditSettings", "Finding", "Rows", "audit"]
+__all__ = ["Audit", "Finding", "Rows", "audit"]

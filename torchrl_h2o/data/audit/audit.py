@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from tensordict import TensorDictBase
 
 from torchrl_h2o.data.audit.actions import check_actions
+from torchrl_h2o.data.audit.contacts import contact_rows
 from torchrl_h2o.data.audit.derivative import Derivative, deviation, fit_derivative, lateness, roughness
 from torchrl_h2o.data.audit.excitation import check_excitation
 from torchrl_h2o.data.audit.finding import SEVERITIES, Finding
 from torchrl_h2o.data.audit.kinematics import check_kinematics
 from torchrl_h2o.data.audit.log import AuditedSimulation, AuditedTransitions, Log
 from torchrl_h2o.data.audit.model import check_belonging, check_model
+from torchrl_h2o.data.audit.regression import with_rotors
 from torchrl_h2o.data.audit.response import Response
-from torchrl_h2o.data.audit.rotors import with_rotors
 from torchrl_h2o.data.audit.rows import check_rows
-from torchrl_h2o.data.audit.settings import AUDIT_SETTINGS, AuditSettings
 from torchrl_h2o.data.audit.time import check_step, check_time
+
+FEWEST_ROWS = 30  # below which only time stamps are checked
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,6 @@ class Audit:
 def audit(
     measured: TensorDictBase | AuditedTransitions,
     simulation: AuditedSimulation,
-    *,
-    settings: AuditSettings = AUDIT_SETTINGS,
 ) -> Audit:
     """Looks for faults in measured data that would mislead a search for effects that the simulator lacks.
 
@@ -74,13 +74,13 @@ def audit(
         measured: transitions (T,) in TED, as the readers of :mod:`torchrl_h2o.data` return them, or
             ``torchrl_h2o.residuals.Measured``.
         simulation: ``torchrl_h2o.residuals.Simulation``; observations are in the units of its state map.
-        settings: thresholds and budgets.
 
     Returns:
         The findings; ``audit(...).severe`` is empty if a search makes sense.
 
     Raises:
-        DataError: if the data are no valid TED or do not have the simulator's width.
+        DataError: if the data are no valid TED, hold no row or a value that is not finite, or do not have the
+            simulator's width.
 
     Example:
         >>> from torchrl_h2o.data import audit
@@ -95,35 +95,41 @@ def audit(
         the simulator leaves ... of the accelerations unexplained, and ... if the action of wheels has the other sign
     """
     log = Log.of(measured, simulation)
-    derivatives = [fit_derivative(log, pair, settings) for pair in log.pairs]
-    step = Response.of(log, simulation, None, settings)
+    if len(log) < FEWEST_ROWS:
+        words = f"{len(log)} rows are too few to tell a fault of the data from chance"
+        return ordered([*check_time(log, simulation, ()), Finding("rows", "note", words, None, "record more")])
+    touching, found = contact_rows(log, simulation)
+    log = replace(log, touching=touching)
+    derivatives = [fit_derivative(log, pair) for pair in log.pairs]
+    step = Response.of(log, simulation, None)
     noise = estimate_noise(log, derivatives, step)
-    found = check_time(log, simulation, derivatives, settings)
-    found += check_rows(log, simulation, settings)
+    found += check_time(log, simulation, derivatives)
+    found += check_rows(log, simulation)
     if not any(finding.severity == "severe" and finding.check == "time" for finding in found):
-        kinematics = check_kinematics(log, derivatives, noise, step, settings)
+        kinematics = check_kinematics(log, derivatives, noise, step)
         severe = any(finding.severity == "severe" for finding in kinematics)
         # a wrong time step can look like wrong columns
-        found += (check_step(step, settings) if severe else []) or kinematics
+        found += (check_step(step) if severe else []) or kinematics
     if any(finding.severity == "severe" for finding in found):
         return ordered(found)
     if log.estimated_std is not None:  # the errors of estimated velocities are smooth, so rows do not show them
         noise = np.maximum(noise, log.estimated_std)
-    response = Response.of(log, simulation, noise, settings)
+    response = Response.of(log, simulation, noise)
     if response is None:
         words = "the data hold too few unbroken rows of positions and velocities to compare them with the simulator"
-        return ordered([*found, Finding("model", "note", words), *check_actions(log, None, settings)])
-    plain, response = response, with_rotors(response, settings)
-    if response is not plain:
-        words = "the simulator agrees with the log far better with rotors on its joints (armature); what follows is "
-        found.append(Finding("model", "note", words + "compared with these", None, "a search will tell their size"))
-    found += check_model(response, settings)
+        words += ", contacts left out" if touching.any() else ""
+        return ordered([*found, Finding("model", "note", words), *check_actions(log, None)])
+    (response, said), known = with_rotors(response), response.simulation
+    found += said
+    if any(finding.severity == "warning" for finding in said):
+        return ordered(found)
+    found += check_model(response)
     if not any(finding.severity == "severe" for finding in found):
-        late, known = lateness(derivatives), response is plain  # a rotor of another size looks like another gain
-        found += check_actions(log, response, settings, lateness=late, gains=known)
+        # a rotor of another size looks like another gain
+        gains = response.simulation is known
+        found += check_actions(log, response, lateness=lateness(derivatives), gains=gains)
     if not any(finding.severity == "severe" for finding in found):
-        found += check_belonging(response, settings)
-        found += check_excitation(response, settings)
+        found += [*check_belonging(response), *check_excitation(response)]
     return ordered(found)
 
 

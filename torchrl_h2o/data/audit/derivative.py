@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.data.audit.log import Log, Pair
-from torchrl_h2o.data.audit.settings import AuditSettings
+
+SPAN = 0.3  # displacement, in standard deviations, over which slopes are fitted; longer windows average noise
+LONGEST_SPAN = 64  # rows of the longest such window
+RELATED = 0.7  # correlation of displacement and integral below which the columns do not belong together
+VELOCITY_LAGS = (-3, 24)  # rows by which a velocity may be early or late
+LAG_GAIN = 0.7  # share of the unexplained variance that a shifted velocity must leave at most
+SCALE_WARNING = (0.85, 1.18)  # factors between derivative and velocity that are unsuspicious
+SCALE_SEVERE = (0.6, 1.67)  # factors between which a wrong scale is only a warning
+KNOWN_FACTOR = 0.15  # relative distance to a known factor, such as 57.3 deg/rad, at which it is named
 
 
 @dataclass(frozen=True)
@@ -34,12 +42,12 @@ class Derivative:
     velocity_noise: float
 
 
-def fit_derivative(log: Log, pair: Pair, settings: AuditSettings) -> Derivative:
+def fit_derivative(log: Log, pair: Pair) -> Derivative:
     """Fits one pair of columns; jumps are left out."""
     displacement, integral, good = steps_of(log, pair.position, pair.velocity)
-    factor, bias, correlation = related(log, displacement, integral, good, settings)
-    lag = _lateness(log, displacement, integral, good, settings)
-    error = (displacement - (factor if correlation > settings.related else 1.0) * integral)[good]
+    factor, bias, correlation = related(log, displacement, integral, good)
+    lag = _lateness(log, displacement, integral, good)
+    error = (displacement - (factor if correlation > RELATED else 1.0) * integral)[good]
     usual = deviation(error)
     spread = log.observation[:, pair.velocity].std()
     return Derivative(
@@ -66,9 +74,7 @@ def steps_of(log: Log, position: int, velocity: int) -> tuple[np.ndarray, np.nda
     return displacement, integral, (np.abs(displacement) <= large) & ~log.clipped
 
 
-def related(
-    log: Log, displacement: np.ndarray, integral: np.ndarray, good: np.ndarray, settings: AuditSettings
-) -> tuple[float, float, float]:
+def related(log: Log, displacement: np.ndarray, integral: np.ndarray, good: np.ndarray) -> tuple[float, float, float]:
     """Slope, intercept per row and correlation over the shortest windows in which the displacement is large."""
     horizon, found = 1, (np.nan, 0.0, 0.0)
     spread = float(np.std(np.cumsum(np.where(good, displacement, 0.0))))
@@ -77,7 +83,7 @@ def related(
         if len(x) < 20:
             return found
         found = _line(x, y, horizon)
-        if np.std(y) >= settings.span * spread or horizon >= settings.longest_span:
+        if np.std(y) >= SPAN * spread or horizon >= LONGEST_SPAN:
             return found
         horizon *= 2
 
@@ -100,11 +106,9 @@ def windowed(log: Log, values: np.ndarray, good: np.ndarray, horizon: int) -> np
     return (total[starts + horizon] - total[starts])[whole]
 
 
-def _lateness(
-    log: Log, displacement: np.ndarray, integral: np.ndarray, good: np.ndarray, settings: AuditSettings
-) -> float:
+def _lateness(log: Log, displacement: np.ndarray, integral: np.ndarray, good: np.ndarray) -> float:
     """Shift in rows at which displacement and velocity correlate best; 0 unless it leaves much less unexplained."""
-    first, last = settings.velocity_lags
+    first, last = VELOCITY_LAGS
     lags = np.arange(first, last + 1)
     found = np.zeros(len(lags))
     for index, lag in enumerate(lags):
@@ -113,7 +117,7 @@ def _lateness(
         if len(rows) > 50 and np.std(integral[rows + lag]) > 0.0 and np.std(displacement[rows]) > 0.0:
             found[index] = abs(np.corrcoef(displacement[rows], integral[rows + lag])[0, 1])
     best = int(found.argmax())
-    if 1.0 - found[best] ** 2 > settings.lag_gain * (1.0 - found[-first] ** 2):
+    if 1.0 - found[best] ** 2 > LAG_GAIN * (1.0 - found[-first] ** 2):
         return 0.0
     if 0 < best < len(lags) - 1:  # vertex of the parabola through three points
         left, middle, right = found[best - 1 : best + 2]

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.data.audit.finding import Finding
-from torchrl_h2o.data.audit.response import Response, joint_of
-from torchrl_h2o.data.audit.settings import AuditSettings
+from torchrl_h2o.data.audit.regression import NEGLIGIBLE
+from torchrl_h2o.data.audit.response import Response
+
+ALIKE = 0.9  # cosine of the angle between two effects' sensitivities from which they look alike
+COMBINED = 0.92  # correlation with the other effects of a joint from which an effect looks like their combination
+
 
 CHECK = "excitation"
 _JOINT = ("dry friction", "viscous friction", "armature")
@@ -52,13 +56,13 @@ class Sensitivity:
         return f"{self.effect} of {self.joint}" if self.joint else self.effect
 
 
-def check_excitation(response: Response, settings: AuditSettings) -> list[Finding]:
+def check_excitation(response: Response) -> list[Finding]:
     """Notes which of the main effects look alike in this log, with what to record to tell them apart."""
     found = sensitivities(response)
     size = [float(np.sqrt((s.response**2).mean())) for s in found]
-    seen = [s for s, usual in zip(found, size, strict=True) if usual > settings.negligible]
-    notes = _pairs(seen, settings)
-    return [*notes, *_combinations(seen, notes, settings)]
+    seen = [s for s, usual in zip(found, size, strict=True) if usual > NEGLIGIBLE]
+    notes = _pairs(seen)
+    return [*notes, *_combinations(seen, notes)]
 
 
 def sensitivities(response: Response) -> list[Sensitivity]:
@@ -78,16 +82,15 @@ def sensitivities(response: Response) -> list[Sensitivity]:
         weighted = np.clip(change / response.scale, -10.0, 10.0)
         found.append(Sensitivity(effect, joint, np.nan_to_num(weighted).ravel()))
 
-    for index, pair in enumerate(log.pairs):
+    for index, moving in enumerate(log.velocities):
         force = response.by_force[..., index]
-        add("dry friction", pair.name, -force * np.tanh(velocity[:, [index]] / (0.1 * spread[index])))
-        add("viscous friction", pair.name, -force * velocity[:, [index]])
-        add("armature", pair.name, -force * response.change[:, [index]] / seconds)
+        add("dry friction", moving.name, -force * np.tanh(velocity[:, [index]] / (0.1 * spread[index])))
+        add("viscous friction", moving.name, -force * velocity[:, [index]])
+        add("armature", moving.name, -force * response.change[:, [index]] / seconds)
     actions, _ = response.mean_action(0)
     late, known = response.mean_action(1)
-    for index, name in enumerate(log.actuators):
-        joint = joint_of(response.simulation.model, index, log.pairs)
-        label = name if joint is None else log.pairs[joint].name
+    for index in range(len(log.actuators)):
+        label = log.moved_by(index)
         own = response.by_action[..., index]
         add("motor gain", label, own * actions[:, [index]])
         add("drive delay", label, own * np.where(known, late[:, index] - actions[:, index], 0.0)[:, None])
@@ -103,14 +106,14 @@ def sensitivities(response: Response) -> list[Sensitivity]:
     return found
 
 
-def _pairs(found: list[Sensitivity], settings: AuditSettings) -> list[Finding]:
+def _pairs(found: list[Sensitivity]) -> list[Finding]:
     notes = []
     for i, one in enumerate(found):
         for other in found[i + 1 :]:
             if one.joint != other.joint and one.joint and other.joint:
                 continue
             cosine = _cosine(one.response, other.response)
-            if abs(cosine) < settings.alike:
+            if abs(cosine) < ALIKE:
                 continue
             record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record other motion of this joint")
             words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
@@ -120,7 +123,7 @@ def _pairs(found: list[Sensitivity], settings: AuditSettings) -> list[Finding]:
     return notes
 
 
-def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: AuditSettings) -> list[Finding]:
+def _combinations(found: list[Sensitivity], pairs: list[Finding]) -> list[Finding]:
     """Motor gains that friction, armature and gravity together can take the place of."""
     notes = []
     for gain in (s for s in found if s.effect == "motor gain"):
@@ -136,7 +139,7 @@ def _combinations(found: list[Sensitivity], pairs: list[Finding], settings: Audi
         size = np.maximum(np.linalg.norm(design, axis=0), 1e-12)
         values = np.linalg.lstsq(design / size, gain.response, rcond=None)[0]
         multiple = _cosine(design / size @ values, gain.response)
-        if multiple < settings.combined:
+        if multiple < COMBINED:
             continue
         strongest = [others[i].effect for i in np.argsort(-np.abs(values))[:3]]
         words = f"a weaker motor of {gain.joint} and a combination of {', '.join(strongest)} look alike in this log "

@@ -90,6 +90,23 @@ class Pair:
 
 
 @dataclass(frozen=True)
+class Velocity:
+    """The column of a joint's velocity.
+
+    Args:
+        name: name of the position if it is observed as well; otherwise of the velocity.
+        column: column of the velocity.
+        dof: its index in qvel.
+        actuators: indices of the actuators that drive the joint directly.
+    """
+
+    name: str
+    column: int
+    dof: int
+    actuators: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
 class Turning:
     """The columns of a body that turns about any axis: of a free joint or a ball joint whose quaternion is observed.
 
@@ -124,10 +141,13 @@ class Log:
         units: units of the observations, (n,).
         actuators: names of the actions, (nu,).
         pairs: positions with an observed velocity.
+        velocities: the velocities of the pairs, in their order, then those of driven joints without a position, such
+            as a wheel whose speed alone is measured.
         clipped: (T,), transitions with a value at the end of the range that the simulator's own sensors have.
         estimated_std: (n,), errors of columns that were estimated from others, 0 for measured ones; None if none was.
         alone: names of the positions whose velocity is not observed.
         turning: bodies whose quaternion is observed.
+        touching: (T,), rows in which a contact of the model makes its response meaningless; None for none.
     """
 
     observation: np.ndarray
@@ -141,10 +161,12 @@ class Log:
     units: tuple[str, ...]
     actuators: tuple[str, ...]
     pairs: tuple[Pair, ...]
+    velocities: tuple[Velocity, ...]
     clipped: np.ndarray
     estimated_std: np.ndarray | None = None
     alone: tuple[str, ...] = ()
     turning: tuple[Turning, ...] = ()
+    touching: np.ndarray | None = None
 
     @classmethod
     def of(cls, measured: TensorDictBase | AuditedTransitions, simulation: AuditedSimulation) -> Log:
@@ -154,6 +176,8 @@ class Log:
             DataError: if they are no valid TED, or observations or actions do not have the simulator's width.
         """
         state_map, ended, time, estimated_std = simulation.state_map, None, None, None
+        if not isinstance(measured, TensorDictBase) and not hasattr(measured, "following"):
+            raise DataError(f"an audit needs transitions, not {type(measured).__name__}", "read them with load(...)")
         if isinstance(measured, TensorDictBase):
             require_ted(measured)
             observation, action = _float64(measured["observation"]), _float64(measured["action"])
@@ -170,7 +194,14 @@ class Log:
             run, time, estimated_std = measured.run, measured.time, measured.estimated_std
         _require_width(observation, state_map.names, "observation")
         _require_width(action, simulation.actuators, "action")
+        for values, names in (
+            (observation, state_map.names),
+            (following, state_map.names),
+            (action, simulation.actuators),
+        ):
+            _require_finite(values, names)
         clipped = state_map.clipped(observation) | state_map.clipped(following)
+        pairs = find_pairs(state_map, simulation.model)
         return cls(
             observation,
             action,
@@ -182,7 +213,8 @@ class Log:
             tuple(state_map.names),
             tuple(state_map.units),
             simulation.actuators,
-            find_pairs(state_map, simulation.model),
+            pairs,
+            _velocities(pairs, state_map, simulation.model),
             clipped,
             estimated_std,
             positions_alone(state_map, simulation.model),
@@ -192,22 +224,27 @@ class Log:
     def __len__(self) -> int:
         return len(self.observation)
 
+    def moved_by(self, actuator: int) -> str:
+        """Name of the joint that an actuator drives, or of the actuator if no velocity of such a joint is observed."""
+        return next((one.name for one in self.velocities if actuator in one.actuators), self.actuators[actuator])
+
     @property
     def runs(self) -> list[slice]:
         """Rows of each unbroken run."""
         edges = np.flatnonzero(np.diff(self.run)) + 1
         return [slice(a, b) for a, b in zip([0, *edges.tolist()], [*edges.tolist(), len(self)], strict=True)]
 
-    def starts(self, horizon: int, most: int, margin: int = 0) -> np.ndarray:
+    def starts(self, horizon: int, most: int, margin: int = 0, without: np.ndarray | None = None) -> np.ndarray:
         """First rows of windows that overlap by half at most, evenly thinned, (W,).
 
         Args:
             horizon: transitions per window.
             most: largest number of windows.
             margin: rows of the same run that have to precede a window.
+            without: rows (T,) that no window contains, beside the clipped ones.
         """
         starts = np.arange(margin, len(self) - horizon + 1)
-        bad = np.concatenate([[0], np.cumsum(self.clipped)])
+        bad = np.concatenate([[0], np.cumsum(self.clipped if without is None else self.clipped | without)])
         whole = self.run[starts - margin] == self.run[starts + horizon - 1]
         starts = starts[whole & (bad[starts + horizon] == bad[starts])]
         apart = starts[:: max(1, horizon // 2)]
@@ -226,6 +263,22 @@ def find_pairs(state_map: Any, model: Any) -> tuple[Pair, ...]:
             p, v = column[position], column[velocity]
             pairs.append(Pair(state_map.names[p], state_map.names[v], p, v, position, dof, angle))
     return tuple(pairs)
+
+
+def _velocities(pairs: tuple[Pair, ...], state_map: Any, model: Any) -> tuple[Velocity, ...]:
+    driven: dict[int, list[int]] = {}
+    for actuator in range(model.nu):
+        joint = int(model.actuator_trnid[actuator, 0])
+        if int(model.actuator_trntype[actuator]) in (0, 1) and int(model.jnt_type[joint]) in (2, 3):
+            driven.setdefault(int(model.jnt_dofadr[joint]), []).append(
+                actuator
+            )  # mjtTrn: joint; mjtJoint: slide, hinge
+    found = [Velocity(pair.name, pair.velocity, pair.dof, tuple(driven.pop(pair.dof, ()))) for pair in pairs]
+    column = _single_columns(state_map)
+    for dof, actuators in driven.items():
+        if (place := column.get(model.nq + dof)) is not None:
+            found.append(Velocity(state_map.names[place], place, dof, tuple(actuators)))
+    return tuple(found)
 
 
 def positions_alone(state_map: Any, model: Any) -> tuple[str, ...]:
@@ -279,6 +332,14 @@ def _scalar_coordinates(model: Any) -> Iterator[tuple[int, int, bool]]:
 
 def _float64(tensor: Any) -> np.ndarray:
     return tensor.detach().cpu().double().numpy()
+
+
+def _require_finite(values: np.ndarray, names: Sequence[str]) -> None:
+    if len(values) == 0:
+        raise DataError("the data hold no transitions", "select some rows")
+    if not (finite := np.isfinite(values)).all():
+        row, column = np.argwhere(~finite)[0]
+        raise DataError(f"row {row} of {names[column]} is {values[row, column]}", "leave out or repair such rows")
 
 
 def _require_width(values: np.ndarray, names: Sequence[str], what: str) -> None:

@@ -11,7 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import Log, Turning
-from torchrl_h2o.data.audit.settings import AuditSettings
+
+QUATERNION_NORM = 0.05  # distance of a quaternion's norm from 1 from which it is none
+LOST_NORM = 0.5  # the same distance in few rows: a tracker that has lost the body writes zeros
+LOST_QUATERNIONS = 0.001  # share of rows without a quaternion from which they are named
+MANY_LOST = 0.15  # the share from which they are severe
+EXPLAINED = 1e-3  # share of unexplained rotations or displacements up to which the columns are not doubted
+TURNED = 0.2  # share of rotations or displacements that wrong velocities leave unexplained at least
+BETTER_ORIENTATION = 0.5  # share of this misfit that another meaning of the columns must leave at most
+
 
 CHECK = "kinematics"
 _SPANS = (1, 2, 4, 8, 16, 32)  # rows over which rotations and displacements are compared with integrals
@@ -21,7 +29,7 @@ _TURNS = 0.05  # rad per row beyond which a body surely turns
 _ABOUT = ("x", "y", "z")
 
 
-def check_orientation(log: Log, settings: AuditSettings) -> list[Finding]:
+def check_orientation(log: Log) -> list[Finding]:
     """Whether quaternions are unit quaternions in the right order, and fit the angular velocities.
 
     MuJoCo's convention: a quaternion w, x, y, z turns the body's axes into those of its parent, for a free joint the
@@ -29,35 +37,34 @@ def check_orientation(log: Log, settings: AuditSettings) -> list[Finding]:
 
     Args:
         log: the data.
-        settings: thresholds.
     """
     found = []
     for body in log.turning:
-        faults = _quaternion(log, body, settings)
+        faults = _quaternion(log, body)
         if not any(finding.severity == "severe" for finding in faults):
-            faults += _angular_velocities(log, body, settings)
-            faults += _velocity(log, body, settings)
+            faults += _angular_velocities(log, body)
+            faults += _velocity(log, body)
         found += faults
     return found
 
 
-def _quaternion(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
-    found, wrong = [], _wrong(log, body, settings.quaternion_norm)
-    if wrong.mean() <= settings.many_repeated:  # an episode may begin with noise on its quaternion
-        wrong = _wrong(log, body, settings.lost_norm)
-    if wrong.mean() > settings.lost_quaternions:
+def _quaternion(log: Log, body: Turning) -> list[Finding]:
+    found, wrong = [], _wrong(log, body, QUATERNION_NORM)
+    if wrong.mean() <= MANY_LOST:  # an episode may begin with noise on its quaternion
+        wrong = _wrong(log, body, LOST_NORM)
+    if wrong.mean() > LOST_QUATERNIONS:
         norm = np.median(np.linalg.norm(log.observation[wrong][:, body.quaternion], axis=1))
         words = (
             f"in {wrong.mean():.1%} of the rows, the four numbers of {body.name} are no unit quaternion: their norm is "
         )
-        severity = "severe" if wrong.mean() > settings.many_repeated else "warning"
+        severity = "severe" if wrong.mean() > MANY_LOST else "warning"
         remedy = "check columns and units, or leave out the rows in which the tracker has lost the body"
-        found.append(Finding(CHECK, severity, f"{words}{norm:.3g}", Rows.of(wrong, settings.examples), remedy))
+        found.append(Finding(CHECK, severity, f"{words}{norm:.3g}", Rows.of(wrong), remedy))
     flips = (log.observation[:, body.quaternion] * log.following[:, body.quaternion]).sum(1) < 0.0
     if flips.any():
         words = f"the quaternion of {body.name} changes its sign, which is the same rotation; the simulator's does not"
         remedy = "reverse the sign of all four numbers from there on"
-        found.append(Finding(CHECK, "severe", words, Rows.of(flips, settings.examples), remedy))
+        found.append(Finding(CHECK, "severe", words, Rows.of(flips), remedy))
     return found
 
 
@@ -88,24 +95,24 @@ class _Meaning:
     lag: int = 0
 
 
-def _angular_velocities(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
+def _angular_velocities(log: Log, body: Turning) -> list[Finding]:
     if not body.rates:
         words = f"no angular velocity is given for {body.name}: the simulator alone would have to tell it"
         return [Finding(CHECK, "warning", words, None, "add the columns of its angular velocities, as of a gyroscope")]
-    plain = _unexplained_turns(log, body, _Meaning(), settings)
-    if plain is None:
+    plain = _unexplained_turns(log, body, _Meaning())
+    if plain is None or plain < EXPLAINED:
         return []
-    best, told = min(settings.better_orientation * plain, settings.turned), None
+    best, told = min(BETTER_ORIENTATION * plain, TURNED), None
     for meaning, words, remedy in _meanings(log, body):
-        left = _unexplained_turns(log, body, meaning, settings)
+        left = _unexplained_turns(log, body, meaning)
         if left is not None and left < best:
-            severity = "warning" if meaning.outside and plain <= settings.turned else "severe"
-            best, told = settings.better_orientation * left, Finding(CHECK, severity, words, None, remedy)
+            severity = "warning" if meaning.outside and plain <= TURNED else "severe"
+            best, told = BETTER_ORIENTATION * left, Finding(CHECK, severity, words, None, remedy)
     if told is not None:
         return [told]
-    if plain <= settings.turned:
+    if plain <= TURNED:
         return []
-    if lag := _lag(log, body, plain, settings):
+    if lag := _lag(log, body, plain):
         words = f"the angular velocities of {body.name} are {abs(lag)} rows {'late' if lag > 0 else 'early'} "
         return [Finding(CHECK, "warning", words + "against its quaternion", None, "shift the columns of one of them")]
     words = f"the angular velocities of {body.name} are not the derivative of its quaternion"
@@ -132,33 +139,33 @@ def _meanings(log: Log, body: Turning) -> Iterator[tuple[_Meaning, str, str]]:
         yield _Meaning(axes=axes, factors=signs), words, "correct the order and the signs of the columns"
 
 
-def _lag(log: Log, body: Turning, plain: float, settings: AuditSettings) -> int:
+def _lag(log: Log, body: Turning, plain: float) -> int:
     """Rows by which the angular velocities are late, if that explains most of what they leave; else 0."""
-    left = {lag: _unexplained_turns(log, body, _Meaning(lag=lag), settings) for lag in _LAGS}
+    left = {lag: _unexplained_turns(log, body, _Meaning(lag=lag)) for lag in _LAGS}
     share, lag = min(((share, lag) for lag, share in left.items() if share is not None), default=(plain, 0))
-    return lag if share < settings.better_orientation * plain else 0
+    return lag if share < BETTER_ORIENTATION * plain else 0
 
 
-def _velocity(log: Log, body: Turning, settings: AuditSettings) -> list[Finding]:
+def _velocity(log: Log, body: Turning) -> list[Finding]:
     """Whether a free body's velocity is in its own axes, as in a robot's odometry."""
     if not body.place or not body.velocity:
         return []
-    wrong = _wrong(log, body, settings.quaternion_norm)
+    wrong = _wrong(log, body, QUATERNION_NORM)
     plain, other = (_unexplained_moves(log, body, wrong, turned) for turned in (False, True))
-    if plain is None or other is None or not other < settings.better_orientation * plain:
+    if plain is None or other is None or plain < EXPLAINED or not other < BETTER_ORIENTATION * plain:
         return []
     words = f"the velocity of {body.name} is in the axes of the body, as odometry gives it"
     remedy = "turn it into the world's axes, in which a free joint of MuJoCo has it"
-    return [Finding(CHECK, "severe" if plain > settings.turned else "warning", words, None, remedy)]
+    return [Finding(CHECK, "severe" if plain > TURNED else "warning", words, None, remedy)]
 
 
-def _unexplained_turns(log: Log, body: Turning, meaning: _Meaning, settings: AuditSettings) -> float | None:
+def _unexplained_turns(log: Log, body: Turning, meaning: _Meaning) -> float | None:
     """Share of the squared rotations that angular velocities leave unexplained, at the best span; None at rest.
 
     A constant offset of the angular velocities is left out.
     """
     quaternion, rates = np.take(body.quaternion, meaning.order), np.take(body.rates, meaning.axes)
-    wrong = _wrong(log, body, settings.quaternion_norm)
+    wrong = _wrong(log, body, QUATERNION_NORM)
     turned = np.array(meaning.factors) * 0.5 * log.dt * (log.observation + log.following)[:, rates]
     integral, left, sizes = _integral(np.roll(turned, -meaning.lag, axis=0)), [], []
     for rows in _SPANS:
@@ -175,6 +182,13 @@ def _unexplained_turns(log: Log, body: Turning, meaning: _Meaning, settings: Aud
         sizes.append(size)
     turns = bool(sizes) and (sizes[0] > _TURNS or max(sizes) > 3.0 * sizes[0])
     return min(left) if turns else None
+
+
+def turning_rates(log: Log, body: Turning, part: slice, rows: int) -> np.ndarray:
+    """Mean angular velocities over some rows from the quaternion, in the body's axes and rad/s, (N - rows, 3)."""
+    values = log.observation[part]
+    before, after = _rotation(values[:-rows], body.quaternion), _rotation(values[rows:], body.quaternion)
+    return (before.inv() * after).as_rotvec() / (rows * log.dt)
 
 
 def _unexplained_moves(log: Log, body: Turning, wrong: np.ndarray, turned: bool) -> float | None:

@@ -8,8 +8,20 @@ from functools import cached_property
 
 import numpy as np
 
-from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
-from torchrl_h2o.data.audit.settings import AuditSettings
+from torchrl_h2o.data.audit.log import AuditedSimulation, Log
+
+WINDOWS = 300  # windows that are simulated at most
+MIN_WINDOWS = 60  # windows below which the model is not consulted
+PHYSICS_STEPS = 3_000  # physics steps of one pass over the windows at most
+LONGEST_STEPS = 200  # physics steps of a window up to which MIN_WINDOWS are simulated in any case
+HYPOTHESIS_WINDOWS = 200  # windows on which a hypothesis such as exchanged joints is simulated at most
+HYPOTHESIS_STEPS = 1_000  # physics steps of one hypothesis at most
+LONGEST_WINDOW = 0.1  # s
+SIGNAL_TO_NOISE = 4.0  # change of the velocities within a window, in standard deviations of their noise
+DROWNED = 0.6  # noise of a change, in usual changes, above which a bad fit is no evidence against the data
+SETTLING_STEPS = 12  # control steps from which unobserved coordinates are simulated
+NUDGE = 0.02  # step of derivatives, in ranges or spreads of an action
+ZERO_NUDGE = 0.02  # step of derivatives by the zero of a position, in rad or m
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +31,6 @@ class Response:
     Args:
         log: the data.
         simulation: the simulator.
-        settings: budgets and step sizes.
         horizon: control steps per window, H.
         starts: first row of each window, (W,).
         states: start states, (W, nq + nv).
@@ -31,7 +42,6 @@ class Response:
 
     log: Log
     simulation: AuditedSimulation
-    settings: AuditSettings
     horizon: int
     starts: np.ndarray
     states: np.ndarray
@@ -41,34 +51,31 @@ class Response:
     noise: np.ndarray | None = None
 
     @classmethod
-    def of(
-        cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None, settings: AuditSettings
-    ) -> Response | None:
+    def of(cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None) -> Response | None:
         """Chooses windows in which the velocities change by more than their noise; None without enough of them.
 
         Args:
             log: the data.
             simulation: the simulator.
             noise: standard deviation of the noise of each observation, (n,); None for windows of one step.
-            settings: budgets.
         """
-        moving = np.array([pair.velocity for pair in log.pairs], int)
+        moving = np.array([velocity.column for velocity in log.velocities], int)
         if not len(moving):
             return None
-        horizon = 1 if noise is None else _horizon(log, moving, noise, settings)
-        margin = settings.settling_steps if simulation.state_map.hidden else 0
+        horizon = 1 if noise is None else _horizon(log, moving, noise)
+        margin = SETTLING_STEPS if simulation.state_map.hidden else 0
         length = simulation.frame_skip * horizon
-        fewest = settings.min_windows if length <= settings.longest_steps else 0
-        most = min(settings.windows, max(fewest, settings.physics_steps // length))
-        starts = log.starts(horizon, most, margin)
-        if len(starts) < settings.min_windows:
+        fewest = MIN_WINDOWS if length <= LONGEST_STEPS else 0
+        most = min(WINDOWS, max(fewest, PHYSICS_STEPS // length))
+        starts = log.starts(horizon, most, margin, log.touching)
+        if len(starts) < MIN_WINDOWS:
             return None
         true = np.concatenate([simulation.true_observations(log.observation[run]) for run in log.runs])
         actions = np.concatenate([simulation.executed(log.action[run]) for run in log.runs])
         states = simulation.state_map.states(true)
         activations = np.concatenate([simulation.activations(actions[run]) for run in log.runs])
         chosen = _settled(log, simulation, states, actions, activations, starts, margin)
-        return cls(log, simulation, settings, horizon, starts, chosen, actions, activations, moving, noise)
+        return cls(log, simulation, horizon, starts, chosen, actions, activations, moving, noise)
 
     @property
     def rows(self) -> np.ndarray:
@@ -82,8 +89,8 @@ class Response:
 
     def for_hypotheses(self) -> Response:
         """As many of the windows as a hypothesis may simulate."""
-        most = self.settings.hypothesis_steps // (self.simulation.frame_skip * self.horizon)
-        return self.thinned(int(np.clip(most, 30, self.settings.hypothesis_windows)))
+        most = HYPOTHESIS_STEPS // (self.simulation.frame_skip * self.horizon)
+        return self.thinned(int(np.clip(most, 30, HYPOTHESIS_WINDOWS)))
 
     def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Response:
         """The same windows with changed observations (..., n)."""
@@ -114,7 +121,7 @@ class Response:
         if self.noise is None:
             return False
         share = np.sqrt(2.0) * self.noise[self.moving] / self.scale
-        return bool(np.median(share) > self.settings.drowned)
+        return bool(np.median(share) > DROWNED)
 
     @cached_property
     def limited(self) -> np.ndarray:
@@ -159,7 +166,7 @@ class Response:
         The states are those of all windows, once or several times; their activations are those ``lag`` rows before.
         """
         chosen = self.simulation if simulation is None else simulation
-        activations = self.activations[np.clip(self.starts - lag, 0, None)]
+        activations = self.activations[np.clip(self.starts - lag, 0, len(self.log) - 1)]
         activations = np.tile(activations, (len(states) // len(self.starts), 1))
         end = chosen.rollout(states, actions, activations=activations, applied=applied)[:, -1]
         return self.simulation.state_map.observations(end)
@@ -194,7 +201,7 @@ class Response:
         """Derivative of the change by a constant offset of each action, (W, m, nu), by differences inside its range."""
         if not self.anchor.shape[-1]:  # a model without actuators
             return np.zeros((*self.change.shape, 0))
-        base, unit = self.anchor, self.settings.nudge * self.action_unit
+        base, unit = self.anchor, NUDGE * self.action_unit
         inward = np.where(base.mean(1) > 0.5 * sum(np.nan_to_num(self._range, posinf=0.0, neginf=0.0)), -1.0, 1.0)
         steps = inward * unit  # (W, nu)
         moved = np.concatenate([base + (steps * row)[:, None] for row in np.eye(base.shape[-1])])
@@ -208,28 +215,28 @@ class Response:
 
     @cached_property
     def by_force(self) -> np.ndarray:
-        """Derivative of the change by a constant force on each pair's degree of freedom, (W, m, pairs)."""
-        pairs, nv = self.log.pairs, self.simulation.model.nv
+        """Derivative of the change by a constant force on each velocity's degree of freedom, (W, m, m)."""
+        dofs, nv = [velocity.dof for velocity in self.log.velocities], self.simulation.model.nv
         size = self._force_nudge()
-        actions = np.tile(self.anchor, (len(pairs), 1, 1))
-        applied = np.zeros((len(pairs), len(self.starts), self.horizon, nv))
-        for index, pair in enumerate(pairs):
-            applied[index, ..., pair.dof] = size[index]
+        actions = np.tile(self.anchor, (len(dofs), 1, 1))
+        applied = np.zeros((len(dofs), len(self.starts), self.horizon, nv))
+        for index, dof in enumerate(dofs):
+            applied[index, ..., dof] = size[index]
         reached = self._velocities(actions, applied.reshape(-1, self.horizon, nv))
-        reached = reached.reshape(len(pairs), *self.change.shape)
+        reached = reached.reshape(len(dofs), *self.change.shape)
         return np.moveaxis(reached - self.before - self.simulated, 0, -1) / size
 
     def _force_nudge(self) -> np.ndarray:
-        """Forces that change a velocity by a small share of its usual change, (pairs,), from the diagonal inertia."""
+        """Forces that change a velocity by a small share of its usual change, (m,), from the diagonal inertia."""
         model = self.simulation.model
-        inertia = np.array([1.0 / max(float(model.dof_invweight0[pair.dof]), 1e-9) for pair in self.log.pairs])
-        return np.maximum(self.settings.nudge * inertia * self.scale / (self.horizon * self.log.dt), 1e-9)
+        inertia = np.array([1.0 / max(float(model.dof_invweight0[one.dof]), 1e-9) for one in self.log.velocities])
+        return np.maximum(NUDGE * inertia * self.scale / (self.horizon * self.log.dt), 1e-9)
 
     @cached_property
     def by_zero(self) -> np.ndarray:
         """Derivative of the change by the zero of each pair's position, (W, m, pairs)."""
         pairs, actions = self.log.pairs, self.anchor
-        size, moved = self.settings.zero_nudge, []
+        size, moved = ZERO_NUDGE, []
         for pair in pairs:
             moved.append(self.states.copy())
             moved[-1][:, pair.coordinate] += size
@@ -282,9 +289,9 @@ class Response:
         return float(np.minimum(share, 3.0).mean())
 
 
-def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, settings: AuditSettings) -> int:
+def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray) -> int:
     """Shortest window in which the median velocity changes by a multiple of its noise."""
-    longest = max(1, int(settings.longest_window / log.dt))
+    longest = max(1, int(LONGEST_WINDOW / log.dt))
     horizon = 1
     while horizon < longest:
         starts = log.starts(horizon, 2000)
@@ -292,7 +299,7 @@ def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, settings: AuditSet
             break
         change = (log.following[starts + horizon - 1] - log.observation[starts])[:, moving]
         usual = np.median(np.abs(change), axis=0)
-        if np.median(usual / np.maximum(noise[moving], 1e-12)) >= settings.signal_to_noise:
+        if np.median(usual / np.maximum(noise[moving], 1e-12)) >= SIGNAL_TO_NOISE:
             break
         horizon = min(2 * horizon, longest)
     return horizon
@@ -315,11 +322,3 @@ def _settled(
         after = simulation.follow(states[before], actions[before], time, activations[before])
         chosen[:, list(simulation.state_map.hidden)] = after[-1]
     return chosen
-
-
-def joint_of(model, actuator: int, pairs: tuple[Pair, ...]) -> int | None:
-    """Index of the pair whose joint an actuator drives; None if there is none."""
-    if int(model.actuator_trntype[actuator]) not in (0, 1):  # mjtTrn: joint, joint in parent frame
-        return None
-    dof = int(model.jnt_dofadr[int(model.actuator_trnid[actuator, 0])])
-    return next((index for index, pair in enumerate(pairs) if pair.dof == dof), None)

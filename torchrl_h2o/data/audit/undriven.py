@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.data.audit.finding import Finding
-from torchrl_h2o.data.audit.regression import robust_fit
-from torchrl_h2o.data.audit.response import Response
-from torchrl_h2o.data.audit.settings import AuditSettings
-from torchrl_h2o.data.audit.unexplained import percent
+from torchrl_h2o.data.audit.regression import SIGNIFICANCE, percent, robust_fit
+from torchrl_h2o.data.audit.response import ZERO_NUDGE, Response
+from torchrl_h2o.data.audit.zeros import ZERO_BETTER, ZERO_WARNING
+
+FORCE_LEFT = 0.6  # share of the force missing beside friction that a corrected zero must leave at most
+
 
 CHECK = "model"
 _STEP = np.pi / 6.0  # rad between the shifts from which the best one is sought
@@ -19,7 +21,7 @@ _ROUNDS = 3  # of Newton's method
 _PARTS = 3  # of the log, in all of which a shift must explain the force: a sensor that slips is not meant here
 
 
-def check_undriven_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
+def check_undriven_zeros(response: Response) -> list[Finding]:
     """Shifted zeros of angles whose joint no actuator moves.
 
     Whatever the simulator lacks at the other joints, the measured motion of all of them shows which force is missing at
@@ -29,7 +31,6 @@ def check_undriven_zeros(response: Response, settings: AuditSettings) -> list[Fi
 
     Args:
         response: simulated windows.
-        settings: thresholds.
 
     Returns:
         A warning for each such angle; severe beyond a quarter of a turn, which no load explains.
@@ -41,7 +42,7 @@ def check_undriven_zeros(response: Response, settings: AuditSettings) -> list[Fi
         return []
     driven = driven_dofs(model)
     free = [index for index, pair in enumerate(pairs) if pair.angle and pair.dof not in driven]
-    return _Undriven(response, free, settings).findings() if free else []
+    return _Undriven(response, free).findings() if free else []
 
 
 class _Undriven:
@@ -50,11 +51,10 @@ class _Undriven:
     Args:
         response: simulated windows.
         free: indices of the pairs of these joints, K of them.
-        settings: thresholds.
     """
 
-    def __init__(self, response: Response, free: list[int], settings: AuditSettings):
-        self.response, self.free, self.settings = response, free, settings
+    def __init__(self, response: Response, free: list[int]):
+        self.response, self.free = response, free
         velocity = (response.before + 0.5 * response.change)[:, free]
         self.friction = np.stack([velocity, np.sign(velocity)], -1)  # (W, K, 2)
         positions = [response.log.pairs[index].coordinate for index in free]
@@ -65,18 +65,18 @@ class _Undriven:
         shifts, errors = self._shifts()
         if shifts is None:
             return []
-        nothing, settings = np.zeros(len(self.free)), self.settings
+        nothing = np.zeros(len(self.free))
         plain, left = self._left(nothing), self._left(shifts)
         line = np.stack([np.ones_like(self.position), self.position], -1)
         rival = np.nanmedian(self._left(nothing, np.concatenate([self.friction, line], -1)), axis=0)
         found = []
         for place, index in enumerate(self.free):
             shift, remains = float(shifts[place]), float(np.nanmedian(left[:, place]))
-            if abs(shift) < max(settings.zero_warning, settings.significance * errors[place]) or remains > rival[place]:
+            if abs(shift) < max(ZERO_WARNING, SIGNIFICANCE * errors[place]) or remains > rival[place]:
                 continue
             if self._lowers(plain[:, place], left[:, place]):
                 share = percent(remains / float(np.nanmedian(plain[:, place])))
-                either = remains > settings.zero_better * rival[place]
+                either = remains > ZERO_BETTER * rival[place]
                 found.append(self._finding(self.response.log.pairs[index].name, shift, share, either))
         return found
 
@@ -93,7 +93,7 @@ class _Undriven:
     def _lowers(self, plain: np.ndarray, left: np.ndarray) -> bool:
         """Whether a shift lowers the missing force (W,) of its joint in all parts of the log."""
         parts = np.array_split(np.arange(len(plain)), _PARTS)
-        return all(np.nanmedian(left[p]) < self.settings.force_left * np.nanmedian(plain[p]) for p in parts)
+        return all(np.nanmedian(left[p]) < FORCE_LEFT * np.nanmedian(plain[p]) for p in parts)
 
     def _shifts(self) -> tuple[np.ndarray | None, np.ndarray]:
         """Shifts, (K,), that lower the missing forces most, and their standard errors; None if there are none."""
@@ -122,17 +122,17 @@ class _Undriven:
 
     def _newton(self, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Change of the shifts by one fit of the missing forces, beside friction, and its standard errors, (K,)."""
-        count, step = len(self.free), self.settings.zero_nudge
+        count, step = len(self.free), ZERO_NUDGE
         missing = self._missing(shifts)
         moved = np.stack([self._missing(shifts + step * each) for each in np.eye(count)], -1)
         explained = np.concatenate([-(moved - missing[..., None]) / step, self._own(self.friction)], -1)
-        found = robust_fit(missing, explained, _usual(missing), self.settings.robust)
+        found = robust_fit(missing, explained, _usual(missing))
         return found.values[:count], found.errors[:count]
 
     def _left(self, shifts: np.ndarray, explained: np.ndarray | None = None) -> np.ndarray:
         """Sizes of the missing forces, (W, K), beside what explains each of them, (W, K, P), by default friction."""
         missing, own = self._missing(shifts), self._own(self.friction if explained is None else explained)
-        found = robust_fit(missing, own, _usual(missing), self.settings.robust)
+        found = robust_fit(missing, own, _usual(missing))
         return np.abs(missing - own @ found.values)
 
     @staticmethod

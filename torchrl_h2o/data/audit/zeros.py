@@ -7,13 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchrl_h2o.data.audit.actions import friction_responses
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import Pair
-from torchrl_h2o.data.audit.regression import robust_fit
+from torchrl_h2o.data.audit.regression import (
+    BETTER,
+    FOREIGN,
+    MISFIT,
+    SIGNIFICANCE,
+    friction_responses,
+    percent,
+    robust_fit,
+    unexplained,
+)
 from torchrl_h2o.data.audit.response import Response
-from torchrl_h2o.data.audit.settings import AuditSettings
-from torchrl_h2o.data.audit.unexplained import percent, unexplained
+
+ZERO_WARNING = 0.1  # error of an angle's zero, in rad, from which a warning is given
+ZERO_SEVERE = 0.5  # the error, in rad, from which it is severe, and sought in parts of the log as well
+ZERO_CHANGE = 5.0  # sum over windows of unexplained shares by which a change of a zero must lower them
+ZERO_GAIN = 0.03  # unexplained share of a window that a large shift must explain at least
+ZERO_EXPLAINED = 0.5  # share of the accelerations that a large shift, gains and friction may leave unexplained
+ZERO_BETTER = 0.8  # share of the misfit that a corrected zero must leave at most
+
 
 CHECK = "model"
 _GRIDS = ((30.0, 180.0), (5.0, 30.0), (1.0, 5.0))  # steps and half widths of successive grids of shifts, in degrees
@@ -21,7 +35,7 @@ _FEWEST, _SMALLEST = 12, 0.04  # windows of a part of the log with its own zero,
 _COARSE = 100  # windows with which a shift is sought first
 
 
-def check_large_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
+def check_large_zeros(response: Response) -> list[Finding]:
     """Angles whose zero lies far from the model's, or changes in the log, as that of an encoder that loses counts.
 
     Each angle is shifted by steps of 30° around the circle, in all windows. If no single shift explains the log, the
@@ -32,36 +46,33 @@ def check_large_zeros(response: Response, settings: AuditSettings) -> list[Findi
 
     Args:
         response: simulated windows.
-        settings: thresholds.
     """
-    if _errors(response).mean() <= settings.misfit:
+    if _errors(response).mean() <= MISFIT:
         return []
     found: list[tuple[float, Pair, np.ndarray]] = []
     one, runs = np.zeros(len(response.starts), int), response.log.run[response.starts]
     for pair in (pair for pair in response.log.pairs if pair.angle):
-        for groups, change in ((one, np.inf), (runs, settings.zero_change)):
-            shifts = _confirmed(response, pair, groups, _shifts(response, pair, groups, change, settings), settings)
+        for groups, change in ((one, np.inf), (runs, ZERO_CHANGE)):
+            shifts = _confirmed(response, pair, groups, _shifts(response, pair, groups, change))
             shifted = _shifted(response, pair, shifts)
-            if not shifts.any() or unexplained(shifted, settings) >= settings.zero_explained:
+            if not shifts.any() or unexplained(shifted) >= ZERO_EXPLAINED:
                 continue
             cost = float(_errors(shifted).sum())
             if groups is runs:  # several parts have to be clearly better than one shift
                 changes = len(_equal(shifts, runs)) - len(np.unique(runs))
-                cost = cost / settings.zero_better + settings.zero_change * changes
+                cost = cost / ZERO_BETTER + ZERO_CHANGE * changes
             found.append((cost, pair, shifts))
     if not found:
         return []
     _, pair, shifts = min(found, key=lambda each: each[0])
     both = (response, _shifted(response, pair, shifts))
-    plain, left = (unexplained(each, settings, shifts != 0.0) for each in both)
-    if left >= settings.better * plain:  # gains and friction of the whole log explain these parts as well
+    plain, left = (unexplained(each, shifts != 0.0) for each in both)
+    if left >= BETTER * plain:  # gains and friction of the whole log explain these parts as well
         return []
-    return [_finding(response, pair, shifts, plain, left, settings)]
+    return [_finding(response, pair, shifts, plain, left)]
 
 
-def _confirmed(
-    response: Response, pair: Pair, groups: np.ndarray, shifts: np.ndarray, settings: AuditSettings
-) -> np.ndarray:
+def _confirmed(response: Response, pair: Pair, groups: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     """The shifts (W,) without those of parts that gains, friction and constant forces explain nearly as well.
 
     These are fitted to the part alone, so that a force that begins there is no shift. Only where the angle jumps as
@@ -74,11 +85,11 @@ def _confirmed(
         mask = np.zeros(len(shifts), bool)
         mask[part] = True
         if _jumps(response, pair, part, groups, shifts):
-            plain, left = (unexplained(each, settings, mask) for each in (response, shifted))
+            plain, left = (unexplained(each, mask) for each in (response, shifted))
         else:
             own = replace(response, starts=response.starts[part], states=response.states[part])
-            plain, left = (unexplained(each, settings) for each in (own, _shifted(own, pair, shifts[part])))
-        if left >= settings.better * plain or plain - left <= 0.1:
+            plain, left = (unexplained(each) for each in (own, _shifted(own, pair, shifts[part])))
+        if left >= BETTER * plain or plain - left <= 0.1:
             confirmed[part] = 0.0
     return confirmed
 
@@ -94,9 +105,7 @@ def _jumps(response: Response, pair: Pair, part: slice, groups: np.ndarray, shif
     return bool(abs((moved - integral).sum() + change) < 0.3 * abs(change))
 
 
-def _finding(
-    response: Response, pair: Pair, shifts: np.ndarray, plain: float, left: float, settings: AuditSettings
-) -> Finding:
+def _finding(response: Response, pair: Pair, shifts: np.ndarray, plain: float, left: float) -> Finding:
     parts = list(_parts(response, shifts))
     explained = (
         f"with any gains and friction the simulator leaves {percent(plain)} of the accelerations unexplained, and "
@@ -117,7 +126,7 @@ def _finding(
     words = f"{explained}if the zero of {pair.name} is shifted by {sizes}: its sensor slipped, lost counts, or was set "
     words += "to zero elsewhere"
     remedy = "leave these rows out, or correct the column"
-    return Finding(CHECK, "severe", words, Rows.of(mask, settings.examples), remedy)
+    return Finding(CHECK, "severe", words, Rows.of(mask), remedy)
 
 
 def _parts(response: Response, shifts: np.ndarray) -> Iterator[tuple[slice, float]]:
@@ -135,7 +144,7 @@ def _parts(response: Response, shifts: np.ndarray) -> Iterator[tuple[slice, floa
         )
 
 
-def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, settings: AuditSettings) -> np.ndarray:
+def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float) -> np.ndarray:
     """The shift of the angle in each window, in rad, (W,); 0 where none of at least ``zero_severe`` helps.
 
     Args:
@@ -143,7 +152,6 @@ def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, s
         pair: the angle.
         groups: group of each window, (W,); the shift may change freely between groups.
         change: cost of a change within a group.
-        settings: thresholds.
     """
     shifts = np.zeros(len(groups))
     for turn, (step, half_width) in enumerate(_GRIDS):
@@ -151,9 +159,9 @@ def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, s
         if turn == 0:
             some = np.isin(response.starts, response.thinned(_COARSE).starts)  # spares most angles the other windows
             coarse = replace(response, starts=response.starts[some], states=response.states[some])
-            if not _coarse_shifts(coarse, pair, groups[some], grid, change, settings).any():
+            if not _coarse_shifts(coarse, pair, groups[some], grid, change).any():
                 return shifts
-            shifts = _coarse_shifts(response, pair, groups, grid, change, settings)
+            shifts = _coarse_shifts(response, pair, groups, grid, change)
         else:
             errors = _errors_of(response, pair, [shifts + shift for shift in grid])
             for part in _equal(shifts, groups):
@@ -163,17 +171,15 @@ def _shifts(response: Response, pair: Pair, groups: np.ndarray, change: float, s
     fewest = max(_FEWEST, _SMALLEST * len(shifts))
     for part in reversed(_equal(shifts, groups)):
         lasts = part.stop == len(shifts) or groups[part.stop] != groups[part.start] or shifts[part.stop] != 0.0
-        if not lasts or part.stop - part.start < fewest or abs(shifts[part.start]) < settings.zero_severe:
+        if not lasts or part.stop - part.start < fewest or abs(shifts[part.start]) < ZERO_SEVERE:
             shifts[part] = 0.0
     return shifts
 
 
-def _coarse_shifts(
-    response: Response, pair: Pair, groups: np.ndarray, grid: np.ndarray, change: float, settings: AuditSettings
-) -> np.ndarray:
+def _coarse_shifts(response: Response, pair: Pair, groups: np.ndarray, grid: np.ndarray, change: float) -> np.ndarray:
     """The shift of a grid (K,) in each window that leaves the least error, (W,)."""
     errors = _errors_of(response, pair, [np.full(len(groups), shift) for shift in grid])
-    return grid[_viterbi(errors + settings.zero_gain * (grid != 0.0)[:, None], groups, change)]
+    return grid[_viterbi(errors + ZERO_GAIN * (grid != 0.0)[:, None], groups, change)]
 
 
 def _errors_of(response: Response, pair: Pair, shifts: list[np.ndarray]) -> np.ndarray:
@@ -218,24 +224,24 @@ def _errors(response: Response) -> np.ndarray:
     return np.minimum(np.where(np.isfinite(share), share, 3.0), 3.0).mean(1)
 
 
-def check_small_zeros(response: Response, settings: AuditSettings) -> list[Finding]:
+def check_small_zeros(response: Response) -> list[Finding]:
     """Angles whose zero is shifted a little: fitted beside gains and friction, then confirmed by simulation."""
     pairs = response.log.pairs
     angles = [index for index, pair in enumerate(pairs) if pair.angle]
     if not angles:
         return []
-    others = friction_responses(response)[..., : 2 * len(pairs)]
+    others = friction_responses(response, constant=False)
     responses = np.concatenate([response.by_zero[..., angles], response.by_gain, others], -1)
-    found = robust_fit(response.target, responses, response.scale, settings.robust)
+    found = robust_fit(response.target, responses, response.scale)
     findings = []
     misfit = response.misfit()
     for place, index in enumerate(angles):
         shift, error = found.values[place], found.errors[place]
-        if abs(shift) < max(settings.zero_warning, settings.significance * error) or abs(shift) > np.pi:
+        if abs(shift) < max(ZERO_WARNING, SIGNIFICANCE * error) or abs(shift) > np.pi:
             continue
         pair = pairs[index]
         left = _shifted(response, pair, np.full(len(response.starts), shift)).misfit()
-        if left < min(settings.zero_better * misfit, settings.foreign):
+        if left < min(ZERO_BETTER * misfit, FOREIGN):
             words = f"the simulator leaves {percent(misfit)} of the accelerations unexplained, and {percent(left)} "
             words += f"if the zero of {pair.name} is shifted by {-shift:.2f} rad: an offset, or a tilted model"
             remedy = f"measure the angle's zero, for example at rest; offset: {shift:.3g} in its column corrects it"
