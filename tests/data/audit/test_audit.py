@@ -1,8 +1,6 @@
 """Audits of good and of damaged logs of a motored arm."""
 
-import importlib
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,6 +22,8 @@ from tests.data.audit.recorded import (
     with_action,
 )
 from torchrl_h2o.data import Audit, DataError, Finding, audit
+from torchrl_h2o.data.audit.log import Log
+from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import Simulation
@@ -288,23 +288,10 @@ def test_real_log_that_cannot_tell_friction_from_gain_says_so(shared_data):
     assert "friction" in note.words
 
 
-def test_windows_are_as_long_as_the_errors_of_estimated_velocities_ask(good, simulation):
-    """Such errors are smooth, so that the rows do not show them."""
-    sure, unsure = (
-        replace(good, estimated_std=np.array([0.0, 0.0, std, std]) * good.observation.std(0)) for std in (0.0, 0.3)
-    )
-    horizons = [_audited_horizon(data, simulation) for data in (good, sure, unsure)]
-    assert horizons[0] == horizons[1] < horizons[2]
-
-
-def _audited_horizon(data, simulation) -> int:
-    """Rows of the windows that the audit simulates."""
-    found = []
-    with pytest.MonkeyPatch.context() as patch:
-        module = importlib.import_module("torchrl_h2o.data.audit.audit")  # the package has the function of this name
-        patch.setattr(module, "check_model", lambda response, _: found.append(response) or [])
-        audit(data, simulation)
-    return found[0].horizon
+def test_windows_are_longer_where_velocities_have_larger_errors(good, simulation):
+    log = Log.of(good, simulation)
+    horizons = [Response.of(log, simulation, share * good.observation.std(0)).horizon for share in (0.0, 0.3)]
+    assert horizons[0] < horizons[1]
 
 
 def test_actions_of_an_arm_with_heavy_rotors_are_not_exchanged(simulation):

@@ -15,7 +15,7 @@ from torchrl_h2o.data.audit.derivative import Derivative, deviation, fit_derivat
 from torchrl_h2o.data.audit.excitation import check_excitation
 from torchrl_h2o.data.audit.finding import SEVERITIES, Finding
 from torchrl_h2o.data.audit.kinematics import check_kinematics
-from torchrl_h2o.data.audit.log import AuditedSimulation, AuditedTransitions, Log
+from torchrl_h2o.data.audit.log import AuditedSimulation, Log
 from torchrl_h2o.data.audit.model import check_belonging, check_model
 from torchrl_h2o.data.audit.regression import with_rotors
 from torchrl_h2o.data.audit.response import Response
@@ -59,10 +59,7 @@ class Audit:
         return cls(tuple(Finding.from_dict(finding) for finding in plain["findings"]))
 
 
-def audit(
-    measured: TensorDictBase | AuditedTransitions,
-    simulation: AuditedSimulation,
-) -> Audit:
+def audit(measured: TensorDictBase | Any, simulation: AuditedSimulation) -> Audit:
     """Looks for faults in measured data that would mislead a search for effects that the simulator lacks.
 
     The checks of time, rows and kinematics compare the columns with each other. If they find nothing severe, the

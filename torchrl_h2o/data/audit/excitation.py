@@ -16,26 +16,23 @@ COMBINED = 0.92  # correlation with the other effects of a joint from which an e
 
 CHECK = "excitation"
 _JOINT = ("dry friction", "viscous friction", "armature")
+_REVERSALS = "record both directions under the same torque, such as slow reversals beside fast swings, or let it swing"
+_HOLDING = "record fast motion with a known torque: gravity shows at rest, mass in acceleration"
 _TO_RECORD = {
-    frozenset({"dry friction", "motor gain"}): "record both directions under the same torque, such as slow reversals "
-    "beside fast swings, or let the joint swing freely",
-    frozenset({"dry friction", "viscous friction"}): "record slow and fast motion of the joint",
-    frozenset({"armature", "motor gain"}): "record a constant torque against gravity beside fast changes",
-    frozenset(
-        {"gravity", "mass"}
-    ): "record fast motion with a known torque: gravity shows at rest, mass in acceleration",
-    frozenset({"mass", "motor gain"}): "only their ratio shows in the motion: weigh the robot, or measure a torque",
-    frozenset({"mass", "armature"}): "weigh the robot",
-    frozenset({"gravity", "armature"}): "record fast and slow motion through the same angles",
-    frozenset({"gravity", "motor gain"}): "record fast motion beside holding still",
-    frozenset(
-        {"viscous friction", "motor gain"}
-    ): "record actions that do not follow the velocity, such as random ones",
-    frozenset({"viscous friction", "armature"}): "record several frequencies of motion",
-    frozenset({"dry friction", "armature"}): "record several frequencies of motion",
-    frozenset({"drive delay", "motor gain"}): "record steps of the action",
-    frozenset({"drive delay", "viscous friction"}): "record steps of the action from rest",
-}
+    ("dry friction", "motor gain"): _REVERSALS,
+    ("dry friction", "viscous friction"): "record slow and fast motion of the joint",
+    ("dry friction", "armature"): "record several frequencies of motion",
+    ("viscous friction", "motor gain"): "record actions that do not follow the velocity, such as random ones",
+    ("viscous friction", "armature"): "record several frequencies of motion",
+    ("viscous friction", "drive delay"): "record steps of the action from rest",
+    ("armature", "motor gain"): "record a constant torque against gravity beside fast changes",
+    ("armature", "gravity"): "record fast and slow motion through the same angles",
+    ("armature", "mass"): "weigh the robot",
+    ("motor gain", "drive delay"): "record steps of the action",
+    ("motor gain", "gravity"): "record fast motion beside holding still",
+    ("motor gain", "mass"): "only their ratio shows in the motion: weigh the robot, or measure a torque",
+    ("gravity", "mass"): _HOLDING,
+}  # in the order of :func:`sensitivities`
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +112,7 @@ def _pairs(found: list[Sensitivity]) -> list[Finding]:
             cosine = _cosine(one.response, other.response)
             if abs(cosine) < ALIKE:
                 continue
-            record = _TO_RECORD.get(frozenset({one.effect, other.effect}), "record other motion of this joint")
+            record = _TO_RECORD.get((one.effect, other.effect), "record other motion of this joint")
             words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
             if one.joint == other.joint != "":
                 words = f"{one.effect} and {other}{words[len(f'{one} and {other}') :]}"

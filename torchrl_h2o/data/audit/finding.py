@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -85,14 +85,7 @@ class Finding:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        rows = None if self.rows is None else {"count": self.rows.count, "ranges": [list(r) for r in self.rows.ranges]}
-        return {
-            "check": self.check,
-            "severity": self.severity,
-            "words": self.words,
-            "rows": rows,
-            "remedy": self.remedy,
-        }
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Finding:

@@ -45,23 +45,6 @@ class AuditedSimulation(Protocol):
     ) -> np.ndarray: ...
 
 
-class AuditedTransitions(Protocol):
-    """Transitions as arrays; ``torchrl_h2o.residuals.Measured`` provides them."""
-
-    @property
-    def observation(self) -> np.ndarray: ...
-    @property
-    def action(self) -> np.ndarray: ...
-    @property
-    def following(self) -> np.ndarray: ...
-    @property
-    def run(self) -> np.ndarray: ...
-    @property
-    def time(self) -> np.ndarray: ...
-    @property
-    def estimated_std(self) -> np.ndarray | None: ...
-
-
 @dataclass(frozen=True)
 class Pair:
     """The columns of a position and of its velocity.
@@ -169,11 +152,12 @@ class Log:
     touching: np.ndarray | None = None
 
     @classmethod
-    def of(cls, measured: TensorDictBase | AuditedTransitions, simulation: AuditedSimulation) -> Log:
-        """Converts transitions and checks their widths against the simulator.
+    def of(cls, measured: TensorDictBase | Any, simulation: AuditedSimulation) -> Log:
+        """Converts transitions, TED or ``torchrl_h2o.residuals.Measured``, and checks them against the simulator.
 
         Raises:
-            DataError: if they are no valid TED, or observations or actions do not have the simulator's width.
+            DataError: if they are no valid TED, hold no row or a value that is not finite, or do not have
+                the simulator's width.
         """
         state_map, ended, time, estimated_std = simulation.state_map, None, None, None
         if not isinstance(measured, TensorDictBase) and not hasattr(measured, "following"):
@@ -194,32 +178,16 @@ class Log:
             run, time, estimated_std = measured.run, measured.time, measured.estimated_std
         _require_width(observation, state_map.names, "observation")
         _require_width(action, simulation.actuators, "action")
-        for values, names in (
-            (observation, state_map.names),
-            (following, state_map.names),
-            (action, simulation.actuators),
-        ):
+        named = (observation, state_map.names), (following, state_map.names), (action, simulation.actuators)
+        for values, names in named:
             _require_finite(values, names)
         clipped = state_map.clipped(observation) | state_map.clipped(following)
         pairs = find_pairs(state_map, simulation.model)
-        return cls(
-            observation,
-            action,
-            following,
-            run,
-            ended,
-            time,
-            simulation.control_step,
-            tuple(state_map.names),
-            tuple(state_map.units),
-            simulation.actuators,
-            pairs,
-            _velocities(pairs, state_map, simulation.model),
-            clipped,
-            estimated_std,
-            positions_alone(state_map, simulation.model),
-            find_turning(state_map, simulation.model),
-        )
+        velocities, turning = _velocities(pairs, state_map, simulation.model), find_turning(state_map, simulation.model)
+        alone, names, units = positions_alone(state_map, simulation.model), state_map.names, state_map.units
+        arrays = observation, action, following, run, ended, time
+        columns = simulation.control_step, tuple(names), tuple(units), simulation.actuators, pairs, velocities
+        return cls(*arrays, *columns, clipped, estimated_std, alone, turning)
 
     def __len__(self) -> int:
         return len(self.observation)
@@ -269,10 +237,9 @@ def _velocities(pairs: tuple[Pair, ...], state_map: Any, model: Any) -> tuple[Ve
     driven: dict[int, list[int]] = {}
     for actuator in range(model.nu):
         joint = int(model.actuator_trnid[actuator, 0])
+        # mjtTrn: 0, 1 joint; mjtJoint: 2 slide, 3 hinge
         if int(model.actuator_trntype[actuator]) in (0, 1) and int(model.jnt_type[joint]) in (2, 3):
-            driven.setdefault(int(model.jnt_dofadr[joint]), []).append(
-                actuator
-            )  # mjtTrn: joint; mjtJoint: slide, hinge
+            driven.setdefault(int(model.jnt_dofadr[joint]), []).append(actuator)
     found = [Velocity(pair.name, pair.velocity, pair.dof, tuple(driven.pop(pair.dof, ()))) for pair in pairs]
     column = _single_columns(state_map)
     for dof, actuators in driven.items():

@@ -41,7 +41,7 @@ def check_model(response: Response) -> list[Finding]:
         return check_large_zeros(response)
     best, words = min(BETTER * misfit, FOREIGN), None  # a change that explains nothing is no cause
     for change, what in _hypotheses(few.log.pairs):
-        left = few.misfit(observations=change)
+        left = few.changed(change).misfit()
         if left < best and misfit - left > 0.1:
             best, words = left, what
     if words is None:

@@ -70,11 +70,16 @@ class Response:
         starts = log.starts(horizon, most, margin, log.touching)
         if len(starts) < MIN_WINDOWS:
             return None
-        true = np.concatenate([simulation.true_observations(log.observation[run]) for run in log.runs])
         actions = np.concatenate([simulation.executed(log.action[run]) for run in log.runs])
-        states = simulation.state_map.states(true)
         activations = np.concatenate([simulation.activations(actions[run]) for run in log.runs])
-        chosen = _settled(log, simulation, states, actions, activations, starts, margin)
+        true = np.concatenate([simulation.true_observations(log.observation[run]) for run in log.runs])
+        states = simulation.state_map.states(true)
+        chosen = states[starts]
+        if margin:  # unobserved coordinates are simulated over the steps before, with the others measured
+            before = starts + np.arange(-margin, 0)[:, None]
+            time = simulation.control_step * before if log.time is None else log.time[before]
+            after = simulation.follow(states[before], actions[before], time, activations[before])
+            chosen[:, list(simulation.state_map.hidden)] = after[-1]
         return cls(log, simulation, horizon, starts, chosen, actions, activations, moving, noise)
 
     @property
@@ -178,7 +183,7 @@ class Response:
 
     def simulated_with(self, actions: np.ndarray) -> np.ndarray:
         """Simulated change of the velocities under actions (W, H, nu), (W, m)."""
-        return self._velocities(actions) - self.before
+        return self.reached(self.states, actions)[:, self.moving] - self.before
 
     @cached_property
     def target(self) -> np.ndarray:
@@ -192,21 +197,21 @@ class Response:
         last = self.log.following[self.starts + self.horizon - 1]
         return last - self.reached(self.states, self.limited[self.rows])
 
-    def _velocities(self, actions: np.ndarray, applied: np.ndarray | None = None) -> np.ndarray:
-        copies = len(actions) // len(self.states)
-        return self.reached(np.tile(self.states, (copies, 1)), actions, applied)[:, self.moving]
+    def _moved(self, states: np.ndarray, actions: np.ndarray, applied: np.ndarray | None = None) -> np.ndarray:
+        """What K variants of all windows change in their velocities, from states (K W, nq + nv), (W, m, K)."""
+        reached = self.reached(states, actions, applied)[:, self.moving].reshape(-1, *self.change.shape)
+        return np.moveaxis(reached - self.before - self.simulated, 0, -1)
 
     @cached_property
     def by_action(self) -> np.ndarray:
         """Derivative of the change by a constant offset of each action, (W, m, nu), by differences inside its range."""
-        if not self.anchor.shape[-1]:  # a model without actuators
+        base, number = self.anchor, self.anchor.shape[-1]
+        if not number:  # a model without actuators
             return np.zeros((*self.change.shape, 0))
-        base, unit = self.anchor, NUDGE * self.action_unit
         inward = np.where(base.mean(1) > 0.5 * sum(np.nan_to_num(self._range, posinf=0.0, neginf=0.0)), -1.0, 1.0)
-        steps = inward * unit  # (W, nu)
-        moved = np.concatenate([base + (steps * row)[:, None] for row in np.eye(base.shape[-1])])
-        reached = self._velocities(moved).reshape(base.shape[-1], *self.change.shape)
-        return np.moveaxis(reached - self.before - self.simulated, 0, -1) / steps[:, None]
+        steps = inward * NUDGE * self.action_unit  # (W, nu)
+        actions = np.concatenate([base + (steps * row)[:, None] for row in np.eye(number)])
+        return self._moved(np.tile(self.states, (number, 1)), actions) / steps[:, None]
 
     @cached_property
     def by_gain(self) -> np.ndarray:
@@ -216,33 +221,26 @@ class Response:
     @cached_property
     def by_force(self) -> np.ndarray:
         """Derivative of the change by a constant force on each velocity's degree of freedom, (W, m, m)."""
-        dofs, nv = [velocity.dof for velocity in self.log.velocities], self.simulation.model.nv
-        size = self._force_nudge()
-        actions = np.tile(self.anchor, (len(dofs), 1, 1))
-        applied = np.zeros((len(dofs), len(self.starts), self.horizon, nv))
+        dofs, model = [velocity.dof for velocity in self.log.velocities], self.simulation.model
+        inertia = 1.0 / np.maximum(model.dof_invweight0[dofs], 1e-9)  # diagonal
+        size = np.maximum(NUDGE * inertia * self.scale / (self.horizon * self.log.dt), 1e-9)
+        applied = np.zeros((len(dofs), len(self.starts), self.horizon, model.nv))
         for index, dof in enumerate(dofs):
             applied[index, ..., dof] = size[index]
-        reached = self._velocities(actions, applied.reshape(-1, self.horizon, nv))
-        reached = reached.reshape(len(dofs), *self.change.shape)
-        return np.moveaxis(reached - self.before - self.simulated, 0, -1) / size
-
-    def _force_nudge(self) -> np.ndarray:
-        """Forces that change a velocity by a small share of its usual change, (m,), from the diagonal inertia."""
-        model = self.simulation.model
-        inertia = np.array([1.0 / max(float(model.dof_invweight0[one.dof]), 1e-9) for one in self.log.velocities])
-        return np.maximum(NUDGE * inertia * self.scale / (self.horizon * self.log.dt), 1e-9)
+        states, actions = np.tile(self.states, (len(dofs), 1)), np.tile(self.anchor, (len(dofs), 1, 1))
+        return self._moved(states, actions, applied.reshape(-1, *applied.shape[2:])) / size
 
     @cached_property
     def by_zero(self) -> np.ndarray:
         """Derivative of the change by the zero of each pair's position, (W, m, pairs)."""
-        pairs, actions = self.log.pairs, self.anchor
-        size, moved = ZERO_NUDGE, []
-        for pair in pairs:
-            moved.append(self.states.copy())
-            moved[-1][:, pair.coordinate] += size
-        reached = self.reached(np.concatenate(moved), np.tile(actions, (len(pairs), 1, 1)))[:, self.moving]
-        reached = reached.reshape(len(pairs), *self.change.shape)
-        return np.moveaxis(reached - self.before - self.simulated, 0, -1) / size
+        pairs = self.log.pairs
+        if not pairs:  # of wheels, whose speed alone is measured
+            return np.zeros((*self.change.shape, 0))
+        states = np.tile(self.states, (len(pairs), 1, 1))
+        for index, pair in enumerate(pairs):
+            states[index, :, pair.coordinate] += ZERO_NUDGE
+        actions = np.tile(self.anchor, (len(pairs), 1, 1))
+        return self._moved(states.reshape(-1, states.shape[-1]), actions) / ZERO_NUDGE
 
     def mean_action(self, lag: int) -> tuple[np.ndarray, np.ndarray]:
         """Mean action of each window if actions act ``lag`` rows late, (W, nu), and which windows have it, (W,)."""
@@ -258,33 +256,19 @@ class Response:
         rows = np.clip(self.rows - lag, 0, len(self.log) - 1)
         return self.misfit(actions=lambda _: self.limited[rows], lag=lag)
 
-    def misfit(
-        self,
-        actions: Callable[[np.ndarray], np.ndarray] | None = None,
-        observations: Callable[[np.ndarray], np.ndarray] | None = None,
-        lag: int = 0,
-    ) -> float:
+    def misfit(self, actions: Callable[[np.ndarray], np.ndarray] | None = None, lag: int = 0) -> float:
         """Unexplained share of the change of the velocities: median error over median change, mean over velocities.
 
         Args:
             actions: changes the actions (W, H, nu) first, also to another number of steps; None for none.
-            observations: changes the observations (..., n) first; None for none.
             lag: rows by which the actions are late, for the activations.
         """
         executed = self.limited[self.rows]
         if actions is not None:
             executed = np.clip(actions(executed), *self._range)
-        states, before, change = self.states, self.before, self.change
-        if observations is not None:
-            first = self.log.observation[self.starts]
-            last = self.log.following[self.starts + self.horizon - 1]
-            moved = observations(first)
-            states = states + (moved - first) @ self.simulation.state_map.restore.T
-            before = moved[:, self.moving]
-            change = observations(last)[:, self.moving] - before
-        error = np.abs(change - (self.reached(states, executed, lag=lag)[:, self.moving] - before))
+        error = np.abs(self.change - (self.reached(self.states, executed, lag=lag)[:, self.moving] - self.before))
         error = np.where(np.isfinite(error), error, np.inf)
-        usual = np.median(np.abs(change), axis=0)
+        usual = np.median(np.abs(self.change), axis=0)
         share = np.median(error, axis=0) / np.where(usual > 0.0, usual, np.inf)
         return float(np.minimum(share, 3.0).mean())
 
@@ -303,22 +287,3 @@ def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray) -> int:
             break
         horizon = min(2 * horizon, longest)
     return horizon
-
-
-def _settled(
-    log: Log,
-    simulation: AuditedSimulation,
-    states: np.ndarray,
-    actions: np.ndarray,
-    activations: np.ndarray,
-    starts: np.ndarray,
-    steps: int,
-) -> np.ndarray:
-    """Start states of windows; unobserved coordinates are simulated over the steps before, with the others measured."""
-    chosen = states[starts]
-    if steps:
-        before = starts + np.arange(-steps, 0)[:, None]
-        time = simulation.control_step * before if log.time is None else log.time[before]
-        after = simulation.follow(states[before], actions[before], time, activations[before])
-        chosen[:, list(simulation.state_map.hidden)] = after[-1]
-    return chosen
