@@ -34,7 +34,13 @@ def test_an_elbow_whose_angle_is_counted_from_the_world_is_found(good, simulatio
     assert "in the world, which also contains shoulder" in finding.words
 
 
-@pytest.mark.parametrize("effects", [(ActionGain(1.5), Armature(0.002)), (BodyMass(2.2), JointFrictionLoss(0.05))])
+@pytest.mark.parametrize(
+    "effects",
+    [
+        pytest.param((ActionGain(1.5), Armature(0.002)), marks=pytest.mark.slow),
+        (BodyMass(2.2), JointFrictionLoss(0.05)),
+    ],
+)
 def test_it_is_found_beside_effects_that_the_simulator_lacks(effects, simulation):
     log = recording(*effects)
     assert words_of(log, simulation) == []

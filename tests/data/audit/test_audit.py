@@ -40,11 +40,11 @@ def test_good_log_has_neither_severe_findings_nor_warnings(good, simulation):
     "effect",
     [
         JointFrictionLoss(0.15),
-        ActionGain(0.7),
         Armature(0.02),
-        BodyMass(1.5),
-        Gravity(2.0),
         ActionDelay(0.015),
+        pytest.param(ActionGain(0.7), marks=pytest.mark.slow),
+        pytest.param(BodyMass(1.5), marks=pytest.mark.slow),
+        pytest.param(Gravity(2.0), marks=pytest.mark.slow),
     ],
     ids=lambda effect: type(effect).__name__,
 )
@@ -52,7 +52,11 @@ def test_dynamics_gap_is_no_fault_of_the_data(effect, simulation):
     assert audit(recording(effect), simulation).severe == ()
 
 
-@pytest.mark.parametrize("effects", [(), (JointFrictionLoss(0.15), Gravity(2.0))], ids=["no gap", "a gap"])
+@pytest.mark.parametrize(
+    "effects",
+    [(), pytest.param((JointFrictionLoss(0.15), Gravity(2.0)), marks=pytest.mark.slow)],
+    ids=["no gap", "a gap"],
+)
 def test_free_motion_of_a_model_without_actuators_has_no_severe_findings(effects):
     data, simulation = swinging(*effects)
     assert audit(data, simulation).severe == ()
@@ -84,19 +88,16 @@ def test_actions_of_another_run(good, simulation):
     assert "another run" in severe(other, simulation, "actions")
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.1])
+@pytest.mark.parametrize("noise", [pytest.param(0.02, marks=pytest.mark.slow), 0.1])
 def test_torques_that_follow_the_velocity_are_not_blamed_for_a_heavier_robot(simulation, noise):
     """Earlier, their sign was called reversed or they were called 300 ms late: they act as viscous friction does."""
     found = audit(pumped(BodyMass(2.4), JointFrictionLoss(0.1), noise=noise), simulation)
     assert [finding for finding in (*found.severe, *found.warnings) if finding.check == "actions"] == []
 
 
-@pytest.mark.parametrize("actuator", [0, 1])
-def test_sign_of_an_action(good, simulation, actuator):
-    action = good.action * np.where(np.arange(2) == actuator, -1.0, 1.0)
-    assert f"the action of m{actuator + 1} has the other sign" in severe(
-        with_action(good, action), simulation, "actions"
-    )
+def test_sign_of_an_action(good, simulation):
+    words = severe(with_action(good, good.action * [1.0, -1.0]), simulation, "actions")
+    assert "the action of m2 has the other sign" in words
 
 
 def test_late_actions(good, simulation):
@@ -111,7 +112,8 @@ def test_unit_of_the_actions(good, simulation):
 def test_unit_of_the_actions_of_a_held_arm(simulation):
     """Nearly all of the torque holds the arm's weight, as friction could."""
     data = holding()
-    assert audit(data, simulation).warnings == audit(data, simulation).severe == ()
+    sound = audit(data, simulation)
+    assert sound.warnings == sound.severe == ()
     assert "looks like another unit" in severe(with_action(data, 50.0 * data.action), simulation, "actions")
 
 
@@ -198,7 +200,7 @@ def test_rows_that_were_recorded_twice(good, simulation):
     assert any("occur a second time" in finding.words for finding in audit(twice, simulation).warnings)
 
 
-@pytest.mark.parametrize("column", range(4))
+@pytest.mark.parametrize("column", [0, 3])
 def test_frozen_column(good, simulation, column):
     def freeze(rows: np.ndarray) -> np.ndarray:
         rows[1000:, column] = rows[1000, column]
@@ -207,7 +209,7 @@ def test_frozen_column(good, simulation, column):
     assert "is frozen" in severe(changed(good, freeze), simulation, "rows")
 
 
-@pytest.mark.parametrize("column", range(4))
+@pytest.mark.parametrize("column", [0, 3])
 def test_clipped_column(good, simulation, column):
     def clip(rows: np.ndarray) -> np.ndarray:
         rows[:, column] = rows[:, column].clip(0.5 * rows[:, column].min(), 0.5 * rows[:, column].max())
@@ -216,7 +218,7 @@ def test_clipped_column(good, simulation, column):
     assert "the signal is clipped" in warned(changed(good, clip), simulation, "rows")
 
 
-@pytest.mark.parametrize("column", range(4))
+@pytest.mark.parametrize("column", [0, 3])
 def test_coarse_column(good, simulation, column):
     def round_off(rows: np.ndarray) -> np.ndarray:
         step = 0.25 * rows[:, column].std()

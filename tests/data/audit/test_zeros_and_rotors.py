@@ -19,7 +19,7 @@ def test_zero_on_the_other_side_of_the_turn(good, simulation):
     assert "half a turn" in words
 
 
-@pytest.mark.parametrize(("from_row", "size"), [(800, 1.2), (1500, -0.9)])
+@pytest.mark.parametrize(("from_row", "size"), [(800, 1.2), pytest.param(1500, -0.9, marks=pytest.mark.slow)])
 def test_an_encoder_that_slips_is_found_with_its_rows(good, simulation, from_row, size):
     slipped = changed(good, lambda rows: rows + size * np.outer(np.arange(len(rows)) >= from_row, [1, 0, 0, 0]))
     (found,) = audit(slipped, simulation).severe
@@ -58,7 +58,7 @@ def test_a_joint_without_a_name_gets_no_rotor():
     assert audit(measured(rows, action), simulation).severe == ()
 
 
-@pytest.mark.parametrize("begins", [1000, 1500])
+@pytest.mark.parametrize("begins", [1000, pytest.param(1500, marks=pytest.mark.slow)])
 def test_a_force_that_begins_in_the_middle_is_no_slipped_encoder(begins):
     """A pendulum alone, whose constant force looks like another zero as long as it hardly swings."""
     xml = (

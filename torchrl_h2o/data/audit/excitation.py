@@ -10,11 +10,9 @@ from torchrl_h2o.data.audit.finding import Finding
 from torchrl_h2o.data.audit.regression import NEGLIGIBLE
 from torchrl_h2o.data.audit.response import Response
 
+CHECK = "excitation"
 ALIKE = 0.9  # cosine of the angle between two effects' sensitivities from which they look alike
 COMBINED = 0.92  # correlation with the other effects of a joint from which an effect looks like their combination
-
-
-CHECK = "excitation"
 _JOINT = ("dry friction", "viscous friction", "armature")
 _REVERSALS = "record both directions under the same torque, such as slow reversals beside fast swings, or let it swing"
 _HOLDING = "record fast motion with a known torque: gravity shows at rest, mass in acceleration"

@@ -23,14 +23,12 @@ from torchrl_h2o.data.audit.orientation import check_orientation
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.time import common_factor
 
+CHECK = "kinematics"
 FINE = 0.7  # correlation of successive velocities below which rows are too far apart for small errors to show
 LAG_WARNING = 1.5  # rows of lateness from which a warning is given; below, a note
 NOISE_WARNING = 0.12  # noise of a sensor, in standard deviations, from which a warning is given
 NOISE_SEVERE = 0.6  # the noise from which it is severe
 BIAS_WARNING = 0.3  # constant error of a velocity, in its standard deviations, from which a warning is given
-
-
-CHECK = "kinematics"
 # factor between a position's derivative and its velocity -> what it looks like, for position and for velocity
 _FACTORS = (
     (180.0 / np.pi, "the position looks like degrees, the velocity like rad/s"),
@@ -196,8 +194,7 @@ def _bias(log: Log, derivative: Derivative, step: Response | None) -> list[Findi
 def _wrapped(log: Log, pair: Pair) -> list[Finding]:
     if not pair.angle:
         return []
-    moved = log.following[:, pair.position] - log.observation[:, pair.position]
-    integral = 0.5 * log.dt * (log.following[:, pair.velocity] + log.observation[:, pair.velocity])
+    moved, integral, _ = steps_of(log, pair.position, pair.velocity)
     for turn, unit in ((2.0 * np.pi, "2 π"), (360.0, "360")):
         turns = (np.abs(moved) > 0.5 * turn) & (np.abs(np.abs(moved) - turn) < 0.1 * turn)
         turns &= np.abs(integral) < 0.25 * turn

@@ -25,11 +25,11 @@ from torchrl_h2o.data.audit.response import MIN_WINDOWS, Response
 from torchrl_h2o.data.audit.undriven import check_undriven_zeros
 from torchrl_h2o.data.audit.zeros import check_large_zeros, check_small_zeros
 
+CHECK = "model"
 REGRESSION_STEPS = 300_000  # physics steps of all regressions at most; robots with too many joints are left out
 
 
 Change = Callable[[np.ndarray], np.ndarray]
-CHECK = "model"
 PARALLEL = 0.999  # cosine of the angle between two joints' axes
 
 

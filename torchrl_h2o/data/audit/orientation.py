@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import Log, Turning
 
+CHECK = "kinematics"
 QUATERNION_NORM = 0.05  # distance of a quaternion's norm from 1 from which it is none
 LOST_NORM = 0.5  # the same distance in few rows: a tracker that has lost the body writes zeros
 LOST_QUATERNIONS = 0.001  # share of rows without a quaternion from which they are named
@@ -19,9 +20,6 @@ MANY_LOST = 0.15  # the share from which they are severe
 EXPLAINED = 1e-3  # share of unexplained rotations or displacements up to which the columns are not doubted
 TURNED = 0.2  # share of rotations or displacements that wrong velocities leave unexplained at least
 BETTER_ORIENTATION = 0.5  # share of this misfit that another meaning of the columns must leave at most
-
-
-CHECK = "kinematics"
 _SPANS = (1, 2, 4, 8, 16, 32)  # rows over which rotations and displacements are compared with integrals
 _LAGS = (1, 2, 3, 4, 6, 8, -1, -2, -3, -4, -6, -8)  # rows by which angular velocities may be late
 _SMALL = 0.5  # rad; integrals of angular velocities are compared with rotations up to this angle

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.data.audit.derivative import deviation, roughness
+from torchrl_h2o.data.audit.derivative import deviation, roughness, steps_of
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
 from torchrl_h2o.data.audit.orientation import turning_rates
 
+CHECK = "rows"
 REPEATED = 0.001  # share of repeated rows, of those in motion, from which they are a warning
 MANY_REPEATED = 0.15  # the share from which they are severe
 MOVING = 0.2  # velocity, in standard deviations, from which an equal next reading is no chance
@@ -25,9 +26,6 @@ MOSTLY_AT_END = 0.3  # the share from which clipping is severe
 QUANTUM_NOTE = 0.05  # resolution of a column, in standard deviations, from which a note is given
 QUANTUM_WARNING = 0.12  # the resolution from which it is a warning
 DUPLICATE_BLOCK = 20  # shortest stretch of rows that counts as recorded twice
-
-
-CHECK = "rows"
 SLOPE_ROWS = 10  # rows over which a position is differentiated beside a frozen velocity
 ROUNDED = 0.01  # share of a constant velocity by which the slope of its position may differ from it
 
@@ -133,9 +131,9 @@ def _jumps(log: Log, simulation: AuditedSimulation, ends: np.ndarray) -> list[Fi
         return []
     seen = suspects[np.unique(np.linspace(0, len(suspects) - 1, MAX_SUSPECTS).astype(int))]
     seen = seen[_surprising(log, simulation, seen)] if simulation.frame_skip < 100 else seen
-    share = len(seen) / min(len(suspects), MAX_SUSPECTS) * len(suspects) / len(log)
     if not len(seen):
         return []
+    share = len(seen) / min(len(suspects), MAX_SUSPECTS) * len(suspects) / len(log)
     if _spikes(log, seen) > 0.8:
         what, remedy = "single readings lie far beside their neighbours", "remove these readings and split the log"
     else:
@@ -154,8 +152,8 @@ def position_spread(log: Log, pair: Pair) -> float:
 
 def _deviations(log: Log, pair: Pair) -> np.ndarray:
     """Displacement minus the integral of the velocity, (T,); turns of an angle by 2 π are removed."""
-    moved = log.following[:, pair.position] - log.observation[:, pair.position]
-    error = moved - 0.5 * log.dt * (log.following[:, pair.velocity] + log.observation[:, pair.velocity])
+    displacement, integral, _ = steps_of(log, pair.position, pair.velocity)
+    error = displacement - integral
     if pair.angle:
         turns = np.round(error / (2.0 * np.pi))
         near = np.abs(error - 2.0 * np.pi * turns) < 0.5

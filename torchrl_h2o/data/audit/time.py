@@ -13,6 +13,7 @@ from torchrl_h2o.data.audit.log import AuditedSimulation, Log
 from torchrl_h2o.data.audit.regression import BETTER, MISFIT
 from torchrl_h2o.data.audit.response import MIN_WINDOWS, PHYSICS_STEPS, ZERO_NUDGE, Response
 
+CHECK = "time"
 STEP_OFF = 0.02  # share by which the median time step may differ from the simulator's control step
 STEP_FAR_OFF = 0.3  # share beyond which that difference is severe
 LATE_STEP = 0.2  # share of the median step by which a single step may differ before it is irregular
@@ -23,9 +24,6 @@ VERY_SHORT_RUNS = 15.0  # the number below which it is severe
 FEW_ROWS_PER_PERIOD = 6.0  # rows per period of the model's fastest oscillation below which a note is given
 STEP_MULTIPLES = (2, 3, 4, 5, 10)  # control steps per row that are tried
 SAME_FACTOR = 0.1  # relative spread of all joints' factors within which the time is wrong, not the units
-
-
-CHECK = "time"
 
 
 def check_time(log: Log, simulation: AuditedSimulation, derivatives: Sequence[Derivative]) -> list[Finding]:

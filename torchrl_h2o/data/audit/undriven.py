@@ -11,10 +11,8 @@ from torchrl_h2o.data.audit.regression import SIGNIFICANCE, percent, robust_fit
 from torchrl_h2o.data.audit.response import ZERO_NUDGE, Response
 from torchrl_h2o.data.audit.zeros import ZERO_BETTER, ZERO_WARNING
 
-FORCE_LEFT = 0.6  # share of the force missing beside friction that a corrected zero must leave at most
-
-
 CHECK = "model"
+FORCE_LEFT = 0.6  # share of the force missing beside friction that a corrected zero must leave at most
 _STEP = np.pi / 6.0  # rad between the shifts from which the best one is sought
 _STARTS = _STEP * np.arange(-5, 7)
 _ROUNDS = 3  # of Newton's method

@@ -21,15 +21,13 @@ from torchrl_h2o.data.audit.regression import (
 )
 from torchrl_h2o.data.audit.response import Response
 
+CHECK = "model"
 ZERO_WARNING = 0.1  # error of an angle's zero, in rad, from which a warning is given
 ZERO_SEVERE = 0.5  # the error, in rad, from which it is severe, and sought in parts of the log as well
 ZERO_CHANGE = 5.0  # sum over windows of unexplained shares by which a change of a zero must lower them
 ZERO_GAIN = 0.03  # unexplained share of a window that a large shift must explain at least
 ZERO_EXPLAINED = 0.5  # share of the accelerations that a large shift, gains and friction may leave unexplained
 ZERO_BETTER = 0.8  # share of the misfit that a corrected zero must leave at most
-
-
-CHECK = "model"
 _GRIDS = ((30.0, 180.0), (5.0, 30.0), (1.0, 5.0))  # steps and half widths of successive grids of shifts, in degrees
 _FEWEST, _SMALLEST = 12, 0.04  # windows of a part of the log with its own zero, and their share of all
 _COARSE = 100  # windows with which a shift is sought first
