@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import torch
-import torch._functorch.config
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch._dynamo.exc import TorchDynamoException
