@@ -82,7 +82,7 @@ def _filled(buffer_class: type, replay: HybridReplayBuffer, device: str) -> obje
         named |= {"reward": after["reward"], "done": after["terminated"].float()}
         return {name: value.cpu().numpy() for name, value in named.items()}
 
-    real, sim = rows(replay.real.storage[:]), rows(replay.sim.storage[:])
+    real, sim = rows(replay.real.storage[:]), rows(replay.storage[:])
     buffer = buffer_class.__new__(buffer_class)
     buffer.device, buffer.scale_state = torch.device(device), False
     buffer.fixed_dataset_size, buffer.size = len(replay.real), len(replay)

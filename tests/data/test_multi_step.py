@@ -84,14 +84,14 @@ def buffer(**kwargs):
 def test_a_buffer_gives_n_step_rows_of_both_streams_and_names_the_one_step_state():
     replay = buffer()
     replay.extend(torch.stack([run([False] * 8, start=100), run([False] * 8, start=200)]))
-    assert len(replay.sim) == 2 * (8 - 3)
+    assert len(replay.storage) == 2 * (8 - 3)
     batch = replay.sample()
     assert replay.next_observation == ("next", "original_observation")
     assert (batch["next", "original_observation"] == batch["observation"] + 1).all()
     assert (batch["next", "observation"] == batch["observation"] + batch["steps_to_next_obs"]).all()
     assert (batch["steps_to_next_obs"][6:] == 3).all()
     replay.extend(torch.stack([run([False] * 2, start=108), run([False] * 2, start=208)]))
-    assert sorted(replay.sim[:]["observation"].flatten().tolist())[-7:] == [200, 201, 202, 203, 204, 205, 206]
+    assert sorted(replay.storage[:]["observation"].flatten().tolist())[-7:] == [200, 201, 202, 203, 204, 205, 206]
 
 
 def test_one_step_rows_have_no_further_entries():
@@ -113,5 +113,5 @@ def test_rows_that_wait_are_part_of_a_checkpoint(tmp_path, way):
         other.load_state_dict(torch.load(tmp_path / "replay.pt", weights_only=True))
     for each in (replay, other):
         each.extend(run([False] * 4, start=105)[None])
-    assert_same(other.sim[:], replay.sim[:])
-    assert len(other.sim) == 6
+    assert_same(other.storage[:], replay.storage[:])
+    assert len(other.storage) == 6

@@ -71,7 +71,7 @@ def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     title = METHODS[cfg.method].title
     latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
     load_checkpoint(cast(Path, latest), Checkpoint(replay=replay))  # a run with a summary has one
-    return _in_units(cfg, replay.sim[:]["observation"], ("theta", "theta_dot")).numpy()
+    return _in_units(cfg, replay.storage[:]["observation"], ("theta", "theta_dot")).numpy()
 
 
 def _in_units(cfg: DictConfig, observation: torch.Tensor, wanted: Sequence[str]) -> torch.Tensor:

@@ -107,7 +107,7 @@ def break_seed_1(monkeypatch, at_epoch):
         begin_epoch(self, epoch)
         simulated.append((self.cfg.seed, epoch))
         if self.cfg.seed == 1 and epoch >= at_epoch:
-            self.learner.replay.sim.storage[:]["next", "reward"].fill_(float("nan"))
+            self.learner.replay.storage[:]["next", "reward"].fill_(float("nan"))
 
     monkeypatch.setattr("torchrl_h2o.training.loop.Trainee.begin_epoch", broken)
     return simulated

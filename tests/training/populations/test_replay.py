@@ -57,7 +57,7 @@ def test_each_member_gets_what_its_own_buffer_draws(alone, together, sizes):
     for _ in range(3):
         batch = together.sample(sizes, ours)
         for member, buffer in enumerate(alone):
-            assert (batch[member] == buffer.sample(sizes, theirs[member])).all()
+            assert (batch[member] == buffer.sample(sizes, generator=theirs[member])).all()
 
 
 def test_without_generators_each_member_gets_its_own_rows_uniformly(together):
@@ -65,7 +65,7 @@ def test_without_generators_each_member_gets_its_own_rows_uniformly(together):
     batch = together.sample((2000, 2000))
     for member, buffer in enumerate(together.buffers):
         simulated = batch["observation"][member, 2000:]
-        own = buffer.sim.storage[:]["observation"]
+        own = buffer.storage[:]["observation"]
         seen = (simulated[:, None] == own).all(-1)
         assert seen.any(-1).all()
         expected = 2000 / len(own)

@@ -159,7 +159,7 @@ def train_population(
                 try:
                     trainee.begin_epoch(epoch)
                 except UnstableSimulatorError as error:
-                    if not len(trainee.learner.replay.sim):  # a batch needs simulated rows of every member
+                    if not len(trainee.learner.replay.storage):  # a batch needs simulated rows of every member
                         raise UnstableSimulatorError(f"{name}: {error}") from error
                     learner.note_failure(number, str(error))
                 learner.start_stream(number)
