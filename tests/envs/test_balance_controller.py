@@ -213,6 +213,8 @@ def test_recording_leaves_the_callers_env_as_it_was():
 def test_recording_nothing_is_an_error():
     with pytest.raises(ValueError, match="num_transitions is 0"):
         record(WheelLeggedEnv(), BalanceController(), 0)
+    with pytest.raises(ValueError, match="seed is 'a'; give an integer"):
+        record(WheelLeggedEnv(), BalanceController(), 5, seed="a")
 
 
 def test_recording_a_batch_of_envs_is_an_error():

@@ -23,6 +23,9 @@ TASKS = {
     "HalfCheetah": lambda: GymEnv("HalfCheetah-v5"),
     "Hopper": lambda: GymEnv("Hopper-v5"),
     "Walker2d": lambda: GymEnv("Walker2d-v5"),
+    "HalfCheetah-v4": lambda: GymEnv("HalfCheetah-v4"),
+    "Hopper-v4": lambda: GymEnv("Hopper-v4"),
+    "Walker2d-v4": lambda: GymEnv("Walker2d-v4"),
     "standing still": lambda: WheelLeggedEnv("standing_still"),
     "moving forward": lambda: WheelLeggedEnv("moving_forward"),
 }
@@ -49,7 +52,7 @@ def test_every_step_is_that_of_the_task_from_the_same_state(name):
             assert td["next", "terminated"][world].item() == terminated
             ended += terminated
         td = env.maybe_reset(env.step_mdp(td))
-    assert ended or name not in ("Hopper", "Walker2d")
+    assert ended or not name.startswith(("Hopper", "Walker2d"))
 
 
 @pytest.mark.parametrize("name", TASKS)

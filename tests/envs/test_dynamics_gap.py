@@ -181,7 +181,7 @@ def test_an_env_without_mujoco_is_refused():
 
 
 def test_what_is_no_effect_is_refused():
-    with pytest.raises(TypeError, match=r"takes effects such as Gravity.*got 'gravity'"):
+    with pytest.raises(TypeError, match=r"expected effects such as Gravity.*got 'gravity'"):
         DynamicsGap("gravity")
 
 

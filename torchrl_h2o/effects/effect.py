@@ -175,6 +175,18 @@ def _in_words(field: str, chosen: Any, names: Sequence[str]) -> str:
     return f"{field} {', '.join(names[int(i)] if i in range(len(names)) else str(i) for i in selected)}"
 
 
+def checked_effects(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+    """Returns effects as a tuple; raises TypeError for anything else, such as the name of an effect."""
+    found = tuple(effects) if isinstance(effects, Iterable) and not isinstance(effects, str) else (effects,)
+    for effect in found:
+        if not isinstance(effect, Effect):
+            raise TypeError(
+                f"expected effects such as Gravity(2.0), got {effect!r}; for one of the paper's gaps by name, use "
+                "paper_gap or dynamics_gap"
+            )
+    return found
+
+
 class ModelEffect(Effect):
     """An effect on the model: masses, geometry, joints, contacts, gravity."""
 

@@ -24,6 +24,7 @@ from torchrl_h2o.effects.effect import (
     ForceEffect,
     ObservationEffect,
     Process,
+    checked_effects,
 )
 from torchrl_h2o.effects.model.compilation import compile_model, edit_spec
 from torchrl_h2o.effects.noise_balance import balanced
@@ -80,7 +81,7 @@ class Pipeline:
     effects: tuple[Effect, ...] = ()
 
     def __post_init__(self):
-        object.__setattr__(self, "effects", tuple(self.effects))
+        object.__setattr__(self, "effects", checked_effects(self.effects))
 
     @classmethod
     def balanced_together(cls, groups: Mapping[Key, Sequence[Effect]]) -> dict[Key, Pipeline]:

@@ -18,10 +18,18 @@ from torchrl._utils import seed_generator
 from torchrl.data import Composite
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, Pipeline
-from torchrl_h2o.effects.effect import BatchedForce
+from torchrl_h2o.effects import (
+    ActionEffect,
+    Effect,
+    ObservationEffect,
+    Pipeline,
+    effect_from_dict,
+    effect_to_dict,
+)
+from torchrl_h2o.effects.effect import BatchedForce, checked_effects
+from torchrl_h2o.effects.model.compilation import require_changes
 from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
-from torchrl_h2o.envs.dynamics_gap import DynamicsGap, transforms_of
+from torchrl_h2o.envs.dynamics_gap import DrawEffects, DynamicsGap, GapContent, transforms_of
 from torchrl_h2o.envs.mujoco_model import find_backend
 from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, roll_out
 from torchrl_h2o.envs.recorded_episode import RecordedEpisode
@@ -41,7 +49,9 @@ class BatchedMujocoEnv(EnvBase):
         env: one env of the task, with or without dynamics gaps. The batched env keeps it, to draw initial states. Put
             other transforms around the batched env.
         num_worlds: number of worlds, N.
-        effects: further effects for all worlds, or one list of effects per world.
+        effects: further effects for all worlds, or one list of effects per world, or a function from a
+            ``numpy.random.Generator`` to a list of effects, which draws those of a world anew at each of its resets. A
+            drawn :class:`~torchrl_h2o.envs.DynamicsGap` on the given env is drawn for each world too.
 
     Keyword Args:
         num_threads: number of threads of ``mujoco.rollout``, at most one per world; the number of processors by
@@ -54,7 +64,8 @@ class BatchedMujocoEnv(EnvBase):
 
     Raises:
         ValueError: if the env is not a Gymnasium MuJoCo task with implemented rules, repeats actions or has transforms
-            other than dynamics gaps, or if the number of lists of effects is not N.
+            other than dynamics gaps; if the number of lists of effects is not N; if a model effect changes nothing in
+            the model; and in a step, if an action is NaN or outside its bounds.
 
     Examples:
         >>> import numpy as np
@@ -70,7 +81,7 @@ class BatchedMujocoEnv(EnvBase):
         self,
         env: EnvBase,
         num_worlds: int,
-        effects: Sequence[Effect] | Sequence[Sequence[Effect]] = (),
+        effects: Sequence[Effect] | Sequence[Sequence[Effect]] | DrawEffects = (),
         *,
         num_threads: int | None = None,
     ) -> None:
@@ -82,11 +93,15 @@ class BatchedMujocoEnv(EnvBase):
         self._rules = rules_of(self._task)
         self.num_worlds = num_worlds
         self.max_episode_steps = _time_limit(backend.env)
-        inside = [effect for of_gap in backend.gaps.values() for effect in of_gap]
-        self._pipelines = [Pipeline((*inside, *own)) for own in _of_each_world(effects, num_worlds)]
+        self._backend = backend
+        of_gaps = [cast("GapContent", gap).draw or effects for gap, effects in backend.gaps.items()]
+        self._sources = [(*of_gaps, own) for own in _of_each_world(effects, num_worlds)]
+        self._is_drawn = any(callable(source) for sources in self._sources for source in sources)
+        self._pipelines = [self._drawn(index, np.random.default_rng(index)) for index in range(num_worlds)]
         self.physics_steps = self._task.frame_skip
-        self._models = self._compiled(backend)
-        self._differ = len(set(self._pipelines)) > 1
+        # those of one world, because the worlds differ in values more than in kinds of effects
+        require_changes(backend.spec(), max(self._pipelines, key=lambda pipeline: len(pipeline.effects)).effects)
+        self._models = self._compiled()
         threads = min(num_threads or cpu_count() or 1, num_worlds)
         self._pool = Rollout(nthread=threads if threads > 1 else 0)  # 0 runs in the calling thread
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, self._pool.nthread))]
@@ -94,9 +109,7 @@ class BatchedMujocoEnv(EnvBase):
         self._steps = np.zeros(num_worlds, dtype=np.int64)
         self._control_steps = np.array([self.physics_steps * model.opt.timestep for model in self._models])
         self._episodes = [self._begin_episode(index) for index in range(num_worlds)]
-        self._alters_actions = any(pipeline.of_kind(ActionEffect) for pipeline in self._pipelines)
-        self._alters_observations = any(pipeline.of_kind(ObservationEffect) for pipeline in self._pipelines)
-        self._forces = self._batched_forces()
+        self._prepare_effects()
         self._make_specs(backend.env)
         self.set_seed(int(torch.randint(2**31, ())))
 
@@ -105,20 +118,37 @@ class BatchedMujocoEnv(EnvBase):
         """The model of each world, with its effects."""
         return self._models
 
-    def _compiled(self, backend: GymnasiumBackend) -> list[mujoco.MjModel]:
+    def _compiled(self) -> list[mujoco.MjModel]:
         """Compiles one model per world; worlds with the same effects share a model."""
-        models = {pipeline: pipeline.compile(backend.spec()) for pipeline in dict.fromkeys(self._pipelines)}
-        for model in models.values():
-            backend.check_sizes(model)
+        models = {pipeline: self._compile(pipeline) for pipeline in dict.fromkeys(self._pipelines)}
         return [models[pipeline] for pipeline in self._pipelines]
 
-    def _batched_forces(self) -> list[BatchedForce]:
-        """Returns the forces of all worlds; each acts only in its own worlds."""
-        forces = []
-        for pipeline in dict.fromkeys(self._pipelines):
+    def _compile(self, pipeline: Pipeline) -> mujoco.MjModel:
+        model = pipeline.compile(self._backend.spec())
+        self._backend.check_sizes(model)
+        return model
+
+    def _drawn(self, index: int, rng: np.random.Generator) -> Pipeline:
+        """Returns the effects of a world in its next episode."""
+        parts = [source(rng) if callable(source) else source for source in self._sources[index]]
+        return Pipeline(tuple(effect for part in parts for effect in checked_effects(part)))
+
+    def _put_into_world(self, index: int, pipeline: Pipeline) -> None:
+        """Replaces the effects of one world; the caller then calls :meth:`_prepare_effects`."""
+        if pipeline != self._pipelines[index]:
+            self._pipelines[index], self._models[index] = pipeline, self._compile(pipeline)
+            self._control_steps[index] = self.physics_steps * self._models[index].opt.timestep
+
+    def _prepare_effects(self) -> None:
+        """Stores what the worlds' effects alter; each force acts only in its own worlds."""
+        distinct = dict.fromkeys(self._pipelines)
+        self._differ = len(distinct) > 1
+        self._alters_actions = any(pipeline.of_kind(ActionEffect) for pipeline in distinct)
+        self._alters_observations = any(pipeline.of_kind(ObservationEffect) for pipeline in distinct)
+        self._forces: list[BatchedForce] = []
+        for pipeline in distinct:
             worlds = np.array([index for index, own in enumerate(self._pipelines) if own == pipeline])
-            forces += [_in_worlds(worlds, force) for force in pipeline.batched_forces(self._models[worlds[0]])]
-        return forces
+            self._forces += [_in_worlds(worlds, force) for force in pipeline.batched_forces(self._models[worlds[0]])]
 
     def _make_specs(self, env: EnvBase) -> None:
         n = self.num_worlds
@@ -130,6 +160,8 @@ class BatchedMujocoEnv(EnvBase):
         # stored here, because looking up a spec in every step is slow
         self._observation_dtype = env.observation_spec["observation"].dtype
         self._reward_dtype = env.reward_spec.dtype
+        space = cast("Any", env.action_spec_unbatched).space
+        self._bounds = space.low.numpy(), space.high.numpy()
 
     def _set_seed(self, seed: int | None) -> None:
         self._generators = []
@@ -141,6 +173,10 @@ class BatchedMujocoEnv(EnvBase):
         mask = np.ones(self.num_worlds, dtype=bool)
         if tensordict is not None and (chosen := tensordict.get("_reset", None)) is not None:
             mask = chosen.reshape(self.num_worlds, -1).any(1).numpy()
+        if self._is_drawn:
+            for index in np.flatnonzero(mask):
+                self._put_into_world(index, self._drawn(index, self._generators[index]))
+            self._prepare_effects()
         for index in np.flatnonzero(mask):
             self._begin(int(index))
         done = torch.zeros(self.num_worlds, 1, dtype=torch.bool)
@@ -151,6 +187,7 @@ class BatchedMujocoEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action").numpy()
+        self._require_within_bounds(action)
         executed = action
         if self._alters_actions:
             executed = np.stack([episode.executed(own) for episode, own in zip(self._episodes, action, strict=True)])
@@ -196,6 +233,16 @@ class BatchedMujocoEnv(EnvBase):
         self._steps[index] = 0
         self._episodes[index] = self._begin_episode(index)
 
+    def _require_within_bounds(self, action: np.ndarray) -> None:
+        low, high = self._bounds
+        outside = ~((action >= low) & (action <= high))  # this form also finds NaN
+        if outside.any():
+            world, entry = (int(place) for place in np.argwhere(outside)[0])
+            raise ValueError(
+                f"the action of world {world} is {action[world, entry]:g} in entry {entry}, outside of "
+                f"[{low[entry]:g}, {high[entry]:g}]; clip it, or use a policy with the env's action_spec"
+            )
+
     def _begin_episode(self, index: int) -> RecordedEpisode:
         """Begins an episode of a world's action and observation effects."""
         # without random effects torch's generator is not used
@@ -211,12 +258,16 @@ class BatchedMujocoEnv(EnvBase):
             "states": torch.from_numpy(self.states.copy()),
             "steps": torch.from_numpy(self._steps.copy()),
             "effects": [episode.state() for episode in self._episodes],
+            "drawn": [[effect_to_dict(effect) for effect in p.effects] for p in self._pipelines] * self._is_drawn,
         }
 
     def restore_episodes(self, state: dict[str, Any]) -> None:
         """Continues the episodes that :meth:`episodes_state` returned, in an env of the same task and effects."""
         self.states[:] = state["states"].numpy()
         self._steps[:] = state["steps"].numpy()
+        for index, drawn in enumerate(state.get("drawn", [])):
+            self._put_into_world(index, Pipeline(tuple(map(effect_from_dict, drawn))))
+        self._prepare_effects()
         self._episodes = [
             RecordedEpisode.restored(partial(pipeline.begin, step), own)
             for pipeline, step, own in zip(self._pipelines, self._control_steps, state["effects"], strict=True)
@@ -242,15 +293,19 @@ def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
     return forces
 
 
-def _of_each_world(effects: Sequence[Effect] | Sequence[Sequence[Effect]], num_worlds: int) -> list[tuple[Effect, ...]]:
-    given = list(effects)
+def _of_each_world(
+    effects: Sequence[Effect] | Sequence[Sequence[Effect]] | DrawEffects, num_worlds: int
+) -> Sequence[Sequence[Effect] | DrawEffects]:
+    if callable(effects):
+        return [effects] * num_worlds
+    given = list(effects) if not isinstance(effects, str) else checked_effects(cast("Any", effects))
     if all(isinstance(effect, Effect) for effect in given):
-        return [cast("tuple[Effect, ...]", tuple(given))] * num_worlds
+        return [cast("Sequence[Effect]", given)] * num_worlds
     if len(given) != num_worlds:
         raise ValueError(
             f"there are {len(given)} lists of effects for {num_worlds} worlds: give one per world, or one for all"
         )
-    return [tuple(cast("Sequence[Effect]", own)) for own in given]
+    return cast("Sequence[Sequence[Effect]]", given)
 
 
 def _backend_in(env: EnvBase) -> GymnasiumBackend:

@@ -1,5 +1,8 @@
 """DynamicsGap, the TorchRL transform that applies effects to a simulator."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import mujoco
@@ -9,9 +12,13 @@ from tensordict import TensorDictBase
 from torchrl.envs import Compose, EnvBase, FrameSkipTransform, Transform, TransformedEnv
 
 from torchrl_h2o.effects import ActionEffect, Effect, ObservationEffect, Pipeline, paper_gap
+from torchrl_h2o.effects.effect import checked_effects
+from torchrl_h2o.effects.model.compilation import require_changes
 from torchrl_h2o.envs.backends.backend import MujocoBackend
 from torchrl_h2o.envs.episode import GapEpisode
 from torchrl_h2o.envs.mujoco_model import find_backend
+
+DrawEffects = Callable[[np.random.Generator], Sequence[Effect]]
 
 
 class DynamicsGap(Transform):
@@ -33,20 +40,24 @@ class DynamicsGap(Transform):
     another gap needs a new env. Put the gap directly on the env, before other transforms, and inside each worker of a
     batched env. In a copy of the env, the gaps are applied again at the first reset.
 
-    The random effects of an episode are seeded at its reset from torch's global generator, so ``torch.manual_seed``
-    repeats them. In ``ParallelEnv`` each worker has its own generator; the env's ``set_seed`` makes them differ.
+    A function instead of effects draws the gap anew at each reset, for domain randomisation: it gets a random generator
+    and returns a list of effects. Effects that are assigned to :attr:`effects` also act from the next reset on.
+
+    Gaps are drawn from the task's own random generator, so the env's ``set_seed`` repeats them. The random effects of
+    an episode are seeded at its reset from torch's global generator, so ``torch.manual_seed`` repeats them. In
+    ``ParallelEnv`` each worker has its own generators; the env's ``set_seed`` makes them differ.
 
     Observation effects receive the env's floating-point observations as one vector, in the order of the observation
     spec.
 
     Args:
-        *effects: the effects, in their order.
+        *effects: the effects, in their order; or one function from a ``numpy.random.Generator`` to such a list.
 
     Raises:
         TypeError: if an argument is not an effect.
         ValueError: when added to an env that is batched, does not run on MuJoCo or had another gap; if the model has
-            no element that one of the effects could act on; if negative noise exceeds the noise before it; or if
-            action or observation effects are added after transforms of other kinds.
+            no element that one of the effects could act on, or a model effect changes nothing in it; if negative noise
+            exceeds the noise before it; or if action or observation effects are added after transforms of other kinds.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -60,24 +71,48 @@ class DynamicsGap(Transform):
         -19.62
         >>> env.rollout(3)["next", "reward"].shape
         torch.Size([3, 1])
+
+        Another gravity in every episode:
+
+        >>> drawn = DynamicsGap(lambda rng: [Gravity(rng.uniform(0.5, 2.0))])
+        >>> env = TransformedEnv(GymEnv("HalfCheetah-v5"), drawn)
+        >>> gravities = []
+        >>> for _ in range(3):
+        ...     _ = env.reset()
+        ...     gravities.append(float(mujoco_model(env).opt.gravity[2]))
+        >>> len(set(gravities))
+        3
     """
 
-    def __init__(self, *effects: Effect):
+    def __init__(self, *effects: Effect | DrawEffects):
         super().__init__()
-        for effect in effects:
-            if not isinstance(effect, Effect):
-                raise TypeError(
-                    f"DynamicsGap takes effects such as Gravity(2.0), got {effect!r}; for one of "
-                    "the paper's gaps by name, use dynamics_gap"
-                )
-        self.effects = effects
         # TorchRL clones transforms, sometimes onto the same env. Clones share this object, which identifies the gap
         # and its current episode in the simulation.
-        self._identity = object()
+        self._identity = GapContent()
+        if len(effects) == 1 and callable(effects[0]) and not isinstance(effects[0], type):
+            self._identity.draw = cast("DrawEffects", effects[0])
+        else:
+            self._identity.effects = checked_effects(effects)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects of the current episode. Others may be assigned; they act from the next reset on."""
+        return self._identity.effects
+
+    @effects.setter
+    def effects(self, effects: Sequence[Effect]) -> None:
+        self._identity.effects, self._identity.draw = checked_effects(effects), None
+        self._identity.is_new = True
+
+    @property
+    def draw(self) -> DrawEffects | None:
+        """The function that draws the effects at each reset; None if they are fixed."""
+        return self._identity.draw
 
     def describe(self) -> str:
         """Describes the gap in words with units."""
-        return ", ".join(effect.describe() for effect in self.effects)
+        words = ", ".join(effect.describe() for effect in self.effects)
+        return f"drawn at each reset: {words or 'not yet'}" if self.draw is not None else words
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.describe()})"
@@ -87,8 +122,11 @@ class DynamicsGap(Transform):
         env = _env_of(self)
         if env is None:  # the transform is in a Compose that has not been added to an env yet
             return
-        self._check_place(env)
         backend = find_backend(env)
+        is_new = self._identity not in backend.gaps  # TorchRL also adds clones of a gap in use
+        if self.draw is not None and is_new:
+            self._identity.effects = checked_effects(self.draw(np.random.default_rng(0)))
+        self._check_place(env)
         # a trial episode, so that an effect that does not fit the model raises before the model is changed
         trial = self._begin(backend, self._pipeline(backend), np.random.default_rng(0))
         example = backend.env.fake_tensordict()
@@ -96,11 +134,19 @@ class DynamicsGap(Transform):
         trial.observe(example)
         for force in trial.effects.forces:
             force(mujoco.MjData(backend.model))
+        if is_new:
+            require_changes(backend.spec(), self.effects)
         backend.apply(self._identity, {gap._identity: gap.effects for gap in self._gaps_on(env)})
 
     def _reset_env_preprocess(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         # a copied or unpickled env may have rebuilt its simulator without the gaps
         env = self._own_env()
+        backend = find_backend(env)
+        if self.draw is not None:
+            self._identity.effects = checked_effects(self.draw(backend.generator()))
+        elif self._identity.is_new:
+            require_changes(backend.spec(), self.effects)
+            self._identity.is_new = False
         self._check_place(env)
         gaps = self._gaps_on(env)
         effects = {gap._identity: gap.effects for gap in gaps}
@@ -109,7 +155,6 @@ class DynamicsGap(Transform):
                 f"{self} and a clone of it are on one env, where they count as one gap; to apply its effects twice, "
                 "make a second DynamicsGap"
             )
-        backend = find_backend(env)
         for identity in effects:
             backend.apply(identity, effects)
         return super()._reset_env_preprocess(tensordict)
@@ -154,7 +199,7 @@ class DynamicsGap(Transform):
     def _begin(backend: MujocoBackend, pipeline: Pipeline, rng: np.random.Generator | None) -> GapEpisode:
         return GapEpisode.begin(pipeline, backend.env, backend.control_step, backend.model, rng)
 
-    def _gaps_on(self, env: EnvBase) -> list["DynamicsGap"]:
+    def _gaps_on(self, env: EnvBase) -> list[DynamicsGap]:
         return [transform for transform in _transforms_of(self, env) if isinstance(transform, DynamicsGap)]
 
     def _check_place(self, env: EnvBase) -> None:
@@ -173,6 +218,14 @@ class DynamicsGap(Transform):
                     f"{self} stands after {type(transform).__name__}, so its actions and observations are not those "
                     "of the simulator; put it first: env.insert_transform(0, DynamicsGap(...))"
                 )
+
+
+class GapContent:
+    """The effects of a gap, shared by its clones; the object itself identifies the gap."""
+
+    effects: tuple[Effect, ...] = ()
+    draw: DrawEffects | None = None
+    is_new: bool = False  # assigned since the last reset
 
 
 def dynamics_gap(name: str, strength: float | None = None) -> DynamicsGap:

@@ -1,7 +1,7 @@
 """Finds the MuJoCo simulation of a TorchRL env and its model."""
 
 import mujoco
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, MujocoEnv
 
 from torchrl_h2o.envs.backends.backend import MujocoBackend, base_env
 from torchrl_h2o.envs.backends.dm_control import DMControlBackend
@@ -43,6 +43,12 @@ def find_backend(env: EnvBase) -> MujocoBackend:
         ValueError: if the env is batched or does not run on MuJoCo.
     """
     base = base_env(env)
+    if isinstance(base, MujocoEnv):
+        raise ValueError(
+            f"{type(base).__name__} is TorchRL's own MujocoEnv, which keeps a copy of its model where no gap reaches "
+            "it; choose the task of Gymnasium or dm_control, such as GymEnv('Hopper-v5') or "
+            "DMControlEnv('hopper', 'hop')"
+        )
     if base.batch_size:
         raise ValueError(
             f"{base} is batched, with batch size {tuple(base.batch_size)}: its simulations are not accessible from "

@@ -41,7 +41,8 @@ def record(
         the env, as in all measured data.
 
     Raises:
-        ValueError: for fewer than one transition, or for an env that is batched or has no ``observation``.
+        ValueError: for fewer than one transition, a seed that is no integer, or an env that is batched or has no
+            ``observation``.
 
     Example:
         >>> from torchrl_h2o.envs.wheel_legged.balance_controller import BalanceController
@@ -52,6 +53,8 @@ def record(
     """
     if num_transitions < 1:
         raise ValueError(f"num_transitions is {num_transitions}; record at least one")
+    if not isinstance(seed, int):
+        raise ValueError(f"seed is {seed!r}; give an integer")
     if env.batch_size:
         raise ValueError(
             f"record takes one env, not a batch of {tuple(env.batch_size)}; record from each of its envs and "

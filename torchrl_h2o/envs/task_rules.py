@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 import numpy as np
+from gymnasium.envs.mujoco import half_cheetah_v4, hopper_v4, walker2d_v4
 from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
@@ -87,7 +88,9 @@ class Walking(Running):
             return super().is_terminated(qpos, qvel)
         return ~self._is_healthy(qpos, qvel)
 
-    def _survival(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    def _survival(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray | float:
+        if isinstance(self.task, _PAY_THE_LAST_STEP) and self.task._terminate_when_unhealthy:
+            return self.task._healthy_reward
         return self._is_healthy(qpos, qvel) * self.task._healthy_reward
 
     def _is_healthy(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
@@ -124,10 +127,16 @@ class Balancing(TaskRules):
         return ~(np.abs(qpos[:, 2]) <= MAX_PITCH)  # this form also counts a NaN pitch as fallen
 
 
+# version 4 also pays the healthy reward in the step that ends unhealthy
+_PAY_THE_LAST_STEP = (hopper_v4.HopperEnv, walker2d_v4.Walker2dEnv)
+
 RULES: dict[type[MujocoEnv], type[TaskRules]] = {
     HalfCheetahEnv: Running,
     HopperEnv: Hopping,
     Walker2dEnv: Walking,
+    half_cheetah_v4.HalfCheetahEnv: Running,
+    hopper_v4.HopperEnv: Hopping,
+    walker2d_v4.Walker2dEnv: Walking,
     WheelLeggedMujocoEnv: Balancing,
 }
 
@@ -139,10 +148,11 @@ def rules_of(task: MujocoEnv) -> TaskRules:
         ValueError: for a task whose rules are not implemented.
     """
     if type(task) not in RULES:
-        known = ", ".join(kind.__name__ for kind in RULES)
+        known = ", ".join(f"{kind.__module__.rpartition('.')[2]}.{kind.__name__}" for kind in RULES)
         raise ValueError(
-            f"{type(task).__name__} cannot be stepped in a batch, because its rules are not implemented, only those of "
-            f"{known}; use ParallelEnv, or add its TaskRules to torchrl_h2o.envs.task_rules.RULES"
+            f"{type(task).__module__}.{type(task).__name__} cannot be stepped in a batch, because its rules are not "
+            f"implemented, only those of {known}; use ParallelEnv, or add its TaskRules to "
+            "torchrl_h2o.envs.task_rules.RULES"
         )
     return RULES[type(task)](task)
 

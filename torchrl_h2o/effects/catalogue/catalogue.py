@@ -19,7 +19,7 @@ from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.effects.catalogue.model_entries import body_entries, force_entries, geom_entries, joint_entries
 from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.indices import Indices
-from torchrl_h2o.effects.model.compilation import compile_model
+from torchrl_h2o.effects.model.compilation import compile_model, saved_model
 from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness, is_filter, is_servo
 from torchrl_h2o.effects.model.timestep import Timestep
@@ -79,7 +79,7 @@ def catalogue(
         *_action_entries(mechanism, dt),
         *_observation_entries(num_observations, dt, tuple(velocities)),
     ]
-    unchanged = _bytes(model)
+    unchanged = saved_model(model)
     return tuple(entry for entry in entries if _changes_something(entry, spec, unchanged))
 
 
@@ -154,12 +154,6 @@ def _changes_something(entry: CatalogueEntry, spec: mujoco.MjSpec, unchanged: by
     if not isinstance(first, ModelEffect):
         return True
     try:
-        return _bytes(compile_model(spec.copy(), [first])) != unchanged
+        return saved_model(compile_model(spec.copy(), [first])) != unchanged
     except ValueError:
         return False
-
-
-def _bytes(model: mujoco.MjModel) -> bytes:
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer.tobytes()

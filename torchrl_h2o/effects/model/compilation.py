@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import mujoco
+import numpy as np
 
 from torchrl_h2o.effects.effect import Effect, ModelEffect
 
@@ -64,3 +65,41 @@ def edit_spec(spec: mujoco.MjSpec, effects: Iterable[Effect]) -> None:
                     f"{type(effect).__name__} ({effect.describe()}) cannot be put into model "
                     f"'{spec.modelname}': {error}"
                 ) from error
+
+
+def require_changes(spec: mujoco.MjSpec, effects: Iterable[Effect]) -> None:
+    """Checks that every model effect changes the model, in its place in the list.
+
+    Args:
+        spec: the specification, edited in place.
+        effects: effects of any kind; neutral effects are allowed.
+
+    Raises:
+        ValueError: naming the first effect that changes nothing, such as a scale on a gravity of zero.
+
+    Examples:
+        >>> from torchrl_h2o.effects import Gravity
+        >>> weightless = mujoco.MjSpec.from_string("<mujoco model='arm'><option gravity='0 0 0'/></mujoco>")
+        >>> require_changes(weightless, [Gravity(2.0)])
+        Traceback (most recent call last):
+        ...
+        ValueError: Gravity (gravity × 2) changes nothing in model 'arm': what it alters is zero or absent there; ...
+    """
+    before = saved_model(compile_model(spec.copy()))
+    for effect in effects:
+        if isinstance(effect, ModelEffect) and not effect.is_neutral:
+            edit_spec(spec, [effect])
+            after = saved_model(compile_model(spec.copy()))
+            if after == before:
+                raise ValueError(
+                    f"{type(effect).__name__} ({effect.describe()}) changes nothing in model '{spec.modelname}': what "
+                    "it alters is zero or absent there; leave it out or choose another effect"
+                )
+            before = after
+
+
+def saved_model(model: mujoco.MjModel) -> bytes:
+    """Returns a compiled model as bytes; equal models have equal bytes."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()

@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_h2o.effects import Effect, ForceEffect, Pipeline, compile_model
+from torchrl_h2o.effects import Effect, ForceEffect, ModelEffect, Pipeline, compile_model
 from torchrl_h2o.effects.effect import Force
+from torchrl_h2o.effects.model.compilation import saved_model
 from torchrl_h2o.envs.episode import GapEpisodes
 
 # fields of MjModel that a dynamics gap must not change
@@ -71,6 +72,10 @@ class MujocoBackend(ABC):
     def push(self) -> None:
         """Makes every later physics step apply the forces of the current episodes."""
 
+    @abstractmethod
+    def generator(self) -> np.random.Generator:
+        """Returns a new random generator, seeded from that of the task, which the env's ``set_seed`` seeds."""
+
     @property
     def gaps(self) -> Mapping[object, Sequence[Effect]]:
         """The effects of every applied gap, by the gap's identity, in the order of application."""
@@ -82,7 +87,7 @@ class MujocoBackend(ABC):
         return self.owner.__dict__.setdefault("_dynamics_gap_episodes", GapEpisodes())
 
     def apply(self, gap: object, on_env: Mapping[object, Sequence[Effect]]) -> None:
-        """Applies a gap to the model, after the gaps applied before; does nothing if it was applied before.
+        """Applies a gap to the model, after the gaps applied before, and what has changed in these.
 
         Args:
             gap: the gap's identity; the same object denotes the same gap.
@@ -94,9 +99,11 @@ class MujocoBackend(ABC):
                 among the gaps of the env. The simulation is unchanged after the error.
         """
         applied = self.gaps
-        if gap in applied:
+        wanted = {other: tuple(on_env.get(other, effects)) for other, effects in applied.items()}
+        wanted.setdefault(gap, tuple(on_env[gap]))
+        if wanted == applied:
             return
-        if not applied.keys() <= on_env.keys():
+        if gap not in applied and not applied.keys() <= on_env.keys():
             left = ", ".join(e.describe() for other in applied if other not in on_env for e in applied[other])
             raise ValueError(
                 f"a gap that is not among the transforms of this env was applied to the simulator of {self.env} "
@@ -104,16 +111,16 @@ class MujocoBackend(ABC):
             )
         if not applied:
             self._check_source([effect for effects in on_env.values() for effect in effects])
-        applied = {**applied, gap: tuple(on_env[gap])}
-        pipeline = Pipeline(tuple(effect for effects in applied.values() for effect in effects))
-        model = pipeline.compile(self.spec())
-        self.check_sizes(model)
-        model.vis.global_.offwidth = self.model.vis.global_.offwidth
-        model.vis.global_.offheight = self.model.vis.global_.offheight
-        self.load(model)
+        pipeline = _together(wanted)
+        if not applied or pipeline.of_kind(ModelEffect) != _together(applied).of_kind(ModelEffect):
+            model = pipeline.compile(self.spec())
+            self.check_sizes(model)
+            model.vis.global_.offwidth = self.model.vis.global_.offwidth
+            model.vis.global_.offheight = self.model.vis.global_.offheight
+            self.load(model)
         if pipeline.of_kind(ForceEffect):
             self.push()
-        self.owner._dynamics_gaps = applied
+        self.owner._dynamics_gaps = wanted
 
     def _check_source(self, effects: Sequence[Effect]) -> None:
         self.check_sizes(compile_model(self.spec()))
@@ -131,7 +138,7 @@ class MujocoBackend(ABC):
         source.vis.global_.offheight = model.vis.global_.offheight
         for field in self.written_at_reset:
             getattr(source, field)[:] = getattr(model, field)
-        return np.array_equal(_bytes(source), _bytes(model))
+        return saved_model(source) == saved_model(model)
 
     def check_sizes(self, model: mujoco.MjModel) -> None:
         """Checks that a model has the same joints, bodies and actuators as the one in use.
@@ -167,10 +174,8 @@ class MujocoBackend(ABC):
         return [force for gap in self.gaps if gap in episodes for force in episodes[gap].effects.forces]
 
 
-def _bytes(model: mujoco.MjModel) -> np.ndarray:
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return buffer
+def _together(gaps: Mapping[object, Sequence[Effect]]) -> Pipeline:
+    return Pipeline(tuple(effect for effects in gaps.values() for effect in effects))
 
 
 def base_env(env: EnvBase) -> EnvBase:

@@ -8,6 +8,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 import mujoco
+import numpy as np
 from torchrl.envs import DMControlWrapper, EnvBase
 
 from torchrl_h2o.envs.backends.backend import MujocoBackend
@@ -76,6 +77,9 @@ class DMControlBackend(MujocoBackend):
     @property
     def _module(self) -> ModuleType:
         return sys.modules[type(self.env._env.task).__module__]
+
+    def generator(self) -> np.random.Generator:
+        return np.random.default_rng(self.env._env.task.random.randint(2**31 - 1))
 
     def load(self, model: mujoco.MjModel) -> None:
         from dm_control.mujoco.wrapper import MjModel

@@ -49,6 +49,9 @@ class GymnasiumBackend(MujocoBackend):
     def source(self) -> str:
         return self.owner.fullpath
 
+    def generator(self) -> np.random.Generator:
+        return np.random.default_rng(self.owner.np_random.integers(2**63))
+
     def load(self, model: mujoco.MjModel) -> None:
         task, old = self.owner, self.owner.model
         task.model, task.data = model, mujoco.MjData(model)
