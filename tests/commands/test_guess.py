@@ -84,7 +84,7 @@ def test_a_file_is_never_overwritten(folder):
         ([], "the log is missing; write close-the-loop --guess data=log.csv"),
         (["data=log.csv", "held_out=0.2"], "held_out is not an option of --guess"),
         (["data=none.csv"], "none.csv: there is no such file"),
-        (["data=log.csv", "simulator=none.xml"], "simulator=none.xml is not an MJCF file that MuJoCo reads"),
+        (["data=log.csv", "simulator=none.xml"], "simulator=none.xml: there is no file none.xml"),
         (["data=robot.xml"], "no (column|two rows) of numbers"),
     ],
 )

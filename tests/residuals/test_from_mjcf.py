@@ -71,6 +71,52 @@ def test_a_misspelt_coordinate_is_answered_with_the_right_one():
         Simulation.from_mjcf(PENDULUM, ["hinge", "hinge_velocit"], 0.005)
 
 
+@pytest.mark.parametrize("names", [[], {}, "hinge"])
+def test_no_coordinates_are_refused_with_those_that_there_are(names):
+    with pytest.raises(ValueError, match="names no observed coordinates; give a list of some of hinge, hinge_velocity"):
+        Simulation.from_mjcf(PENDULUM, names, 0.005)
+
+
+def test_effects_that_are_none_are_refused():
+    with pytest.raises(TypeError, match="got 'gravity'"):
+        Simulation.from_mjcf(PENDULUM, ["hinge"], 0.005, "gravity")
+
+
+BODY = "<mujoco><worldbody><body>{joint}<geom size='.1' mass='{mass}'/></body></worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (BODY.format(joint="", mass=1), "has no joints"),
+        (BODY.format(joint="<joint name='hinge'/>", mass="nan"), "mass='nan' of <geom> is not a number"),
+        (
+            BODY.format(joint="<joint name='hinge' damping='-NaN'/>", mass=1),
+            "damping='-NaN' of <joint> is not a number",
+        ),
+    ],
+    ids=["no joints", "mass", "damping"],
+)
+def test_a_model_that_cannot_move_or_holds_nan_is_refused(text, said, tmp_path):
+    (tmp_path / "robot.xml").write_text(text)
+    with pytest.raises(ValueError, match=rf"robot\.xml.*{said}"):
+        Simulation.from_mjcf(tmp_path / "robot.xml", ["hinge"], 0.005)
+
+
+def test_a_urdf_with_meshes_and_a_massless_link_says_what_to_change(tmp_path):
+    (tmp_path / "arm.urdf").write_text(
+        """<robot name="arm"><link name="base">
+             <inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+             <visual><geometry><mesh filename="package://arm/base.stl"/></geometry></visual></link>
+           <link name="tool"/><joint name="wrist" type="continuous">
+             <parent link="base"/><child link="tool"/><axis xyz="0 0 1"/></joint></robot>"""
+    )
+    said = r"remove all <visual>.*do not matter.*give an <inertial> .* links tool$"
+    with pytest.raises(ValueError, match=said) as caught:
+        Simulation.from_mjcf(tmp_path / "arm.urdf", ["wrist"], 0.005)
+    assert "\n" not in str(caught.value)
+
+
 def test_one_coordinate_twice_is_refused():
     with pytest.raises(ValueError, match="hinge is named twice"):
         Simulation.from_mjcf(PENDULUM, ["hinge", "hinge"], 0.005)
@@ -81,9 +127,9 @@ def test_a_state_map_of_another_model_is_refused():
         Simulation.from_mjcf(PENDULUM, StateMap.of_coordinates(("q",), ("rad",), (0,), num_states=4), 0.005)
 
 
-@pytest.mark.parametrize("step", [0.0, -0.005])
-def test_a_control_step_that_is_not_positive_is_refused(step):
-    with pytest.raises(ValueError, match="give the time between two rows"):
+@pytest.mark.parametrize("step", [0.0, -0.005, float("inf"), float("nan"), "0.005", True, 1e9])
+def test_a_control_step_that_is_no_time_between_two_rows_is_refused(step):
+    with pytest.raises(ValueError, match=r"a control step of .*; give the time between two rows in s"):
         Simulation.from_mjcf(PENDULUM, COLUMNS, step)
 
 

@@ -22,7 +22,6 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, physics
 from torchrl_h2o.residuals import Simulation
-from torchrl_h2o.residuals.simulation.settings import SimulationSettings
 
 PULL = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q) - 0.1 * v + np.cos(3.0 * t))
 
@@ -51,13 +50,13 @@ def test_a_rollout_is_what_mujoco_makes_of_each_state_alone(effects):
 
 
 @pytest.mark.parametrize("effects", [(), (PULL,)], ids=["free", "forced"])
-def test_a_rollout_in_chunks_is_the_rollout_at_once(effects):
+def test_a_rollout_in_chunks_is_the_rollout_at_once(effects, monkeypatch):
     simulation = pendulum().with_effects(*effects)
     states, actions, time = drawn(batch=50)
     applied = np.random.default_rng(1).standard_normal((50, 5, 1))
     at_once = simulation.rollout(states, actions, time=time, applied=applied)
-    in_chunks = replace(simulation, settings=SimulationSettings(rollout_numbers=100))
-    np.testing.assert_array_equal(in_chunks.rollout(states, actions, time=time, applied=applied), at_once)
+    monkeypatch.setattr("torchrl_h2o.residuals.simulation.simulation._ROLLOUT_NUMBERS", 100)
+    np.testing.assert_array_equal(simulation.rollout(states, actions, time=time, applied=applied), at_once)
 
 
 @pytest.mark.parametrize("effects", [(), (PULL,)], ids=["free", "forced"])

@@ -26,12 +26,14 @@ from torchrl_h2o.residuals.simulation.activations import (
     actuators_of_unknown_activation,
     settled_activations,
 )
-from torchrl_h2o.residuals.simulation.from_env import source_of_env
-from torchrl_h2o.residuals.simulation.from_mjcf import source_of_mjcf
-from torchrl_h2o.residuals.simulation.observability import hidden_coordinates
-from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
-from torchrl_h2o.residuals.simulation.source import SimulatorSource
-from torchrl_h2o.residuals.simulation.state_map import StateMap
+from torchrl_h2o.residuals.simulation.source import SimulatorSource, source_of_env, source_of_mjcf
+from torchrl_h2o.residuals.simulation.state_map import StateMap, hidden_coordinates
+
+# float64 values that one call of mujoco.rollout returns at most, 128 MB; larger rollouts are split
+_ROLLOUT_NUMBERS = 2**24
+# share of the control step by which the simulated time may differ from the expected one. MuJoCo resets a diverging
+# simulation and its clock, so a larger difference marks divergence.
+_CLOCK_JUMP = 0.5
 
 STEPS_BETWEEN_CHECKS = 50_000  # physics steps, about a second for a robot with twelve joints
 
@@ -49,7 +51,6 @@ class Simulation:
         effects: the effects in the simulator, in their order.
         name: the name for reports.
         action_units: units of the action's entries, (nu), for reports; empty if they are not known.
-        settings: tolerances and limits.
         check: called before every few thousand simulated steps; it raises to end a computation whose time is up.
 
     Examples:
@@ -67,7 +68,6 @@ class Simulation:
     effects: tuple[Effect, ...] = ()
     name: str = "simulator"
     action_units: tuple[str, ...] = ()
-    settings: SimulationSettings = SIMULATION_SETTINGS
     check: Callable[[], object] = field(default=lambda: None, repr=False)
     _pool: Rollout = field(default_factory=lambda: Rollout(nthread=cpu_count()), repr=False)
 
@@ -119,7 +119,7 @@ class Simulation:
                 "tell it; use actuators without dynamics, or enabled ones with dyntype filter or filterexact, no delay"
             )
         state_map = source.state_map
-        hidden = hidden_coordinates(state_map, simulation.model.nu, simulation.rollout, simulation.settings)
+        hidden = hidden_coordinates(state_map, simulation.model.nu, simulation.rollout)
         return replace(simulation, state_map=replace(state_map, hidden=hidden))
 
     def __eq__(self, other: object) -> bool:
@@ -242,7 +242,7 @@ class Simulation:
         full = self._full(states, np.zeros(batch) if time is None else time, activations, actions[:, 0])
         forces = self.pipeline.batched_forces(self.model)
         physics_steps = horizon * self.frame_skip
-        numbers = self.settings.rollout_numbers // full.shape[-1]
+        numbers = _ROLLOUT_NUMBERS // full.shape[-1]
         chunk = max(1, min(numbers, STEPS_BETWEEN_CHECKS) // physics_steps)
         parts = []
         with _no_warnings:
@@ -309,7 +309,7 @@ class Simulation:
         # MuJoCo resets a simulation and its clock if the state is not finite or too large
         control_step = self.control_step
         expected = full[:, :1] + control_step * np.arange(1, actions.shape[1] + 1)
-        jumps = np.abs(reached[:, :, 0] - expected) > self.settings.clock_jump * control_step
+        jumps = np.abs(reached[:, :, 0] - expected) > _CLOCK_JUMP * control_step
         states = reached[:, :, 1 : 1 + self.model.nq + self.model.nv].copy()
         if jumps.any():
             states[np.maximum.accumulate(jumps, axis=1)] = np.nan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -10,10 +10,18 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from torchrl_h2o.residuals.simulation.settings import SIMULATION_SETTINGS, SimulationSettings
-
 if TYPE_CHECKING:
     from gymnasium.envs.mujoco import MujocoEnv
+
+# the random states that probe the observation and the hidden state; coordinates in m, rad, m/s or rad/s
+_PROBE_SPREAD = 0.01  # standard deviation
+_SPARE_PROBES = 4  # beyond those that determine a linear map; they test its linearity
+# largest error of the linear map, in units of the observation; smaller coefficients become zero
+_LINEAR_TOLERANCE = 1e-5
+_FAR_STATE = 1e3  # coordinates at which the clipping of the observation is read
+# the test for hidden state: displacement of an unobserved coordinate, number of states at which it is displaced, and
+# the change of the next observation that makes it hidden state
+_NUDGE, _NUM_NUDGED, _NUDGE_RESPONSE = 0.05, 8, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +120,7 @@ def coordinate_names(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
     return positions + velocities, position_units + velocity_units
 
 
-def probe_gymnasium(
-    task: MujocoEnv, rng: np.random.Generator, settings: SimulationSettings = SIMULATION_SETTINGS
-) -> StateMap:
+def probe_gymnasium(task: MujocoEnv, rng: np.random.Generator) -> StateMap:
     """Determines the state map of a Gymnasium MuJoCo task from its observations in random states.
 
     A task may define an attribute ``hidden_state``, which gives usual values of unobserved velocities as linear
@@ -123,7 +129,6 @@ def probe_gymnasium(
     Args:
         task: the task; its state is restored afterwards.
         rng: generator of the random states.
-        settings: spread and number of the states, and tolerances.
 
     Returns:
         The map.
@@ -134,18 +139,18 @@ def probe_gymnasium(
     model = task.model
     num_states = model.nq + model.nv
     before = task.data.qpos.copy(), task.data.qvel.copy()
-    states = settings.probe_spread * rng.standard_normal((num_states + 1 + settings.spare_probes, num_states))
+    states = _PROBE_SPREAD * rng.standard_normal((num_states + 1 + _SPARE_PROBES, num_states))
     observed = np.array([_observation(task, state) for state in states], dtype=np.float64)
     design = np.hstack([states, np.ones((len(states), 1))])
     solution = np.linalg.lstsq(design, observed, rcond=None)[0]
     error = np.abs(design @ solution - observed).max()
-    far = settings.far_state * np.ones((2, num_states)) * np.array([[-1.0], [1.0]])
+    far = _FAR_STATE * np.ones((2, num_states)) * np.array([[-1.0], [1.0]])
     clip = np.array([_observation(task, state) for state in far], dtype=np.float64).T
     task.set_state(*before)
-    observe, tolerance = solution[:-1].T, settings.linear_tolerance
-    observe[np.abs(observe) < tolerance] = 0.0
+    observe = solution[:-1].T
+    observe[np.abs(observe) < _LINEAR_TOLERANCE] = 0.0
     one_each = (np.abs(observe) > 0).sum(1) == 1
-    if error > tolerance or np.abs(solution[-1]).max() > tolerance or not one_each.all():
+    if max(error, np.abs(solution[-1]).max()) > _LINEAR_TOLERANCE or not one_each.all():
         raise ValueError(
             f"the observation of {type(task).__name__} does not consist of single coordinates of qpos and qvel, so it "
             "cannot be converted to a state. Give the simulation a StateMap of your own"
@@ -169,3 +174,37 @@ def probe_gymnasium(
 def _observation(task: Any, state: np.ndarray) -> np.ndarray:
     task.set_state(state[: task.model.nq], state[task.model.nq :])
     return task._get_obs()
+
+
+def hidden_coordinates(
+    state_map: StateMap,
+    num_actuators: int,
+    rollout: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[int, ...]:
+    """Returns the indices of the unobserved coordinates that change the next observation when they are moved.
+
+    For example, the distance that HalfCheetah has run is not observed, and it changes no later observation. The depth
+    to which the wheels of a robot sink into the floor is not observed either, but it changes later observations.
+
+    Args:
+        state_map: the map between observations and states.
+        num_actuators: nu, the size of the action.
+        rollout: steps states (B, nq + nv) under actions (B, H, nu) to states (B, H, nq + nv).
+    """
+    unobserved = np.flatnonzero(~state_map.observe.any(0))
+    size = (_NUM_NUDGED, len(state_map.offset))
+    states = state_map.offset + _PROBE_SPREAD * np.random.default_rng(0).standard_normal(size)
+    still = np.zeros((len(states), 1, num_actuators))
+
+    def observed(moved: np.ndarray) -> np.ndarray:
+        return state_map.observations(rollout(moved, still))
+
+    base = observed(states)
+    hidden = []
+    for index in unobserved:
+        moved = states.copy()
+        moved[:, index] += _NUDGE
+        own = _NUDGE * state_map.observe[:, index]
+        if np.abs(observed(moved) - base - own).max() > _NUDGE_RESPONSE:
+            hidden.append(int(index))
+    return tuple(hidden)
