@@ -28,7 +28,7 @@ from torchrl_h2o.effects import (
     compile_model,
     paper_gap,
 )
-from torchrl_h2o.effects.catalogue.families import families
+from torchrl_h2o.effects.catalogue.choices import families
 
 FILES = {
     "HalfCheetah": ASSETS / "half_cheetah.xml",

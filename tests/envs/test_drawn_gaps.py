@@ -55,7 +55,7 @@ def test_drawn_effects_on_actions_act_and_leave_the_model():
         velocity = env.step(td.set("action", torch.full((1,), 3.0)))["next", "observation"][2]
         moved[env.transform.effects[0].scale] = velocity.item()
     assert abs(moved[0.0]) < 0.3
-    assert moved[-1.0] < -1.0
+    assert moved[-1.0] < -0.5
     assert mujoco_model(env) is model
 
 

@@ -9,6 +9,7 @@ from torchrl_h2o.effects.action.signal import ActionBias, ActionGain, ActionNois
 from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.catalogue.catalogue import catalogue
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry
+from torchrl_h2o.effects.catalogue.plausibility import is_negligible
 from torchrl_h2o.effects.effect import (
     ActionEffect,
     Effect,
@@ -18,31 +19,28 @@ from torchrl_h2o.effects.effect import (
 )
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.force.residual_force import ResidualForce
-from torchrl_h2o.effects.indices import Indices
 from torchrl_h2o.effects.joint_units import joint_names, quantity_name
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
 from torchrl_h2o.effects.model.compilation import compile_model
-from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
-from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
-from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
+from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
 from torchrl_h2o.effects.model.joint import (
     Armature,
     JointDamping,
     JointFrictionLoss,
     JointRange,
+    JointRest,
+    JointSpring,
+    JointStiffness,
 )
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness
-from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
-from torchrl_h2o.effects.model.timestep import Timestep
-from torchrl_h2o.effects.negligible import is_negligible
+from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation.sensor import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
 from torchrl_h2o.effects.paper_gaps import PAPER_GAPS, PaperGap, paper_gap
 from torchrl_h2o.effects.parameter import Parameter, parameter
 from torchrl_h2o.effects.pipeline import Episode, Pipeline
-from torchrl_h2o.effects.selection import Names
+from torchrl_h2o.effects.selection import Indices, Names
 from torchrl_h2o.effects.serialisation import effect_from_dict, effect_to_dict
-from torchrl_h2o.effects.settings import EffectSettings
 
 __all__ = [
     "PAPER_GAPS",
@@ -63,7 +61,6 @@ __all__ = [
     "CatalogueEntry",
     "ContactSoftness",
     "Effect",
-    "EffectSettings",
     "Episode",
     "ForceEffect",
     "GeomFriction",

@@ -14,10 +14,9 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.indices import Indices, checked_indices
 from torchrl_h2o.effects.joint_units import motion, unit_under
 from torchrl_h2o.effects.parameter import Parameter
-from torchrl_h2o.effects.selection import Names, checked_names
+from torchrl_h2o.effects.selection import Indices, Names, checked_indices, checked_names
 
 # by a field's type, which is a string in modules with ``from __future__ import annotations``
 _SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_indices, "Indices": checked_indices}

@@ -11,9 +11,8 @@ from types import MappingProxyType
 from torchrl_h2o.effects.action.signal import ActionNoise
 from torchrl_h2o.effects.effect import Effect
 from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
-from torchrl_h2o.effects.model.gravity import Gravity
-from torchrl_h2o.effects.model.joint import JointRange
-from torchrl_h2o.effects.model.spring import JointStiffness
+from torchrl_h2o.effects.model.joint import JointRange, JointStiffness
+from torchrl_h2o.effects.model.world import Gravity
 
 
 @dataclass(frozen=True)

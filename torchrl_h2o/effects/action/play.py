@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from torchrl_h2o.effects.effect import ActionEffect, Process
-from torchrl_h2o.effects.indices import Indices, entry_mask
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, parameter
+from torchrl_h2o.effects.selection import Indices, entry_mask
 
 
 @dataclass(frozen=True)

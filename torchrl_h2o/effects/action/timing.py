@@ -8,8 +8,8 @@ import numpy as np
 
 from torchrl_h2o.effects.delay_line import delay_line, delayed
 from torchrl_h2o.effects.effect import ActionEffect, Process
-from torchrl_h2o.effects.indices import Indices, entry_mask
 from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.selection import Indices, entry_mask
 
 
 @dataclass(frozen=True)

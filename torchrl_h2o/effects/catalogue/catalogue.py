@@ -2,7 +2,7 @@
 
 An effect is tried on single elements, on groups of elements whose names share a word, and on all elements, wherever
 it changes the model. The trial values are proportional to the model's own masses, torques and control step. They are
-written where their entry is defined; only the factors that several entries share are settings.
+written where their entry is defined.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,20 +16,24 @@ from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.catalogue.choices import indexed_choices
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
 from torchrl_h2o.effects.catalogue.mechanism import Mechanism
-from torchrl_h2o.effects.catalogue.model_entries import body_entries, force_entries, geom_entries, joint_entries
+from torchrl_h2o.effects.catalogue.model_entries import (
+    FACTORS,
+    body_entries,
+    force_entries,
+    geom_entries,
+    joint_entries,
+)
 from torchrl_h2o.effects.effect import ModelEffect
-from torchrl_h2o.effects.indices import Indices
 from torchrl_h2o.effects.model.compilation import compile_model, saved_model
-from torchrl_h2o.effects.model.gravity import Gravity, GravityTilt
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness, is_filter, is_servo
-from torchrl_h2o.effects.model.timestep import Timestep
+from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.observation.sensor import (
     ObservationBias,
     ObservationDelay,
     ObservationGain,
     ObservationNoise,
 )
-from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
+from torchrl_h2o.effects.selection import Indices
 
 
 def catalogue(
@@ -38,7 +42,6 @@ def catalogue(
     num_observations: int,
     dt: float,
     velocities: Sequence[int] = (),
-    settings: EffectSettings = EFFECT_SETTINGS,
 ) -> tuple[CatalogueEntry, ...]:
     """Returns the effects that a simulator of a model may lack, with initial values for their fits.
 
@@ -48,7 +51,6 @@ def catalogue(
         dt: the control step, in s.
         velocities: entries of the observation that are velocities. They may be late together: many machines compute
             them from positions, with a filter.
-        settings: sizes of the trials.
 
     Returns:
         The entries, all with different effects.
@@ -68,7 +70,7 @@ def catalogue(
     if num_observations < 0:
         raise ValueError(f"num_observations = {num_observations} is negative; give 0 to leave the sensors out")
     model = compile_model(spec.copy())
-    mechanism = Mechanism(model, settings)
+    mechanism = Mechanism(model)
     entries = [
         *_world_entries(mechanism),
         *body_entries(mechanism),
@@ -86,7 +88,7 @@ def catalogue(
 def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     model = mechanism.model
     if mechanism.weight:
-        yield CatalogueEntry(Gravity(), each("scale", *mechanism.settings.factors))
+        yield CatalogueEntry(Gravity(), each("scale", *FACTORS))
         planar = all(mechanism.planar(body) for body in range(1, model.nbody))
         spatial = tuple({"pitch": pitch, "roll": roll} for pitch in (0.1, -0.1) for roll in (0.1, -0.1))
         yield CatalogueEntry(GravityTilt(), each("pitch", 0.1, -0.1) if planar else spatial)
@@ -94,10 +96,9 @@ def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
 
 
 def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
-    factors = mechanism.settings.factors
-    yield from entries_of(ServoStiffness, "actuators", _where(is_servo, spec), lambda _: each("scale", *factors))
+    yield from entries_of(ServoStiffness, "actuators", _where(is_servo, spec), lambda _: each("scale", *FACTORS))
     yield from entries_of(
-        ActuatorTimeConstant, "actuators", _where(is_filter, spec), lambda _: each("scale", 0.1, *factors, 4.0)
+        ActuatorTimeConstant, "actuators", _where(is_filter, spec), lambda _: each("scale", 0.1, *FACTORS, 4.0)
     )
 
 
@@ -127,7 +128,7 @@ def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]
         ActionGain,
         "actuators",
         indexed_choices(labels, groups=True),
-        lambda _: each("scale", *mechanism.settings.factors),
+        lambda _: each("scale", *FACTORS),
     )
     yield from entries_of(ActionBias, "actuators", singles, shares("bias", 0.1, -0.1))
     yield from entries_of(ActionDeadBand, "actuators", single_and_all, shares("width", 0.03, 0.15))

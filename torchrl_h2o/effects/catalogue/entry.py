@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from torchrl_h2o.effects.effect import Effect
-from torchrl_h2o.effects.indices import Indices
-from torchrl_h2o.effects.selection import Names
+from torchrl_h2o.effects.selection import Indices, Names
 
 Trials = tuple[dict[str, float], ...]
 

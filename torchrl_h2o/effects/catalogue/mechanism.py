@@ -6,8 +6,10 @@ These are floating roots, planar motion, possible contacts, and the magnitudes o
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.settings import EFFECT_SETTINGS, EffectSettings
-
+# arm in m; the weight times this lever is the typical torque on a hinge without an actuator
+_LEVER = 0.1
+# deviation of a direction cosine from 0 or 1 below which an axis is perpendicular or parallel to the y axis
+_ALIGNED = 1e-3
 # converted to integers, because MuJoCo's constants do not compare equal to a model's integers inside tuples
 _FREE, _HINGE, _SLIDE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "HINGE", "SLIDE"))
 _JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -19,12 +21,10 @@ class Mechanism:
 
     Args:
         model: the compiled model.
-        settings: the lever arm for torques without an actuator, and the scales of the trials.
     """
 
-    def __init__(self, model: mujoco.MjModel, settings: EffectSettings = EFFECT_SETTINGS):
+    def __init__(self, model: mujoco.MjModel):
         self.model = model
-        self.settings = settings
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         self._axes = data.xaxis.copy()
@@ -61,9 +61,8 @@ class Mechanism:
             first = self.model.body_jntadr[body]
             for joint in range(first, first + self.model.body_jntnum[body]):
                 along_y = abs(self._axes[joint][1])
-                aligned = self.settings.aligned
                 kind = self.model.jnt_type[joint]
-                if not ((kind == _HINGE and along_y > 1.0 - aligned) or (kind == _SLIDE and along_y < aligned)):
+                if not ((kind == _HINGE and along_y > 1.0 - _ALIGNED) or (kind == _SLIDE and along_y < _ALIGNED)):
                     return False
             body = self.model.body_parentid[body]
         return True
@@ -92,7 +91,7 @@ class Mechanism:
         for actuator, target in enumerate(self._joint_of_actuators()):
             if target == joint:
                 largest += abs(self.model.actuator_gear[actuator, 0]) * self.control(actuator)
-        lever = self.settings.lever if self.model.jnt_type[joint] == _HINGE else 1.0
+        lever = _LEVER if self.model.jnt_type[joint] == _HINGE else 1.0
         return largest or self.weight * lever or 1.0
 
     def control(self, actuator: int) -> float:

@@ -14,11 +14,23 @@ from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
 from torchrl_h2o.effects.model.compilation import compile_model
-from torchrl_h2o.effects.model.contact import ContactSoftness, RollingResistance
-from torchrl_h2o.effects.model.geom import GeomFriction, GeomLength, GeomSize
-from torchrl_h2o.effects.model.joint import LOCKED, Armature, JointDamping, JointFrictionLoss, JointRange
-from torchrl_h2o.effects.model.spring import JointRest, JointSpring, JointStiffness
+from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
+from torchrl_h2o.effects.model.joint import (
+    LOCKED,
+    Armature,
+    JointDamping,
+    JointFrictionLoss,
+    JointRange,
+    JointRest,
+    JointSpring,
+    JointStiffness,
+)
 from torchrl_h2o.effects.selection import Names
+
+# scales that a trial multiplies a property of the model by
+FACTORS = (0.5, 0.8, 1.25, 2.0)
+# relative change of a body's inertia above which a geom contributes to it
+_INERTIA_CHANGE = 1e-9
 
 Choices = dict[Names, tuple[int, ...]]
 
@@ -56,7 +68,7 @@ def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         return named_choices(_joint_paths(model), joints, passed_over=passed_over, groups=groups)
 
     everything = set(range(model.njnt))
-    ranges = each("scale", *mechanism.settings.factors, LOCKED)
+    ranges = each("scale", *FACTORS, LOCKED)
     yield from entries_of(JointRange, "joints", chosen(limited, everything - set(limited)), lambda _: ranges)
     yield from _factors(mechanism, JointStiffness, "joints", chosen(sprung, everything - set(sprung)))
     yield from entries_of(JointRest, "joints", chosen(sprung, groups=False), lambda _: each("angle", 0.1, -0.1))
@@ -92,9 +104,7 @@ def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[Catalogu
         GeomFriction,
         "geoms",
         own,
-        lambda geoms: each(
-            "scale", *(factor for factor in mechanism.settings.factors if _rubs_otherwise(model, pairs, geoms, factor))
-        ),
+        lambda geoms: each("scale", *(factor for factor in FACTORS if _rubs_otherwise(model, pairs, geoms, factor))),
     )
     together = {names: geoms for names, geoms in rubbing.items() if len(geoms) > 1}
     yield from _factors(mechanism, ContactSoftness, "geoms", together)
@@ -127,7 +137,7 @@ def force_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
 
 
 def _factors(mechanism: Mechanism, effect: type, field: str, choices: Choices) -> Iterator[CatalogueEntry]:
-    return entries_of(effect, field, choices, lambda _: each("scale", *mechanism.settings.factors))
+    return entries_of(effect, field, choices, lambda _: each("scale", *FACTORS))
 
 
 def _shifts(mechanism: Mechanism, body: int) -> Trials:
@@ -180,7 +190,7 @@ def _weighing(mechanism: Mechanism, spec: mujoco.MjSpec, geoms: Sequence[int]) -
         if not model.geom(geom).name:
             continue
         larger = compile_model(spec.copy(), [GeomSize(1.5, geoms=model.geom(geom).name)])
-        if not np.allclose(larger.body_inertia, model.body_inertia, rtol=mechanism.settings.inertia_change, atol=0.0):
+        if not np.allclose(larger.body_inertia, model.body_inertia, rtol=_INERTIA_CHANGE, atol=0.0):
             found.add(geom)
     return found
 

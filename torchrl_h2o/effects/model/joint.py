@@ -1,8 +1,9 @@
-"""Effects on joints: range, damping, dry friction and armature.
+"""Effects on joints: range, damping, dry friction, armature and springs.
 
-For sliding joints, N·m stands for N and kg·m² for kg.
+For sliding joints, N·m stands for N, rad for m and kg·m² for kg.
 """
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -41,7 +42,7 @@ class JointRange(ModelEffect):
     joints: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:
-        for joint in those_with("range", selection.joints(spec, self.joints)):
+        for joint in _those_with("range", selection.joints(spec, self.joints)):
             joint.range *= self.scale
 
 
@@ -68,7 +69,7 @@ class JointDamping(ModelEffect):
     def edit(self, spec: mujoco.MjSpec) -> None:
         for joint in selection.joints(spec, self.joints):
             # the entries after the first are the coefficients of higher powers of the velocity
-            joint.damping[0] = added(joint, "damping", joint.damping[0], self.damping)
+            joint.damping[0] = _added(joint, "damping", joint.damping[0], self.damping)
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class JointFrictionLoss(ModelEffect):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         for joint in selection.joints(spec, self.joints):
-            joint.frictionloss = added(joint, "frictionloss", joint.frictionloss, self.torque)
+            joint.frictionloss = _added(joint, "frictionloss", joint.frictionloss, self.torque)
 
 
 @dataclass(frozen=True)
@@ -118,10 +119,91 @@ class Armature(ModelEffect):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         for joint in selection.joints(spec, self.joints):
-            joint.armature = added(joint, "armature", joint.armature, self.inertia)
+            joint.armature = _added(joint, "armature", joint.armature, self.inertia)
 
 
-def those_with(attribute: str, joints: list) -> list:
+@dataclass(frozen=True)
+class JointStiffness(ModelEffect):
+    """Scales the stiffness of joints.
+
+    Args:
+        scale: factor on the stiffness.
+        joints: name patterns of the joints; joints without a spring are skipped.
+
+    Raises:
+        ValueError: when put into a model that has no such joint with a spring.
+
+    Examples:
+        >>> JointStiffness(0.0, joints="*foot*").describe()
+        'stiffness of joints *foot* × 0'
+
+    Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716, the gap ``soft_feet``.
+    """
+
+    wording: ClassVar[str] = "stiffness of {joints} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.0, 10.0), neutral=1.0)
+    joints: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        for joint in _those_with("stiffness", selection.joints(spec, self.joints)):
+            joint.stiffness *= self.scale
+
+
+@dataclass(frozen=True)
+class JointSpring(ModelEffect):
+    """A spring on joints, as of a cable or a hose: a torque proportional to the deflection.
+
+    The rest position is the joint's ``springref``, which is zero unless the model sets it.
+
+    Args:
+        stiffness: addition to the joints' own stiffness, in N·m/rad; a negative value reduces it.
+        joints: name patterns of the joints.
+
+    Raises:
+        ValueError: when put into a model that has no such joint, or if the stiffness would become negative.
+
+    Examples:
+        >>> JointSpring(0.5, joints="*hip*").describe()
+        'stiffness of joints *hip* + 0.5 N·m/rad'
+    """
+
+    wording: ClassVar[str] = "stiffness of {joints} + {stiffness}"
+    stiffness: float = parameter(unit="N·m/rad", bounds=ANY_SIZE, neutral=0.0)
+    joints: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        for joint in selection.joints(spec, self.joints):
+            # the entries after the first are the coefficients of higher powers of the angle
+            joint.stiffness[0] = _added(joint, "stiffness", joint.stiffness[0], self.stiffness)
+
+
+@dataclass(frozen=True)
+class JointRest(ModelEffect):
+    """Shifts the rest position of the springs of joints.
+
+    Args:
+        angle: addition to the joints' ``springref``, in rad.
+        joints: name patterns of the joints; joints without a spring are skipped.
+
+    Raises:
+        ValueError: when put into a model that has no such joint with a spring.
+
+    Examples:
+        >>> JointRest(0.1, joints="*foot*").describe()
+        'rest of joints *foot* + 0.1 rad'
+    """
+
+    wording: ClassVar[str] = "rest of {joints} + {angle}"
+    angle: float = parameter(unit="rad", bounds=(-10.0, 10.0), neutral=0.0)
+    joints: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        for joint in _those_with("stiffness", selection.joints(spec, self.joints)):
+            in_degrees = joint.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE
+            joint.springref += math.degrees(self.angle) if in_degrees else self.angle
+
+
+def _those_with(attribute: str, joints: list) -> list:
     """Returns the joints whose attribute is not zero; raises ValueError if it is zero for all of them."""
     chosen = [joint for joint in joints if any(getattr(joint, attribute))]
     if not chosen:
@@ -130,7 +212,7 @@ def those_with(attribute: str, joints: list) -> list:
     return chosen
 
 
-def added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
+def _added(joint: mujoco.MjsJoint, attribute: str, value: float, addend: float) -> float:
     """Returns the sum of value and addend; raises ValueError if it is negative."""
     if value + addend < 0.0:
         raise ValueError(f"joint '{joint.name}' has a {attribute} of {value:g}, so {-addend:g} cannot be removed")

@@ -6,8 +6,8 @@ from typing import ClassVar
 import mujoco
 
 from torchrl_h2o.effects.effect import ModelEffect
-from torchrl_h2o.effects.indices import Indices
 from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.selection import Indices
 
 
 @dataclass(frozen=True)

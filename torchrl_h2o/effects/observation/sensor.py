@@ -7,8 +7,8 @@ import numpy as np
 
 from torchrl_h2o.effects.delay_line import advanced, delay_line
 from torchrl_h2o.effects.effect import ObservationEffect, Process
-from torchrl_h2o.effects.indices import Indices, entry_mask
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, ANY_SIZE, parameter
+from torchrl_h2o.effects.selection import Indices, entry_mask
 
 
 @dataclass(frozen=True)

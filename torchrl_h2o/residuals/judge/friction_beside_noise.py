@@ -9,7 +9,7 @@ import numpy as np
 
 from torchrl_h2o.effects import ActionNoise, Effect
 from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
-from torchrl_h2o.effects.indices import entry_mask
+from torchrl_h2o.effects.selection import entry_mask
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 # share of a dry friction from which noise of the actions at its joint makes its value doubtful

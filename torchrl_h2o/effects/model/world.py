@@ -1,4 +1,4 @@
-"""Effects on the magnitude and direction of gravity."""
+"""Effects on the whole simulation: magnitude and direction of gravity, physics timestep."""
 
 from dataclasses import dataclass
 from math import cos, pi, sin
@@ -61,3 +61,24 @@ class GravityTilt(ModelEffect):
         y, z = cos(self.roll) * y - sin(self.roll) * z, sin(self.roll) * y + cos(self.roll) * z
         x, z = cos(self.pitch) * x + sin(self.pitch) * z, cos(self.pitch) * z - sin(self.pitch) * x
         spec.option.gravity = [x, y, z]
+
+
+@dataclass(frozen=True)
+class Timestep(ModelEffect):
+    """Scales the physics timestep, so that the system runs faster or slower than nominal.
+
+    The number of physics steps per control step stays the same, so a control step covers ``scale`` times the time.
+
+    Args:
+        scale: factor on the model's timestep.
+
+    Examples:
+        >>> Timestep(1.1).describe()
+        'timestep × 1.1'
+    """
+
+    wording: ClassVar[str] = "timestep × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.1, 10.0), neutral=1.0)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        spec.option.timestep *= self.scale
