@@ -261,9 +261,13 @@ class HybridReplayBuffer(TensorDictReplayBuffer):
         Args:
             data: a batch from :meth:`sample`, with the entry ``priority_key``, such as ``td_error`` from the losses.
         """
-        for buffer, rows in ((self.real, data["real"]), (super(), ~data["real"])):
-            if rows.any():
-                buffer.update_tensordict_priority(cast(TensorDictBase, data[rows]))
+        if "index" not in data.keys():  # of two streams that are drawn uniformly
+            return
+        for buffer, of_stream in ((self.real, data["real"]), (super(), ~data["real"])):
+            if of_stream.any():
+                rows = cast(TensorDictBase, data.select("index", self.priority_key)[of_stream])
+                # TorchRL's trees read the bytes of float64 priorities as float32
+                buffer.update_tensordict_priority(rows.set(self.priority_key, rows[self.priority_key].float()))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the simulated stream. The real data are not included, because they can be read again."""
