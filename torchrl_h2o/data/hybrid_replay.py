@@ -26,6 +26,7 @@ from torchrl.data import (
     TensorStorage,
 )
 from torchrl.data.replay_buffers import RandomSampler, Sampler
+from torchrl.envs import Compose
 
 from torchrl_h2o.data.multi_step import STEPS, OngoingMultiStep, multi_step_keys, original_key
 from torchrl_h2o.data.readers.memory_map import load_memory_map, map_to_files
@@ -50,8 +51,8 @@ class HybridReplayBuffer(TensorDictReplayBuffer):
     transforms (:meth:`append_transform`) alter sampled batches, their inverse calls the simulated transitions that come
     in; real data are stored as given.
 
-    Random indices are drawn from torch's global generator of ``device``, so ``torch.manual_seed`` repeats them and a
-    restored generator state continues them.
+    Uniform indices are drawn from torch's global generator of ``device``, so ``torch.manual_seed`` repeats them and a
+    restored generator state continues them. Other samplers draw as TorchRL lets them.
 
     Args:
         real: flat TED transitions of batch size [T], in memory or memory-mapped; copied only if they are on another
@@ -98,6 +99,9 @@ class HybridReplayBuffer(TensorDictReplayBuffer):
 
     Source: Niu, Ji, et al., H2O+ (2023), arXiv 2309.12716: 𝒟 and B of Eq. (8), with 128 rows of each.
     """
+
+    _storage: TensorStorage
+    _transform: Compose
 
     def __init__(
         self,
@@ -405,7 +409,7 @@ def _draw(
     buffer: TensorDictReplayBuffer, count: int, generator: torch.Generator | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Draw places in one stream's storage, [count], and the weights that correct for their probabilities, [count]."""
-    storage = buffer.storage
+    storage = cast(TensorStorage, buffer.storage)
     if type(buffer.sampler) is RandomSampler:
         index = torch.randint(len(storage), (count,), device=storage.device, generator=generator)
         return index, torch.ones(count, device=storage.device)

@@ -174,10 +174,10 @@ def _in_words(field: str, chosen: Any, names: Sequence[str]) -> str:
     return f"{field} {', '.join(names[int(i)] if i in range(len(names)) else str(i) for i in selected)}"
 
 
-def checked_effects(effects: Iterable[Effect]) -> tuple[Effect, ...]:
+def checked_effects(effects: Iterable[Any]) -> tuple[Effect, ...]:
     """Returns effects as a tuple; raises TypeError for anything else, such as the name of an effect."""
-    found = tuple(effects) if isinstance(effects, Iterable) and not isinstance(effects, str) else (effects,)
-    for effect in found:
+    found: tuple[Any, ...] = tuple(effects) if isinstance(effects, Iterable) else (effects,)
+    for effect in (effects,) if isinstance(effects, str) else found:
         if not isinstance(effect, Effect):
             raise TypeError(
                 f"expected effects such as Gravity(2.0), got {effect!r}; for one of the paper's gaps by name, use "

@@ -174,11 +174,11 @@ class BatchedMujocoEnv(EnvBase):
         if tensordict is not None and (chosen := tensordict.get("_reset", None)) is not None:
             mask = chosen.reshape(self.num_worlds, -1).any(1).numpy()
         if self._is_drawn:
-            for index in np.flatnonzero(mask):
+            for index in map(int, np.flatnonzero(mask)):
                 self._put_into_world(index, self._drawn(index, self._generators[index]))
             self._prepare_effects()
-        for index in np.flatnonzero(mask):
-            self._begin(int(index))
+        for index in map(int, np.flatnonzero(mask)):
+            self._begin(index)
         done = torch.zeros(self.num_worlds, 1, dtype=torch.bool)
         return TensorDict(
             {"observation": self._observe(mask), "done": done, "terminated": done.clone(), "truncated": done.clone()},
@@ -298,7 +298,7 @@ def _of_each_world(
 ) -> Sequence[Sequence[Effect] | DrawEffects]:
     if callable(effects):
         return [effects] * num_worlds
-    given = list(effects) if not isinstance(effects, str) else checked_effects(cast("Any", effects))
+    given = list(effects) if not isinstance(effects, str) else checked_effects(effects)
     if all(isinstance(effect, Effect) for effect in given):
         return [cast("Sequence[Effect]", given)] * num_worlds
     if len(given) != num_worlds:

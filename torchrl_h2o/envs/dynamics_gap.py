@@ -149,7 +149,7 @@ class DynamicsGap(Transform):
             self._identity.is_new = False
         self._check_place(env)
         gaps = self._gaps_on(env)
-        effects = {gap._identity: gap.effects for gap in gaps}
+        effects: dict[object, tuple[Effect, ...]] = {gap._identity: gap.effects for gap in gaps}
         if len(effects) < len(gaps):
             raise ValueError(
                 f"{self} and a clone of it are on one env, where they count as one gap; to apply its effects twice, "
