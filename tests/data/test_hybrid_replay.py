@@ -27,7 +27,7 @@ def make_buffer(real=20, capacity=50, sim=30, **kwargs):
     return buffer
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(n_real=st.integers(0, 40), n_sim=st.integers(0, 40), seed=st.integers(0, 99))
 def test_rows_are_whole_and_marked_by_their_stream(n_real, n_sim, seed):
     if n_real + n_sim == 0:

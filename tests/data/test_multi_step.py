@@ -42,7 +42,7 @@ def expected(data, t, n):
             return total, data["next", "observation"][t + k - 1].item(), bool(data["next", "terminated"][t + k - 1]), k
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(ends=st.lists(st.booleans(), min_size=1, max_size=30), n=st.integers(2, 7))
 def test_every_row_sums_the_rewards_up_to_n_steps_or_the_end_of_its_run(ends, n):
     data = run(ends)
@@ -64,7 +64,7 @@ def test_a_time_limit_ends_the_sum_and_is_not_a_termination():
     assert not rows["next", "terminated"].any()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(ends=st.lists(st.booleans(), min_size=12, max_size=40), cuts=st.lists(st.integers(1, 39), max_size=5))
 def test_a_stream_in_parts_gives_the_rows_of_the_whole(ends, cuts):
     data, n = run(ends), 4

@@ -1,5 +1,6 @@
 """The catalogue of a model: its entries, selections and trials."""
 
+from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -40,6 +41,7 @@ FILES = {
 }
 
 
+@cache
 def entries_of(task: str, num_observations: int = 3) -> tuple[CatalogueEntry, ...]:
     model = mujoco.MjSpec.from_file(str(FILES[task]))
     return catalogue(model, num_observations=num_observations, dt=0.02)
@@ -92,15 +94,16 @@ def test_trials_of_a_crane_are_those_of_a_toy_with_all_forces_and_masses_a_milli
     assert grown >= {"JointDamping", "JointFrictionLoss", "Armature", "JointForce", "JointSpring", "LinearDrag"}
 
 
-@pytest.mark.parametrize("task", FILES)
+@pytest.mark.parametrize("task", ["Walker2d", "InvertedPendulum", "wheel_legged"])
 def test_every_entry_is_neutral_and_every_trial_changes_what_it_acts_on(task):
-    unchanged = as_bytes(compile_model(mujoco.MjSpec.from_file(str(FILES[task]))))
+    plain = mujoco.MjSpec.from_file(str(FILES[task]))
+    unchanged = as_bytes(compile_model(plain))
     for entry in entries_of(task):
         assert entry.effect.is_neutral
         assert 2 <= len(entry.trials) <= 6
-        for start in entry.starts:
+        for start in (entry.starts[0], entry.starts[-1]):
             assert not start.is_neutral
-            model = compile_model(mujoco.MjSpec.from_file(str(FILES[task])), [start])
+            model = compile_model(plain.copy(), [start])
             assert (as_bytes(model) != unchanged) == isinstance(start, ModelEffect)
             if isinstance(start, ForceEffect):
                 data = mujoco.MjData(model)

@@ -39,12 +39,13 @@ def test_every_step_is_that_of_the_task_from_the_same_state(name):
     task = single._env.unwrapped
     task.reset(seed=0)
     td, ended = env.reset(), 0
-    for _ in range(60):
+    falling = name.startswith(("Hopper", "Walker2d"))
+    for _ in range(50 if falling else 6):
         td = env.rand_action(td)
         if name in ("standing still", "moving forward"):
             td["action"] *= 0.1
         before, td = env.states.copy(), env.step(td)
-        for world in range(WORLDS):
+        for world in (0, WORLDS - 1):
             mujoco.mj_setState(task.model, task.data, before[world], mujoco.mjtState.mjSTATE_FULLPHYSICS)
             observation, reward, terminated, _, _ = task.step(td["action"][world].numpy())
             np.testing.assert_allclose(td["next", "observation"][world].numpy(), observation, atol=1e-9)
@@ -52,7 +53,7 @@ def test_every_step_is_that_of_the_task_from_the_same_state(name):
             assert td["next", "terminated"][world].item() == terminated
             ended += terminated
         td = env.maybe_reset(env.step_mdp(td))
-    assert ended or not name.startswith(("Hopper", "Walker2d"))
+    assert ended or not falling
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -71,7 +71,7 @@ def test_the_simulator_steps_with_the_changed_model():
     assert (heavy["next", "observation"] - light["next", "observation"]).abs().max() > 0.1
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=4, deadline=None)
 @example(effects=NEUTRAL, seed=0)
 @given(effects=st.lists(st.sampled_from(NEUTRAL), max_size=5), seed=st.integers(0, 2**16))
 def test_neutral_effects_leave_every_bit_of_a_rollout(effects, seed):

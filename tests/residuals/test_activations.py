@@ -106,6 +106,7 @@ def test_the_audit_finds_no_lag_of_the_actions_behind_the_filter_of_a_right_mode
     assert not [finding for finding in found if "later than" in finding.words or finding.check == "model"]
 
 
+@pytest.mark.slow  # a search for a force
 def test_a_control_times_a_position_may_stand_beside_a_saturation_that_is_never_reached(tmp_path):
     simulation = Simulation.from_mjcf(write(tmp_path, ACTUATORS["none"]), ["hinge", "hinge_velocity"], 0.01)
     truth = ResidualForce(("torque on hinge: 0.1 · a0 · q",))
