@@ -35,6 +35,8 @@ from torchrl_h2o.envs.physics import FULL_PHYSICS, positions_and_velocities, rol
 from torchrl_h2o.envs.recorded_episode import RecordedEpisode
 from torchrl_h2o.envs.task_rules import rules_of
 
+_ROUNDING = 1e-5  # share of an action's bound by which the rounding of a policy may exceed it
+
 
 class BatchedMujocoEnv(EnvBase):
     """N worlds of a Gymnasium MuJoCo task, stepped at once on all processors.
@@ -141,14 +143,17 @@ class BatchedMujocoEnv(EnvBase):
 
     def _prepare_effects(self) -> None:
         """Stores what the worlds' effects alter; each force acts only in its own worlds."""
-        distinct = dict.fromkeys(self._pipelines)
-        self._differ = len(distinct) > 1
-        self._alters_actions = any(pipeline.of_kind(ActionEffect) for pipeline in distinct)
-        self._alters_observations = any(pipeline.of_kind(ObservationEffect) for pipeline in distinct)
-        self._forces: list[BatchedForce] = []
-        for pipeline in distinct:
-            worlds = np.array([index for index, own in enumerate(self._pipelines) if own == pipeline])
-            self._forces += [_in_worlds(worlds, force) for force in pipeline.batched_forces(self._models[worlds[0]])]
+        worlds: dict[Pipeline, list[int]] = {}
+        for index, pipeline in enumerate(self._pipelines):
+            worlds.setdefault(pipeline, []).append(index)
+        self._differ = len(worlds) > 1
+        self._alters_actions = any(pipeline.of_kind(ActionEffect) for pipeline in worlds)
+        self._alters_observations = any(pipeline.of_kind(ObservationEffect) for pipeline in worlds)
+        self._forces: list[BatchedForce] = [
+            _in_worlds(np.array(own), force)
+            for pipeline, own in worlds.items()
+            for force in pipeline.batched_forces(self._models[own[0]])
+        ]
 
     def _make_specs(self, env: EnvBase) -> None:
         n = self.num_worlds
@@ -235,7 +240,8 @@ class BatchedMujocoEnv(EnvBase):
 
     def _require_within_bounds(self, action: np.ndarray) -> None:
         low, high = self._bounds
-        outside = ~((action >= low) & (action <= high))  # this form also finds NaN
+        slack = _ROUNDING * np.maximum(np.abs(low), np.abs(high))
+        outside = ~((action >= low - slack) & (action <= high + slack))  # this form also finds NaN
         if outside.any():
             world, entry = (int(place) for place in np.argwhere(outside)[0])
             raise ValueError(
