@@ -139,7 +139,7 @@ def test_reality_slows_a_rolling_robot_down():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_controller_balances_in_reality_but_wanders(task):
-    data = record(make("reality", task), noisy_balance_controller(task), 2000, 0, progress=False)
+    data = record(make("reality", task), noisy_balance_controller(task), 700, 0, progress=False)
     assert not data["next", "terminated"].any()
     spread = dict(zip(OBSERVATIONS[task], data["observation"].std(0).tolist(), strict=True))
     # the real robot's log has 0.047 rad, 0.52 rad/s and 0.19 m/s
@@ -153,7 +153,7 @@ def test_gains_that_are_best_in_the_simulator_alone_fall_in_reality():
     # theta^2 + 300 x^2 + 0.001 tau^2: high gains, optimal only without actuation delay
     stiff = {"theta": 207.6, "theta_dot": 36.0, "x": 428.5, "v": 164.0}
     for world, falls in (("simulator", False), ("reality", True)):
-        data = record(make(world), BalanceController(gains=stiff), 1200, 0, progress=False)
+        data = record(make(world), BalanceController(gains=stiff), 200, 0, progress=False)
         assert data["next", "terminated"].any().item() is falls
 
 
