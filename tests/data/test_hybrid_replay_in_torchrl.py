@@ -7,7 +7,9 @@ from torchrl.collectors import Collector
 from torchrl.data import Bounded, PrioritizedSampler, ReplayBuffer
 from torchrl.data.replay_buffers import SamplerWithoutReplacement
 from torchrl.envs import DoubleToFloat, GymEnv, RewardScaling, TransformedEnv
+from torchrl.objectives import SoftUpdate
 from torchrl.trainers import ReplayBufferTrainer, Trainer
+from torchrl.trainers.algorithms import SACTrainer
 
 from tests.data.recordings import assert_same
 from tests.data.test_hybrid_replay import make_buffer, stream
@@ -120,6 +122,27 @@ def test_a_trainer_learns_from_it(pendulum):
     trainer.train()
     assert len(buffer) == 30 + 40
     assert seen == [6] * 4
+
+
+def test_torchrl_s_sac_trainer_learns_from_it(pendulum):
+    env, buffer = pendulum
+    loss = h2o_plus(4, env.action_spec)
+    before = [parameter.detach().clone() for parameter in loss.parameters()]
+    trainer = SACTrainer(
+        collector=Collector(env, loss.actor_network, frames_per_batch=20, total_frames=40),
+        total_frames=40,
+        frame_skip=1,
+        optim_steps_per_batch=2,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), 1e-3),
+        replay_buffer=buffer,
+        target_net_updater=SoftUpdate(loss, tau=0.01),
+        progress_bar=False,
+        enable_logging=False,
+    )
+    trainer.train()
+    assert len(buffer) == 30 + 40
+    assert any(not torch.equal(old, new) for old, new in zip(before, loss.parameters(), strict=True))
 
 
 def test_a_sampler_of_torchrl_draws_the_rows_of_its_stream():
