@@ -194,3 +194,7 @@ def test_files_of_columns_of_one_run_are_not_taken_for_runs(tmp_path):
         load(columns_of_one_run(tmp_path, begin=0.003), columns=described)
     with pytest.raises(DataError, match="the column is missing"):
         load(columns_of_one_run(tmp_path, begin=7.0), columns=described)
+    (tmp_path / "broken.csv").write_text("nothing")
+    with pytest.raises(DataError, match="the column is missing") as caught:
+        load([*columns_of_one_run(tmp_path), tmp_path / "broken.csv"], columns=described)
+    assert caught.value.source.endswith("position.csv")

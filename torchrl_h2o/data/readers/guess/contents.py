@@ -76,7 +76,10 @@ def require_several_runs(paths: Sequence[str | Path]) -> None:
     logs = [Path(path) for path in paths if Path(path).is_file() and not is_hdf5(Path(path))]
     if len(logs) < 2 or len(logs) < len(paths):
         return
-    contents = [read_contents(path) for path in logs]
+    try:
+        contents = [read_contents(path) for path in logs]
+    except DataError:  # the readers say what is wrong with a file
+        return
     times = [_time(each) for each in contents]
     first, begin = contents[0], times[0]
     for each, time in zip(contents[1:], times[1:], strict=True):
