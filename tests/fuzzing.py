@@ -16,7 +16,7 @@ LONGEST = 300  # characters of a message, without the name of the file
 MOST_SECONDS, MOST_BYTES = 5.0, 2 * 2**30
 EXAMPLES = os.environ.get("TORCHRL_H2O_FUZZ")  # a number: that many examples, others in every run
 _CHECKS = {"suppress_health_check": list(HealthCheck), "deadline": None}
-few = settings(max_examples=20, derandomize=True, **_CHECKS)
+few = settings(max_examples=10, derandomize=True, **_CHECKS)
 some = settings(max_examples=int(EXAMPLES or 100), derandomize=EXAMPLES is None, **_CHECKS)
 many = settings(max_examples=int(EXAMPLES or 200), derandomize=EXAMPLES is None, **_CHECKS)
 

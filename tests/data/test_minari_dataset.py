@@ -27,7 +27,7 @@ def test_episodes_survive_minari(td):
 
 
 def test_values_equal_those_in_the_file(shared_data):
-    folder = shared_data / "minari" / "walker2d" / "medium-replay-v0"
+    folder = shared_data / "minari" / "halfcheetah" / "medium-replay-v0"
     td = read_minari(folder)
     lengths = [len(episode) for episode in episodes(td)]
     starts = np.cumsum([0, *lengths])

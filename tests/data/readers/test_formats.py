@@ -492,13 +492,13 @@ def test_a_bag_with_damaged_bytes_is_refused(tmp_path):
     columns = write_mcap(path)
     whole, content = load(path, columns=columns), path.read_bytes()
     refused = 0
-    for place in range(60, len(content) - 400, 97):
+    for place in range(60, len(content) - 400, 397):
         path.write_bytes(content[:place] + bytes([content[place] ^ 0x11]) + content[place + 1 :])
         try:
             assert torch.equal(load(path, columns=columns)["observation"], whole["observation"])
         except DataError:
             refused += 1
-    assert refused > 10
+    assert refused > 3
 
 
 @pytest.mark.parametrize(
