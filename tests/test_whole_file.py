@@ -4,10 +4,9 @@ import os
 
 import pytest
 
-from tests.ended_process import ended_process
 from tests.full_disk import full_disk
 from tests.residuals.report.made_up_reports import full_report, nothing_missing
-from torchrl_h2o.whole_file import MACHINE, remove_partial, write_text
+from torchrl_h2o.whole_file import remove_partial, write_text
 
 
 def contents(folder):
@@ -35,20 +34,24 @@ def test_text_that_cannot_be_written_leaves_the_earlier_file_and_nothing_else(tm
     assert contents(tmp_path) == {"a.csv": b"earlier"}
 
 
-def test_the_next_writing_removes_what_a_killed_process_has_left_of_the_same_file(tmp_path):
-    (tmp_path / f".a[1].{MACHINE}-{ended_process()}.partial.csv").write_text("half")
+LEFT = f"{'0a' * 16}.partial"
+
+
+def test_the_next_writing_removes_what_a_killed_process_left_a_day_ago(tmp_path):
+    old, new = tmp_path / f".a[1].{LEFT}.csv", tmp_path / f".b.{LEFT}.csv"
+    for path in (old, new):
+        path.write_text("half")
+    os.utime(old, (0.0, 0.0))
     write_text(tmp_path / "a[1].csv", "whole")
-    assert contents(tmp_path) == {"a[1].csv": b"whole"}
+    assert contents(tmp_path) == {"a[1].csv": b"whole", new.name: b"half"}  # another process may write the other one
 
 
-def test_only_files_and_folders_of_ended_processes_of_this_machine_are_removed(tmp_path):
-    number = ended_process()
-    ended, parent, elsewhere = f"{MACHINE}-{number}", f"{MACHINE}-{os.getppid()}", f"other-{MACHINE}-{number}"
-    left = [tmp_path / f".summary.{ended}.partial.json", tmp_path / "deep" / f".mended.{ended}.partial" / "report.json"]
-    kept = [tmp_path / f".summary.{process}.partial.json" for process in (parent, elsewhere)]
-    kept += [tmp_path / ".my.partial", tmp_path / "a.partial.json"]
+def test_temporary_files_and_folders_are_removed_and_files_of_other_names_are_not(tmp_path):
+    left = [tmp_path / f".summary.{LEFT}.json", tmp_path / "deep" / f".mended.{LEFT}" / "report.json"]
+    kept = [tmp_path / ".my.partial", tmp_path / "a.partial.json", tmp_path / f"summary.{LEFT}.json"]
     for path in (*left, *kept):
-        write_text(path, "half")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("half")
     remove_partial(tmp_path)
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == set(kept)
     assert not left[1].parent.exists()

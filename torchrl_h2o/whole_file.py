@@ -1,32 +1,25 @@
-"""Writes files so that a full disk or a kill leaves the earlier one: under a temporary name, renamed when complete.
-
-The temporary name contains the machine and the number of the process, so that what a killed process has left can be
-told from what another one is writing, also in a folder that several machines share.
-"""
+"""Writes files so that a full disk or a kill leaves the earlier one: under a temporary name, renamed when complete."""
 
 from __future__ import annotations
 
 import os
-import platform
-import re
 import shutil
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
-from glob import escape
 from pathlib import Path
+from uuid import uuid4
 
-_PARTIAL = re.compile(r"\..+\.([\w-]+)-(\d+)\.partial(\.\w+)?")
-MACHINE = re.sub(r"[^\w-]", "_", platform.node()) or "machine"
+DAY = 86_400.0  # s; a temporary file that nobody has written to for so long is what a killed process has left
 
 
 def partial_name(path: Path) -> Path:
-    """The temporary name of a file or folder, of which killed processes have left nothing.
+    """An unused temporary name beside a file or folder, with its suffix, by which some writers choose the format.
 
-    It keeps the suffix, because some writers choose the format by it.
+    What killed processes have left beside it is removed after a day.
     """
-    before, after = f".{path.stem}.", f".partial{path.suffix}"
-    _remove_left(path.parent.glob(f"{escape(before)}*{escape(after)}"))
-    return path.with_name(f"{before}{MACHINE}-{os.getpid()}{after}")
+    remove_partial(path.parent, unchanged_for=DAY, below="")
+    return path.with_name(f".{path.stem}.{uuid4().hex}.partial{path.suffix}")
 
 
 @contextmanager
@@ -61,47 +54,23 @@ def whole_file(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> Path:
-    """Writes a text file in UTF-8, see :func:`whole_file`, and returns its path.
-
-    Examples:
-        >>> import tempfile
-        >>> write_text(Path(tempfile.mkdtemp()) / "report.json", "{}").read_text()
-        '{}'
-    """
-    path = Path(path)
+    """Writes a text file in UTF-8, see :func:`whole_file`, and returns its path."""
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")
-    return path
+    return Path(path)
 
 
-def remove_partial(folder: str | Path) -> None:
-    """Removes temporary files and folders that killed processes have left in a folder and below it.
-
-    Those of processes that run, and those of other machines, are left alone.
+def remove_partial(folder: str | Path, unchanged_for: float = 0.0, below: str = "**/") -> None:
+    """Removes temporary files and folders that killed processes have left in a folder and, by default, below it.
 
     Args:
-        folder: the folder.
+        folder: the folder, in which no other process writes, unless ``unchanged_for`` is longer than it takes.
+        unchanged_for: time since they were last written, in s.
+        below: pattern of the folders below.
     """
-    _remove_left(Path(folder).rglob(".*.partial*"))
-
-
-def _remove_left(paths: Iterable[Path]) -> None:
-    for path in sorted(paths):  # first all names, because the folders change
-        named = _PARTIAL.fullmatch(path.name)
-        if named is None or named[1] != MACHINE or _runs(int(named[2])):
-            continue
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
-
-
-def _runs(process: int) -> bool:
-    """Whether there is a process of this number on this machine."""
-    try:
-        os.kill(process, 0)  # sends nothing
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # it belongs to another user, or the number is none
-        return True
-    return True
+    for path in sorted(Path(folder).glob(f"{below}.*.{'[0-9a-f]' * 32}.partial*")):  # all names first: folders change
+        if path.exists() and path.stat().st_mtime <= time.time() - unchanged_for:
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)

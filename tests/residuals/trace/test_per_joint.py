@@ -9,7 +9,7 @@ from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import ActionGain, Armature, CatalogueEntry, JointFrictionLoss
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.trace.per_joint import divide_by_element
+from torchrl_h2o.residuals.trace.per_joint import divide_by_element, divided_where_shared_harms
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.state import SearchState
 
@@ -70,6 +70,28 @@ def test_an_effect_on_all_joints_and_more_on_one_become_one_effect_on_each():
     effects = each_its_own([(ALL, {"torque": 0.03}), (SHOULDER, {"torque": 0.12})], CATALOGUE)
     assert [effect.joints for effect in effects] == ["shoulder", "elbow"]
     assert [effect.torque for effect in effects] == pytest.approx([0.15, 0.03], rel=0.05)
+
+
+def shared(truth, torque):
+    """A state with one friction on both joints, of which it has added a given torque, in data with other frictions."""
+    rng = np.random.default_rng(0)
+    measured = recorded(SIMULATION.with_effects(*truth), 600, noise=0.002)
+    begun = SearchState.begin(Problem.pose(SIMULATION, measured), CATALOGUE, rng)
+    fitted = begun.refitted([ALL], [JointFrictionLoss(torque)])
+    return replace(
+        begun.with_found([ALL], replace(fitted, effects=(JointFrictionLoss(torque),))), rivals={ALL.name: []}
+    )
+
+
+def test_an_effect_on_all_joints_that_makes_one_worse_is_put_in_for_each_joint():
+    state = divided_where_shared_harms(shared([JointFrictionLoss(0.15, "shoulder")], 0.1))
+    assert [effect.joints for effect in state.fit.effects] == ["shoulder", "elbow"]
+    assert torques(state.fit.effects) == pytest.approx([0.15, 0.0], abs=0.01)
+
+
+def test_an_effect_on_all_joints_that_helps_each_of_them_stays():
+    state = shared([JointFrictionLoss(0.1)], 0.1)
+    assert divided_where_shared_harms(state) is state
 
 
 def test_factors_of_all_motors_and_of_one_are_multiplied():

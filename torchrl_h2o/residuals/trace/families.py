@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
+
 from torchrl_h2o.effects import CatalogueEntry, Effect, selection
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -36,6 +38,16 @@ def elements(effect: Effect, simulation: Simulation) -> tuple[int, ...]:
         chosen = getattr(effect, "actuators", None)
         return tuple(range(simulation.model.nu)) if chosen is None else chosen
     return ()
+
+
+def acted_on(effect: Effect, simulation: Simulation) -> tuple[int, ...]:
+    """Indices of the joints that an effect acts on, by itself or through its motors; empty for other effects."""
+    if getattr(effect, "joints", None) is not None:
+        return elements(effect, simulation)
+    of_joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    model = simulation.model
+    motors = [motor for motor in elements(effect, simulation) if model.actuator_trntype[motor] in of_joints]
+    return tuple(int(model.actuator_trnid[motor, 0]) for motor in motors)
 
 
 def number_of_effects(state: SearchState) -> int:

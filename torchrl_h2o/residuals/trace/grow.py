@@ -20,6 +20,7 @@ from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.families import number_of_effects
 from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
+from torchrl_h2o.residuals.trace.per_joint import divided_where_shared_harms
 from torchrl_h2o.residuals.trace.problem import matters
 from torchrl_h2o.residuals.trace.rescale import rescale
 from torchrl_h2o.residuals.trace.screening import Lead, free_parameters, screen
@@ -106,7 +107,7 @@ class _Beam:
         for addition in possible.near:
             added = state.with_found(addition.entries, addition.fit)
             added = _remember_leads(added, possible.leads, added.entries[len(state.entries) :])
-            added = rescale(reorder(eliminate(added)))
+            added = rescale(reorder(eliminate(divided_where_shared_harms(added))))
             self.progress.closer(ADDITION)
             if _names(added) not in self.seen:
                 self.seen.add(_names(added))

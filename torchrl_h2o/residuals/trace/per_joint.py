@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
-from torchrl_h2o.residuals.trace.families import entries_of_elements
+from torchrl_h2o.residuals.trace.families import acted_on, entries_of_elements
 from torchrl_h2o.residuals.trace.noise_gain import explained_by_noise
-from torchrl_h2o.residuals.trace.problem import MIN_GAIN, MIN_GAIN_UNDER_NOISE, matters
+from torchrl_h2o.residuals.trace.problem import MIN_GAIN, MIN_GAIN_UNDER_NOISE, losses, matters
 from torchrl_h2o.residuals.trace.screening import are_possible_alone, free_parameters, is_possible
 from torchrl_h2o.residuals.trace.significance import BEYOND_NOISE
 from torchrl_h2o.residuals.trace.state import SearchState
@@ -36,6 +36,42 @@ def divide_by_element(state: SearchState, rng: np.random.Generator) -> SearchSta
         state, before = next((divided for divided in divisions if _pays(state, divided, rng)), state), state
         if state is before:
             return state
+
+
+def divided_where_shared_harms(state: SearchState) -> SearchState:
+    """Replaces an effect on several joints or motors by one effect each, where it raises the error of one of them.
+
+    One value for all lowers the sum of the errors, also if what some joints gain exceeds what another one loses. An
+    effect of its own may then have a smaller value at that joint, or none.
+
+    Args:
+        state: effects found.
+    """
+    for entry in state.entries:
+        if _harms_one(state, entry) and (divided := _divided(state, entry)) is not None:
+            before, after = (which.selection_losses(which.fit.effects).mean() for which in (state, divided))
+            return divided_where_shared_harms(divided) if after < before else state
+    return state
+
+
+def _harms_one(state: SearchState, entry: CatalogueEntry) -> bool:
+    """Whether an effect raises the error of what is observed of one of its joints, by the rows that choose effects."""
+    simulation, index = state.problem.simulation, state.entries.index(entry)
+    if len(joints := acted_on(entry.effect, simulation)) < 2:
+        return False
+    without, with_it = (
+        state.problem.selection_residuals(which.effects) for which in (state.fit.without(index), state.fit)
+    )
+    model, observed = simulation.model, simulation.state_map.restore_observed
+    for joint in joints:
+        rows = [model.jnt_qposadr[joint], model.nq + model.jnt_dofadr[joint]]
+        seen = np.flatnonzero(observed[rows].any(0))
+        if not len(seen):
+            continue
+        before, after = (losses(residual[..., seen]) for residual in (without, with_it))
+        if after.mean() > before.mean() / (1.0 - MIN_GAIN) and state.p_value(after, before) < state.settings.level:
+            return True
+    return False
 
 
 def _divided(state: SearchState, entry: CatalogueEntry) -> SearchState | None:
