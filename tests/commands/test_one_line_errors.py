@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hydra.errors import ConfigCompositionException
 
+from tests.full_disk import small_disk
 from tests.small_runs import ROOT
 from torchrl_h2o.commands.one_line_errors import is_expected, one_line_errors
 from torchrl_h2o.data import DataError, LogColumns
@@ -124,3 +125,15 @@ def test_a_traceback_is_there_on_request_and_for_bugs(tmp_path):
     assert bug.returncode == 1
     assert "Traceback" in bug.stderr
     assert "operands could not be broadcast" in bug.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", ["close_the_loop.py", "h2o_plus.py", "train.py"])
+def test_a_folder_that_cannot_be_written_ends_a_script_with_one_line(tmp_path, script):
+    with small_disk(tmp_path / "disk") as disk:
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        done = run(disk, str(ROOT / "recipes" / script))
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert "Read-only file system" in line
+    assert line.endswith("make room, or choose a folder that can be written")

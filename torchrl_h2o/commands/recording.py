@@ -48,11 +48,6 @@ class Recording:
     held_out: float | tuple[str, ...] = HELD_OUT
 
     @property
-    def held_out_logs(self) -> tuple[str, ...]:
-        """Names of the logs that are held out; empty if a share of the transitions is."""
-        return self.held_out if isinstance(self.held_out, tuple) else ()
-
-    @property
     def reported_on(self) -> float | tuple[int, ...]:
         """What errors are reported on: a share of the transitions, from the end, or the indices of logs."""
         if not isinstance(self.held_out, tuple):

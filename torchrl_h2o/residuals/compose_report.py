@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -56,17 +56,7 @@ def compose_report(
         simulator=simulation.name,
         data=_data_summary(measured),
         error=judgement.error,
-        found=tuple(
-            FoundEffect(
-                part.effect,
-                part.declared,
-                part.ci95,
-                error_after,
-                words(part.effect) if part.declared else f"{UNDECLARED}: {words(part.effect)}",
-                units(part.effect),
-            )
-            for part, error_after in zip(explanation.parts, judgement.errors_after, strict=True)
-        ),
+        found=_found(explanation, judgement.errors_after, simulation),
         rejected=_rejected(explanation, judgement, words, units),
         indistinguishable=tuple(
             IndistinguishableGroup(
@@ -112,18 +102,29 @@ def unfinished_report(evidence: Evidence, explanation: Explanation, stage: str) 
         stage: the current stage, in words.
     """
     simulation = evidence.simulation
-    words, units = partial(effect_words, names=simulation.names), partial(effect_units, names=simulation.names)
     return Report(
         simulator=simulation.name,
         data=_data_summary(evidence.measured),
-        found=tuple(
-            FoundEffect(part.effect, part.declared, part.ci95, math.nan, words(part.effect), units(part.effect))
-            for part in explanation.parts
-        ),
+        found=_found(explanation, (math.nan,) * len(explanation.parts), simulation),
         failures=explanation.failures,
         unfinished=stage,
         ended_in=explanation.ended_in,
         audit=evidence.audit,
+    )
+
+
+def _found(explanation: Explanation, errors: Sequence[float], simulation: Simulation) -> tuple[FoundEffect, ...]:
+    """The effects found, each with the error with it and those before it."""
+    return tuple(
+        FoundEffect(
+            part.effect,
+            part.declared,
+            part.ci95,
+            error,
+            ("" if part.declared else f"{UNDECLARED}: ") + effect_words(part.effect, simulation.names),
+            effect_units(part.effect, simulation.names),
+        )
+        for part, error in zip(explanation.parts, errors, strict=True)
     )
 
 

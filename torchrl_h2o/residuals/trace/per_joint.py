@@ -63,13 +63,14 @@ def _harms_one(state: SearchState, entry: CatalogueEntry) -> bool:
         state.problem.selection_residuals(which.effects) for which in (state.fit.without(index), state.fit)
     )
     model, observed = simulation.model, simulation.state_map.restore_observed
+    level = state.settings.level / len(joints)
     for joint in joints:
         rows = [model.jnt_qposadr[joint], model.nq + model.jnt_dofadr[joint]]
         seen = np.flatnonzero(observed[rows].any(0))
         if not len(seen):
             continue
         before, after = (losses(residual[..., seen]) for residual in (without, with_it))
-        if after.mean() > before.mean() / (1.0 - MIN_GAIN) and state.p_value(after, before) < state.settings.level:
+        if after.mean() > before.mean() / (1.0 - MIN_GAIN) and state.p_value(after, before) < level:
             return True
     return False
 
