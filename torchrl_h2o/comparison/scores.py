@@ -59,9 +59,8 @@ def placed(runs: pd.DataFrame, variants: bool) -> pd.DataFrame:
     repeated = runs[offline].drop(columns=["gap", "strength"]).merge(gaps, how="left", on=DATA).fillna("")
     runs = pd.concat([runs[~offline], repeated], ignore_index=True)
     runs["task"] = [task_of(row) for row in runs.to_dict("records")]
-    numbers = {"seed": int, "return_mean": float, "return_std": float, "at": int}
-    runs = runs.astype({column: kind for column, kind in numbers.items() if column in runs})
-    return runs.assign(seconds=pd.to_numeric(runs["seconds"]))
+    numbers = {"seed": int, "return_mean": float, "return_std": float, "seconds": float, "at": int}
+    return runs.astype({column: kind for column, kind in numbers.items() if column in runs})
 
 
 def require_distinct(runs: pd.DataFrame) -> None:
