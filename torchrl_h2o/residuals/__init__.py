@@ -3,10 +3,9 @@
 from torchrl_h2o.residuals.close_the_loop import close_the_loop, explain
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence
 from torchrl_h2o.residuals.explanation import Explanation
-from torchrl_h2o.residuals.judge.error_ahead import horizon_errors, linear_floor
 from torchrl_h2o.residuals.judge.floor import explainable_floor
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
-from torchrl_h2o.residuals.measured.initial_states import estimate_states, smoothed_states
+from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.simulated_transitions import simulate_transitions
@@ -33,13 +32,10 @@ __all__ = [
     "explainable_floor",
     "find_undeclared",
     "gather_evidence",
-    "horizon_errors",
-    "linear_floor",
     "outside_intervals",
     "outside_rows",
     "residuals",
     "simulate_transitions",
-    "smoothed_states",
     "trace_effects",
     "two_sample_auc",
 ]

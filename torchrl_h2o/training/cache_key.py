@@ -24,7 +24,7 @@ from torchrl_h2o.envs import mujoco_model
 SIMULATES = ("effects", "envs", "data")  # sub-packages whose code makes a recording
 SEARCHES = (*SIMULATES, "residuals")  # and those of a search for effects
 SOURCES = (".py", ".xml", ".yaml")
-LIBRARIES = ("mujoco", "gymnasium", "dm-control", "numpy", "scipy", "scikit-learn", "pysindy", "torch")
+LIBRARIES = ("mujoco", "gymnasium", "dm-control", "numpy", "scipy", "torch")
 
 
 def begin_key(settings: Any, env: EnvBase, packages: Sequence[str]) -> hashlib._Hash:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.envs import GymEnv, TransformedEnv
 
-from tests.residuals.pendulum import UnknownForce, pendulum, recorded, three_parts
+from tests.residuals.pendulum import pendulum, recorded, three_parts
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionNoise,
@@ -20,7 +20,7 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller
 from torchrl_h2o.envs.mujoco_model import find_backend
 from torchrl_h2o.residuals import Measured, Simulation, residuals
-from torchrl_h2o.residuals.measured.residual import executed_actions
+from torchrl_h2o.residuals.measured.residual import executed_actions, start_states
 
 STEPS = 60
 CONTROL_STEP = {"HalfCheetah-v5": 0.05, "Hopper-v5": 0.008}
@@ -120,24 +120,14 @@ def test_hidden_coordinates_are_carried_along():
     assert (carried < 0.02 * unknown).all()
 
 
-def test_divergence_is_nan_from_where_it_begins():
+def test_a_window_that_diverges_is_nan_and_spoils_no_other():
     simulation = pendulum()
     measured = recorded(simulation, 300)
-    applied = np.zeros((3, 4, 1))
-    applied[1, 2:] = 1e15
-    missed = residuals(simulation, measured, np.array([10, 20, 30]), 4, applied=applied)
-    assert np.isnan(missed[1, 2:]).all()
+    states = start_states(simulation, measured)
+    states[20, 1] = 1e15
+    missed = residuals(simulation, measured, np.array([10, 20, 30]), 4, states=states)
+    assert np.isnan(missed[1]).all()
     assert np.abs(missed[[0, 2]]).max() < 1e-9
-    assert np.abs(missed[1, :2]).max() < 1e-9
-
-
-def test_applied_forces_act_as_the_same_force_in_the_simulator():
-    simulation, torque = pendulum(), UnknownForce(0.2, lambda q, v, t: 1.0 + 0.0 * q)
-    measured = recorded(simulation.with_effects(torque), 300)
-    starts = measured.windows(3)
-    missed = residuals(simulation, measured, starts, 3, applied=np.full((len(starts), 3, 1), 0.2))
-    assert np.abs(missed).max() < 1e-9
-    assert np.abs(residuals(simulation, measured, starts, 3)).max() > 1e-3
 
 
 def test_random_effects_are_left_out_without_a_generator():

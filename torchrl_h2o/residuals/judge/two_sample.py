@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from sklearn.metrics import roc_auc_score
+from scipy.stats import mannwhitneyu
 from tensordict import TensorDict
 
 from torchrl_h2o.objectives import DynamicsRatioLoss, make_dynamics_ratio_estimator
@@ -67,7 +67,9 @@ def two_sample_auc(
             optimiser.step()
         with torch.no_grad():
             score = estimator.eval()(test)["log_dynamics_ratio"]
-    return float(roc_auc_score(test["real"].numpy(), score.numpy()))
+    real, score = cast("torch.Tensor", test["real"]).numpy(), score.numpy()
+    larger = mannwhitneyu(score[real], score[~real]).statistic  # pairs in which the measured one has the larger ratio
+    return float(larger / (real.sum() * (~real).sum()))
 
 
 def _real_and_simulated(

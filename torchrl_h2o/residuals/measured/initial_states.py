@@ -1,7 +1,6 @@
-"""Start states estimated from noisy sensors: an extended Kalman filter and smoother over the simulator.
+"""Start states estimated from noisy sensors: an extended Kalman filter over the simulator.
 
-Noise levels are estimated from the data. The filter uses past rows only, so a prediction may start from its states;
-the smoother also uses later rows, so its states are for fits only.
+Noise levels are estimated from the data. The filter uses past rows only, so a prediction may start from its states.
 """
 
 from __future__ import annotations
@@ -37,26 +36,16 @@ class NoiseLevels:
     model: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class _Filtered:
-    """Result of the filter, in spreads: filtered and predicted means (T, n) and covariances (T, n, n)."""
-
-    mean: np.ndarray
-    covariance: np.ndarray
-    predicted_mean: np.ndarray
-    predicted_covariance: np.ndarray
-
-
-def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None = None) -> np.ndarray:
+def estimate_states(simulation: Simulation, measured: Measured) -> np.ndarray:
     """Estimates the state of each row from the rows up to and including it.
 
     Uses an extended Kalman filter, linearised about the measured rows. Where the innovation is far larger than expected
-    (a push), the filter follows the measurement. Without sensor noise the result equals the measured states.
+    (a push), the filter follows the measurement. Without sensor noise the result equals the measured states. Noise
+    levels are estimated from the rows that are not held out.
 
     Args:
         simulation: simulator with its sensors, delays and unobserved coordinates.
         measured: the data.
-        noise: noise levels; by default estimated from the rows that are not held out.
 
     Returns:
         (T, nq + nv).
@@ -69,32 +58,14 @@ def estimate_states(simulation: Simulation, measured: Measured, noise: NoiseLeve
         >>> estimate_states(simulation, Measured.from_ted(data, simulation)).shape
         (300, 8)
     """
-    if noise is None:
-        return measured.remembered("states", simulation, lambda: _estimated_states(simulation, measured, None))
-    return _estimated_states(simulation, measured, noise)
 
+    def compute() -> np.ndarray:
+        linearised = Linearised.about(simulation, measured)
+        mean = _filter(linearised, _noise_levels(linearised, measured))
+        states = linearised.states_at(mean, simulation.state_map)
+        return settle(simulation, measured, states, executed_actions(simulation, measured), np.arange(len(measured)))
 
-def _estimated_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None) -> np.ndarray:
-    linearised = Linearised.about(simulation, measured)
-    noise = _noise_levels(linearised, measured) if noise is None else noise
-    return _states(simulation, measured, linearised, _filter(linearised, noise).mean)
-
-
-def smoothed_states(simulation: Simulation, measured: Measured, noise: NoiseLevels | None = None) -> np.ndarray:
-    """Estimates the state of each row from all rows of its run, with a Rauch-Tung-Striebel smoother.
-
-    The states depend on later rows, so a prediction that is judged must not start from them. Arguments and
-    result are those of :func:`estimate_states`.
-    """
-    linearised = Linearised.about(simulation, measured)
-    noise = _noise_levels(linearised, measured) if noise is None else noise
-    return _states(simulation, measured, linearised, _smooth(linearised, _filter(linearised, noise)))
-
-
-def _states(simulation: Simulation, measured: Measured, linearised: Linearised, estimate: np.ndarray) -> np.ndarray:
-    """States, (T, nq + nv), for estimated observations; unobserved coordinates follow from these."""
-    states = linearised.states_at(estimate, simulation.state_map)
-    return settle(simulation, measured, states, executed_actions(simulation, measured), np.arange(len(measured)))
+    return measured.remembered("states", simulation, compute)
 
 
 def noise_levels(simulation: Simulation, measured: Measured) -> NoiseLevels:
@@ -135,13 +106,13 @@ def _sensor_variance(before: np.ndarray, after: np.ndarray, slope: np.ndarray, s
     return np.maximum(share, 0.0) * size**2
 
 
-def _filter(linearised: Linearised, noise: NoiseLevels) -> _Filtered:
+def _filter(linearised: Linearised, noise: NoiseLevels) -> np.ndarray:
+    """Filtered observations, (T, n), in spreads."""
     observed, known, n = linearised.observed, linearised.known, linearised.observed.shape[1]
     spread = linearised.spread
     sensor = np.diag((noise.sensor / spread) ** 2 + 1e-4 * VARIANCE_FLOOR)
     model = noise.model / np.outer(spread, spread) + VARIANCE_FLOOR * np.eye(n)
     mean, covariance = observed.copy(), np.tile(sensor, (len(observed), 1, 1))
-    predicted_mean, predicted_covariance = mean.copy(), covariance.copy()
     for row in np.flatnonzero(linearised.follows):
         following = row + 1
         if not known[row]:
@@ -149,7 +120,6 @@ def _filter(linearised: Linearised, noise: NoiseLevels) -> _Filtered:
         slope = linearised.slope[row]
         guess = linearised.reached[row] + slope @ (mean[row] - observed[row])
         doubt = slope @ covariance[row] @ slope.T + model
-        predicted_mean[following], predicted_covariance[following] = guess, doubt
         if known[following]:
             innovation = observed[following] - guess
             surprise = innovation @ _solve(doubt + sensor, innovation) / n
@@ -159,8 +129,7 @@ def _filter(linearised: Linearised, noise: NoiseLevels) -> _Filtered:
             mean[following] = guess + gain @ innovation
             left = gain @ sensor  # equals doubt - gain @ doubt, without cancellation
             covariance[following] = 0.5 * (left + left.T)
-            predicted_covariance[following] = doubt
-    return _Filtered(mean, covariance, predicted_mean, predicted_covariance)
+    return mean
 
 
 def _solve(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -170,13 +139,3 @@ def _solve(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
     """
     _, solution, failed = _posv(covariance, right)
     return np.linalg.solve(covariance, right) if failed else solution  # rounding may leave it not positive definite
-
-
-def _smooth(linearised: Linearised, filtered: _Filtered) -> np.ndarray:
-    mean, known = filtered.mean.copy(), linearised.known
-    for row in np.flatnonzero(linearised.follows)[::-1]:
-        if known[row] and known[row + 1]:
-            carried = linearised.slope[row] @ filtered.covariance[row]
-            back = _solve(filtered.predicted_covariance[row + 1], carried).T
-            mean[row] = filtered.mean[row] + back @ (mean[row + 1] - filtered.predicted_mean[row + 1])
-    return mean

@@ -50,7 +50,6 @@ class OutsideInterval:
 def outside_intervals(
     simulation: Simulation,
     measured: Measured,
-    states: np.ndarray | None = None,
 ) -> list[OutsideInterval]:
     """Finds intervals disturbed from outside.
 
@@ -61,13 +60,12 @@ def outside_intervals(
     Args:
         simulation: the simulator, with all effects known so far.
         measured: the data.
-        states: (T, nq + nv), start states; the measured ones by default.
 
     Returns:
         The intervals in order, each with a margin of one window on either side; none if large residuals are
         frequent.
     """
-    starts, size = _window_sizes(simulation, measured, states)
+    starts, size = _window_sizes(simulation, measured)
     if len(starts) <= NEIGHBOURS:
         return []
     surprising = np.flatnonzero(size > THRESHOLD)
@@ -127,9 +125,7 @@ def _exceptional(surprising: np.ndarray, windows: int) -> bool:
     return bool(0 < len(surprising) <= MAX_SHARE * windows and few_events)
 
 
-def _window_sizes(
-    simulation: Simulation, measured: Measured, states: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def _window_sizes(simulation: Simulation, measured: Measured) -> tuple[np.ndarray, np.ndarray]:
     """First rows, (W), of all windows, and the residuals at their ends, (W).
 
     The size of a residual is that of its largest dimension, in robust standard deviations.
@@ -137,7 +133,7 @@ def _window_sizes(
     starts = measured.windows(WINDOW_STEPS)
     if not len(starts):
         return starts, np.zeros(0)
-    residual = residuals(simulation, measured, starts, WINDOW_STEPS, states=states)[:, -1]
+    residual = residuals(simulation, measured, starts, WINDOW_STEPS)[:, -1]
     usual = np.nanmedian(np.abs(residual), axis=0) / 0.6745
     usual = np.maximum(usual, ROUNDING * measured.observation.std(0) + 1e-12)
     size = (np.abs(residual) / usual).max(1)

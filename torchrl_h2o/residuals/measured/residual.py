@@ -16,7 +16,6 @@ def residuals(
     horizon: int = 1,
     *,
     states: np.ndarray | None = None,
-    applied: np.ndarray | None = None,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
     """Computes residuals over windows, each simulated from its own start state.
@@ -27,7 +26,6 @@ def residuals(
         starts: (W), first row of each window.
         horizon: control steps per window.
         states: (T, nq + nv), start states; the measured ones by default.
-        applied: (W, H, nv), generalised forces in N or N·m in addition to those of the effects.
         rng: generator for random action effects; without it they are left out.
 
     Returns:
@@ -42,7 +40,6 @@ def residuals(
         actions[rows],
         time=measured.time[starts],
         activations=activations(simulation, measured, actions)[starts],
-        applied=applied,
     )
     return undelayed_following(simulation, measured)[rows] - simulation.observed(reached)
 

@@ -1,19 +1,15 @@
-"""Fits the parameters of effects to residuals: bounded robust least squares with ``mujoco.sysid``."""
+"""Fits the parameters of effects to residuals: bounded robust least squares."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import cpu_count
-from typing import Any
 
 import numpy as np
-from mujoco import sysid
+from scipy.optimize import OptimizeResult, least_squares
 
 from torchrl_h2o.effects import Effect, Parameter
 from torchrl_h2o.residuals.settings import DEFAULTS
@@ -93,19 +89,29 @@ def fit(
     allowed = [_allowed(problem, effects, index) for index in range(len(effects))]
     variables = [_Variable(index, name, allowed[index][name]) for index in range(len(effects)) for name in free[index]]
 
-    def residual(z: np.ndarray, _: sysid.ParameterDict) -> tuple:
+    def residual(z: np.ndarray) -> np.ndarray:
         try:
-            scaled = problem.residual(_with_values(effects, variables, z), starts).ravel()
+            return problem.residual(_with_values(effects, variables, z), starts).ravel()
         except ValueError:  # the model rejects these values, for example negative damping
-            scaled = np.full(len(starts) * problem.horizon * problem.scale.shape[-1], WORST)
-        return [scaled], None, None
+            return np.full(len(starts) * problem.horizon * problem.scale.shape[-1], WORST)
 
     # rollouts that follow unobserved coordinates step by step are too small for MuJoCo's own threads
     in_threads = bool(problem.simulation.state_map.hidden)
-    best, result = _optimised(residual, variables, max_evaluations, difference_step, in_threads=in_threads)
-    fitted = _with_values(effects, variables, best)
+    with ThreadPoolExecutor(cpu_count()) as threads:  # starts threads when they are used
+        result = least_squares(
+            residual,
+            np.full(len(variables), ORIGIN),
+            bounds=np.transpose([variable.bounds for variable in variables]),
+            loss="soft_l1",
+            diff_step=difference_step,
+            ftol=LOSS_TOLERANCE,
+            xtol=VARIABLE_TOLERANCE,
+            max_nfev=max_evaluations,
+            workers=threads.map if in_threads else None,
+        )
+    fitted = _with_values(effects, variables, result.x)
     widths = [{} for _ in effects]
-    for variable, position, half in zip(variables, best, _half_widths(problem, result), strict=True):
+    for variable, position, half in zip(variables, result.x, _half_widths(problem, result), strict=True):
         widths[variable.effect][variable.name] = half * variable.slope(position)
     at_best = problem.residual(fitted, starts)
     return Fit(tuple(fitted), tuple(free), float(losses(at_best).mean()), tuple(widths))
@@ -132,48 +138,7 @@ def _with_values(effects: Sequence[Effect], variables: Sequence[_Variable], z: n
     return [effect.with_parameters(new) if new else effect for effect, new in zip(effects, values, strict=True)]
 
 
-def _optimised(
-    residual: Callable[[np.ndarray, sysid.ParameterDict], tuple],
-    variables: Sequence[_Variable],
-    max_evaluations: int,
-    difference_step: float,
-    *,
-    in_threads: bool,
-) -> tuple[np.ndarray, Any]:
-    """Scaled variables at the least robust loss, and scipy's result; finite differences run in threads if wanted."""
-    unknown = sysid.ParameterDict(
-        {str(i): sysid.Parameter(str(i), ORIGIN, *variable.bounds) for i, variable in enumerate(variables)}
-    )
-    with _quiet(), ThreadPoolExecutor(cpu_count()) as threads:  # starts threads when they are used
-        best, result = sysid.optimize(
-            unknown,
-            residual,
-            "scipy",
-            verbose=False,
-            max_iters=max_evaluations,
-            loss="soft_l1",
-            diff_step=difference_step,
-            ftol=LOSS_TOLERANCE,
-            xtol=VARIABLE_TOLERANCE,
-            workers=threads.map if in_threads else None,
-        )
-    return best.as_vector(), result
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silences ``mujoco.sysid``: it prints iterations even with ``verbose=False`` and warns of starts at a bound."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            yield
-    finally:
-        logger.setLevel(level)
-
-
-def _half_widths(problem: Problem, result) -> np.ndarray:
+def _half_widths(problem: Problem, result: OptimizeResult) -> np.ndarray:
     """Half-widths of the variables' 95 % intervals, by a sandwich estimate with each window as one observation."""
     jacobian, residual = result.jac, result.fun
     size = problem.horizon * problem.scale.shape[-1]

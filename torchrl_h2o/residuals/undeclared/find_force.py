@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
@@ -57,7 +57,6 @@ def find_undeclared(
     measured: Measured,
     horizon: int = 1,
     *,
-    progress: Callable[[str], object] | None = None,
     settings: LoopSettings = DEFAULTS,
 ) -> Undeclared | None:
     """Finds a force that explains the residual of a simulation with all effects found so far.
@@ -72,7 +71,6 @@ def find_undeclared(
         measured: the data.
         horizon: control steps per window on which the force is fitted and judged. With noisy sensors, a weak force
             shows only in long windows.
-        progress: called after each round with a description of the force found so far.
         settings: thresholds and budgets.
 
     Returns:
@@ -82,7 +80,7 @@ def find_undeclared(
     if _nothing_to_explain(problem, measured.fitted()):
         return None
     regression = _Regression.of(problem, horizon, settings)
-    found = _grown(regression, progress or (lambda words: None))
+    found = _grown(regression)
     if found is None:
         return None
     objective, judged = regression.objective, measured.selected_on(horizon)
@@ -145,7 +143,7 @@ def _nothing_to_explain(problem: Problem, starts: np.ndarray) -> bool:
     return bool((problem.scale_of(starts).mean((0, 1)) < NEGLIGIBLE * spread).all())
 
 
-def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | None:
+def _grown(regression: _Regression) -> Fit | None:
     """Adds terms while they lower the loss enough.
 
     After each addition, all terms are fitted again. Redundant ones are removed, nearly straight waves become lines.
@@ -164,7 +162,6 @@ def _grown(regression: _Regression, progress: Callable[[str], object]) -> Fit | 
         pays = left - candidate.loss > MIN_TERM_GAIN * regression.before
         if pays and _p_value_further(regression, (effect,), candidate.effects, held_out=False) < level:
             best, left = candidate, candidate.loss
-            progress(best.effects[0].describe())
         else:
             barred.add(added.terms[0].joint)
     return best

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from pysindy.optimizers import FROLS
 from scipy.stats import f
 
 from torchrl_h2o.effects.force.term import ForceTerm
 from torchrl_h2o.residuals.undeclared.terms import NEGLIGIBLE, Factors, TermLibrary
 
+DEPENDENT = 1e-12  # square of a unit column's part beside the chosen ones up to which it depends on them
 MAX_TERMS = 3  # largest number of terms on one degree of freedom per round
 BLOCKS = 10  # blocks of neighbouring rows that are held back together
 FOLDS = 5  # folds of the cross-validation
@@ -34,7 +35,8 @@ class SparseForce:
 def sparse_force(library: TermLibrary, force: np.ndarray, weight: np.ndarray) -> SparseForce:
     """Selects the terms of a library that explain a force.
 
-    Terms are added by forward regression with orthogonal least squares (FROLS). A term is kept if it lowers the error
+    Terms are added by forward regression with orthogonal least squares (Billings, 2013, Nonlinear System
+    Identification, chapter 3). A term is kept if it lowers the error
     on blocks of rows held back, by a minimum share and significantly: an F-test whose level is divided by the number of
     terms in the library.
 
@@ -69,14 +71,27 @@ def _chosen(design: np.ndarray, target: np.ndarray) -> tuple[list[int], float]:
     chance = f.isf(TERM_LEVEL / choices, 1, rows)
     before = left = float(target @ target)
     chosen = []
-    regression = FROLS(max_iter=MAX_TERMS, alpha=1e-9, unbias=False).fit(design, target[:, None])
-    for coefficients in regression.history_[1:]:
-        support = np.flatnonzero(coefficients).tolist()
+    for support in _growing_supports(design, target):
         loss = _held_back_loss(design[:, support], target)
         if left - loss < max(MIN_GAIN * before, chance * loss / rows):
             break
         chosen, left = support, loss
     return chosen, before - left
+
+
+def _growing_supports(design: np.ndarray, target: np.ndarray) -> Iterator[list[int]]:
+    """Sorted indices of one, two, ... ``MAX_TERMS`` columns; each new one explains most beside those before it."""
+    left, support = design.copy(), []
+    for _ in range(min(MAX_TERMS, design.shape[1])):
+        square = (left**2).sum(0)
+        possible = square > DEPENDENT
+        possible[support] = False
+        if not possible.any():
+            return
+        explained = np.where(possible, (left.T @ target) ** 2 / np.where(possible, square, 1.0), -1.0)
+        support = sorted([*support, best := int(explained.argmax())])
+        left = left - np.outer(left[:, best], left[:, best] @ left / square[best])
+        yield support
 
 
 def _held_back_loss(design: np.ndarray, target: np.ndarray) -> float:
