@@ -35,7 +35,7 @@ from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION, JOINTS = double_pendulum(), ("shoulder", "elbow")
 FRICTION = (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"), JointDamping(0.1, "shoulder"))
-MEASURED = recorded(SIMULATION.with_effects(*FRICTION), 3000, noise=0.002)
+MEASURED = recorded(SIMULATION.with_effects(*FRICTION), 2000, noise=0.002)
 KINDS = (Armature, JointDamping, JointFrictionLoss, Gravity)
 CATALOGUE = tuple(entry for entry in SIMULATION.catalogue() if isinstance(entry.effect, KINDS))
 
@@ -58,24 +58,15 @@ def test_friction_of_each_joint_is_proposed():
 
 def test_friction_is_proposed_as_it_acts_in_the_simulator():
     """There it is softer where torques jump, so a regression that takes it for dry finds 0.11 N·m."""
-    measured = recorded(SIMULATION.with_effects(JointFrictionLoss(0.15, "elbow")), 3000, noise=0.001, smooth=0.0)
+    measured = recorded(SIMULATION.with_effects(JointFrictionLoss(0.15, "elbow")), 2000, noise=0.001, smooth=0.0)
     (friction,) = propose_effects(SIMULATION, measured, CATALOGUE).effects
     assert isinstance(friction, JointFrictionLoss)
     assert friction.torque == pytest.approx(0.15, rel=0.05)
 
 
-def test_no_effect_is_proposed_that_its_own_interval_does_not_tell_from_none():
-    noisy = with_noisy_torques(MEASURED, 0.3)
-    found = propose_effects(SIMULATION, noisy, CATALOGUE)
-    assert found.effects
-    for effect, widths in zip(found.effects, found.half_widths, strict=True):
-        for name, width in widths.items():
-            assert abs(getattr(effect, name) - effect.parameters[name].neutral) > width
-
-
 def test_a_payload_is_proposed_with_its_mass():
     damped = SIMULATION.with_effects(JointDamping(1.0))
-    measured = recorded(damped.with_effects(Payload(0.2, z=-0.15, bodies="lower")), 3000, noise=0.002)
+    measured = recorded(damped.with_effects(Payload(0.2, z=-0.15, bodies="lower")), 2000, noise=0.002)
     trials = ({"mass": 0.05, "x": 0.0, "z": -0.15},)
     (payload,) = propose_effects(damped, measured, [CatalogueEntry(Payload(bodies="lower"), trials)]).effects
     assert (payload.mass, payload.z) == pytest.approx((0.2, -0.15), rel=0.05)
@@ -110,9 +101,10 @@ def test_a_search_that_has_found_only_heavy_rotors_begins_anew_and_finds_the_fri
     assert model.dof_damping == pytest.approx([1.0, 1.0], rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_search_begins_again_with_the_effects_that_the_forces_need_together():
     truth = (*FRICTION, BodyMass(1.4, "lower"))
-    measured = recorded(SIMULATION.with_effects(*truth), 3000, noise=0.002)
+    measured = recorded(SIMULATION.with_effects(*truth), 2000, noise=0.002)
     catalogue = [entry for entry in SIMULATION.catalogue() if isinstance(entry.effect, (*KINDS, BodyMass))]
     for found in [(), (BodyMass(1.7, "lower"), JointFrictionLoss(0.1, "*"))]:
         other = begun_anew(measured, found, begin_with_forces, catalogue)
@@ -134,6 +126,7 @@ def test_a_search_that_explains_the_motion_goes_on():
     assert begun_anew(MEASURED, ()) is None
 
 
+@pytest.mark.slow
 def test_a_search_for_effects_begins_anew_after_its_first_growth():
     """One effect is allowed, and the rotors from which the search begins are one."""
     truth, rotors = (JointFrictionLoss(0.1, "shoulder"), JointDamping(1.0, "*")), Armature(30.0, "*")
@@ -150,23 +143,23 @@ def test_a_search_for_effects_begins_anew_after_its_first_growth():
 def test_friction_that_the_model_has_can_be_reduced_and_a_rotor_that_it_lacks_cannot():
     """Without these bounds, the missing gravity and the light link would make the rotor's inertia negative."""
     rough, smooth = (SIMULATION.with_effects(JointDamping(damping, "*")) for damping in (0.8, 0.5))
-    found = propose_effects(rough, recorded(smooth, 3000, noise=0.002), CATALOGUE)
+    found = propose_effects(rough, recorded(smooth, 2000, noise=0.002), CATALOGUE)
     model = rough.with_effects(*found.effects).model
     assert model.dof_damping == pytest.approx([0.5, 0.5], rel=0.02)
     assert (model.dof_armature < 0.05 * model.dof_M0).all()
     light = (JointDamping(0.3, "*"), BodyMass(0.6, "lower"), Gravity(1.3))
-    found = propose_effects(SIMULATION, recorded(SIMULATION.with_effects(*light), 3000, noise=0.002), CATALOGUE)
+    found = propose_effects(SIMULATION, recorded(SIMULATION.with_effects(*light), 2000, noise=0.002), CATALOGUE)
     assert found.entries
     assert is_possible(Problem.pose(SIMULATION, MEASURED), found.effects)
 
 
 def test_nothing_is_proposed_for_an_equal_simulator():
     (elbow,) = (entry for entry in SIMULATION.catalogue() if entry.effect == JointForce(0.0, "elbow"))
-    assert propose_effects(SIMULATION, recorded(SIMULATION, 3000, noise=0.002), [elbow]).entries == ()
+    assert propose_effects(SIMULATION, recorded(SIMULATION, 2000, noise=0.002), [elbow]).entries == ()
 
 
 def test_windows_do_not_cross_runs_nor_reach_unknown_states():
-    runs = replace(MEASURED, run=np.arange(3000) // 30)
+    runs = replace(MEASURED, run=np.arange(2000) // 30)
     motion = measured_motion(SIMULATION, runs, Split.FIT)
     assert motion is not None
     run = np.rint(motion.time / SIMULATION.control_step).astype(int) // 30
@@ -176,7 +169,7 @@ def test_windows_do_not_cross_runs_nor_reach_unknown_states():
 
 
 def test_nothing_is_proposed_if_a_coordinate_is_not_observed_or_actuators_have_a_state():
-    slow = recorded(SIMULATION.with_effects(JointDamping(1.0, "*")), 3000, noise=0.002)
+    slow = recorded(SIMULATION.with_effects(JointDamping(1.0, "*")), 2000, noise=0.002)
     assert propose_effects(SIMULATION, slow, CATALOGUE).entries
     without_shoulder = StateMap.of_coordinates(("e", "v", "w"), ("rad", "rad/s", "rad/s"), (1, 2, 3), num_states=4)
     blind = replace(SIMULATION, state_map=without_shoulder)
@@ -216,6 +209,7 @@ def test_effects_that_contradict_noisy_torques_give_way_to_the_friction():
     assert all(0.0 < width < 0.1 for widths in other.fit.half_widths for width in widths.values())
 
 
+@pytest.mark.slow
 def test_friction_of_which_the_forces_need_far_less_at_one_joint_gives_way():
     """It lowers the missing forces of both joints, and predicts their motion."""
     noisy = with_noisy_torques(MEASURED, 0.02)
@@ -235,7 +229,7 @@ def test_effects_that_stand_the_test_are_kept():
 def test_effects_that_leave_only_the_error_of_means_over_windows_are_kept():
     """Without noise, small effects of the kinds that a regression knows would make up for that error."""
     truth = (Gravity(0.8), JointDamping(0.3, "*"))
-    measured = recorded(SIMULATION.with_effects(*truth), 3000)
+    measured = recorded(SIMULATION.with_effects(*truth), 2000)
     assert by_forces(measured, truth) is None
 
 
@@ -243,7 +237,7 @@ def test_friction_that_the_data_do_not_have_is_taken_away():
     """Less than none is impossible, so a step that shows how the force changes must lead back from there."""
     rough = SIMULATION.with_effects(JointFrictionLoss(0.05, "shoulder"))
     truth = (JointDamping(0.3, "shoulder"), JointFrictionLoss(0.15, "elbow"))
-    found = propose_effects(rough, recorded(SIMULATION.with_effects(*truth), 3000, noise=0.001), CATALOGUE)
+    found = propose_effects(rough, recorded(SIMULATION.with_effects(*truth), 2000, noise=0.001), CATALOGUE)
     mended = rough.with_effects(*found.effects).model
     assert mended.dof_frictionloss == pytest.approx([0.0, 0.15], abs=0.003)
     assert mended.dof_damping == pytest.approx([0.3, 0.0], abs=0.01)
@@ -251,7 +245,7 @@ def test_friction_that_the_data_do_not_have_is_taken_away():
 
 def test_nothing_replaces_a_wrong_effect_if_no_force_is_missing():
     """Noisy torques alone must not make an effect."""
-    assert by_forces(with_noisy_torques(recorded(SIMULATION, 3000, noise=0.002)), (Armature(0.5, "*"),)) is None
+    assert by_forces(with_noisy_torques(recorded(SIMULATION, 2000, noise=0.002)), (Armature(0.5, "*"),)) is None
 
 
 def test_intervals_cover_the_true_friction():
@@ -274,10 +268,10 @@ def test_what_the_model_has_too_much_is_taken_away_to_the_last_digit():
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.2)
 
 
-@pytest.mark.parametrize("other", [ActionDelay(0.02), ActionGain(0.7), Gravity(0.7)])
+@pytest.mark.parametrize("other", [ActionGain(0.7), pytest.param(ActionDelay(0.02), marks=pytest.mark.slow)])
 def test_effects_that_no_regression_proposes_stay_beside_the_friction(other):
     """Without the gain, masses × 1.4 would explain the forces as well."""
-    noisy = with_noisy_torques(recorded(SIMULATION.with_effects(*FRICTION, other), 3000, noise=0.002))
+    noisy = with_noisy_torques(recorded(SIMULATION.with_effects(*FRICTION, other), 2000, noise=0.002))
     found = by_forces(noisy, (Armature(0.5, "*"), other))
     assert found is not None
     assert found.fit.effects[0] == other
@@ -289,7 +283,7 @@ def test_friction_of_a_light_link_is_dry_beside_its_rotor():
     """The solver softens friction of 0.1 N·m on a link of 0.5 g to a viscous one; with its rotor it is dry."""
     simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(with_light_lower_link(0.0005)))
     true = (Armature(0.05, "elbow"), JointDamping(0.02, "elbow"), JointFrictionLoss(0.1, "elbow"))
-    measured = recorded(simulation.with_effects(*true), 3000, noise=0.001)
+    measured = recorded(simulation.with_effects(*true), 2000, noise=0.001)
     catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, KINDS)]
     proposed = {type(effect): effect for effect in propose_effects(simulation, measured, catalogue).effects}
     for effect in true:
@@ -305,11 +299,10 @@ def without_motor(joint: str):
     return simulation
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_does_not_make_a_link_light_that_no_actuator_moves(seed):
+def test_noise_does_not_make_a_link_light_that_no_actuator_moves():
     """Without a mass, no force is missing at the elbow, whatever the noise; earlier, × 0.01 was proposed."""
     simulation = without_motor("elbow")
-    measured = recorded(simulation.with_effects(JointDamping(0.3, "shoulder")), 3000, noise=0.02, seed=seed)
+    measured = recorded(simulation.with_effects(JointDamping(0.3, "shoulder")), 2000, noise=0.02)
     kinds = (BodyMass, JointDamping, JointFrictionLoss)
     catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, kinds)]
     (found,) = propose_effects(simulation, measured, catalogue).effects
@@ -319,16 +312,14 @@ def test_noise_does_not_make_a_link_light_that_no_actuator_moves(seed):
 @pytest.mark.parametrize(
     ("without", "moved", "body", "scale"),
     [
-        ("shoulder", "elbow", "upper", 0.5),
         ("shoulder", "elbow", "upper", 1.6),
-        ("elbow", "shoulder", "upper", 0.5),
         ("elbow", "shoulder", "lower", 1.6),
     ],
 )
 def test_masses_are_found_with_one_motor(without, moved, body, scale):
     """Of an acrobot, the upper link's mass shows at the shoulder alone, which no actuator moves."""
     simulation, damping = without_motor(without), JointDamping(0.1, moved)
-    measured = recorded(simulation.with_effects(BodyMass(scale, body), damping), 3000, noise=0.002)
+    measured = recorded(simulation.with_effects(BodyMass(scale, body), damping), 2000, noise=0.002)
     found = {type(effect): effect for effect in propose_effects(simulation, measured, simulation.catalogue()).effects}
     assert found.keys() == {BodyMass, JointDamping}
     assert (found[BodyMass].bodies, found[BodyMass].scale) == (body, pytest.approx(scale, rel=0.02))

@@ -30,9 +30,8 @@ def one_step_fit(noise: float, seed: int, rows: int = 1500):
     return problem, fit(problem, (JointDamping(0.1), JointFrictionLoss(0.1)), (("damping",), ("torque",)), starts)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_friction_and_damping_in_noisy_data_get_their_values(seed):
-    problem, short = one_step_fit(0.03, seed)
+def test_friction_and_damping_in_noisy_data_get_their_values():
+    problem, short = one_step_fit(0.03, 0)
     longer = fitted_in_longer_windows(problem, short)
     errors = [
         [abs(one.parameters[name].value / TRUE[name] - 1.0) for one, name in zip(found.effects, TRUE, strict=True)]

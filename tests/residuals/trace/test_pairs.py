@@ -8,7 +8,7 @@ from torchrl.envs import TransformedEnv
 
 from torchrl_h2o.effects import BodyMass, ObservationBias
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
-from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals import LoopSettings, Measured, Simulation
 from torchrl_h2o.residuals.trace.add import additions
 from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.problem import Problem
@@ -20,47 +20,24 @@ TRUE = frozenset({"BodyMass torso", "ObservationBias 0"})
 OTHERS = {"Armature axle", "BodyCentreOfMass wheels", "BodyMass wheels", "JointForce axle", "GeomSize *wheel*"}
 
 
-@pytest.fixture(scope="module")
-def singles():
-    """Single effects, fitted to data of a robot with a heavier torso and a tilted sensor."""
+@pytest.mark.slow
+def test_a_pair_is_found_whose_first_effect_was_passed_over():
+    """Alone, a heavier torso explains less than moved wheels do. With a tilted sensor it explains everything."""
     simulation = Simulation.from_env(WheelLeggedEnv())
     reality = TransformedEnv(WheelLeggedEnv(max_episode_steps=500), DynamicsGap(HEAVY, TILTED))
     measured = Measured.from_ted(record(reality, noisy_balance_controller(), 2000, seed=0), simulation)
     catalogue = [entry for entry in simulation.catalogue() if entry.name in TRUE | OTHERS]
     rng = np.random.default_rng(0)
     state = SearchState.begin(Problem.pose(simulation, measured), catalogue, rng)
-    return additions(state, screen(state.problem, (), catalogue, state.windows.screened), rng)
+    singles = additions(state, screen(state.problem, (), catalogue, state.windows.screened), rng)
+    to_beat = state.screened_loss(singles.near[0].fit.effects)
 
+    def found(limited=state.settings):
+        some = replace(singles, state=replace(singles.state, settings=limited))
+        return pairs_by_prediction(some, (), to_beat, np.random.default_rng(0)).near
 
-@pytest.fixture
-def to_beat(singles):
-    return singles.state.screened_loss(singles.near[0].fit.effects)
-
-
-def found(singles, seen, to_beat):
-    return pairs_by_prediction(singles, seen, to_beat, np.random.default_rng(0)).near
-
-
-def names(addition):
-    return frozenset(entry.name for entry in addition.entries)
-
-
-def test_a_pair_is_found_whose_first_effect_was_passed_over(singles, to_beat):
-    """Alone, a heavier torso explains less than moved wheels do. With a tilted sensor it explains everything."""
     assert "BodyMass torso" not in {one.entries[0].name for one in singles.near}
-    (best, *_) = found(singles, (), to_beat)
-    assert names(best) == TRUE
+    (best, *_) = found()
+    assert frozenset(entry.name for entry in best.entries) == TRUE
     assert best.loss < 0.1 * singles.near[0].loss
-
-
-def test_pairs_that_were_seen_are_left_out(singles, to_beat):
-    assert TRUE not in map(names, found(singles, {TRUE}, to_beat))
-
-
-def test_pairs_that_do_not_come_close_to_other_lists_are_left_out(singles, to_beat):
-    assert not found(singles, (), 0.0)
-
-
-def test_no_pair_is_tried_where_the_limit_leaves_room_for_one_effect(singles, to_beat):
-    limited = replace(singles.state.settings, max_effects=1)
-    assert not found(replace(singles, state=replace(singles.state, settings=limited)), (), to_beat)
+    assert not found(LoopSettings(max_effects=1))

@@ -33,7 +33,8 @@ def torques(effects):
     return [float(model.dof_frictionloss[model.joint(joint).dofadr[0]]) for joint in ("shoulder", "elbow")]
 
 
-@pytest.mark.parametrize("noise", [0.0, pytest.param(0.002, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.002])
 def test_joints_that_differ_have_a_value_each(noise):
     assert torques(friction(0.15, 0.03, noise)) == pytest.approx([0.15, 0.03], rel=0.1)
 

@@ -16,7 +16,7 @@ GRAVITY = CatalogueEntry(Gravity(), FACTORS)
 
 
 def traced(*truth, catalogue, noise=0.002):
-    measured = recorded(SIMULATION.with_effects(*truth), 2000, noise=noise)
+    measured = recorded(SIMULATION.with_effects(*truth), 1500, noise=noise)
     with LoopBar(disable=True) as progress:
         return trace_effects(SIMULATION, measured, catalogue, rng=np.random.default_rng(0), progress=progress)
 
@@ -31,15 +31,11 @@ def test_a_weak_motor_and_a_heavier_arm_with_more_damping_are_both_named():
     named = [kinds(trace.fit.effects), *(kinds(other.fit.effects) for other in trace.others)]
     assert {ActionGain} in named
     assert {BodyMass, JointDamping} in named
-
-
-@pytest.mark.slow
-def test_others_are_ordered_by_how_usual_they_are():
-    surprises = [other.surprise for other in traced(ActionGain(0.55), catalogue=[GAIN, MASS, DAMPING]).others]
-    assert surprises
+    surprises = [other.surprise for other in trace.others]
     assert surprises == sorted(surprises)
 
 
+@pytest.mark.slow
 def test_an_explanation_without_a_rival_stands_alone():
     trace = traced(Gravity(1.4), catalogue=[GRAVITY, DAMPING])
     assert trace.fit.effects[0].scale == pytest.approx(1.4, rel=0.02)

@@ -70,6 +70,7 @@ def test_the_effect_that_explains_most_comes_first():
     assert trace.exact
 
 
+@pytest.mark.slow
 def test_three_effects_are_found_and_no_fourth():
     trace = traced(Gravity(1.2), JointFrictionLoss(0.04), ActionGain(0.8))
     found = {type(effect): effect for effect in trace.fit.effects}
@@ -79,17 +80,12 @@ def test_three_effects_are_found_and_no_fourth():
     assert found[ActionGain].scale == pytest.approx(0.8, rel=0.01)
 
 
-def test_a_spring_that_looks_like_gravity_is_not_named():
-    trace = traced(Gravity(1.3), JointFrictionLoss(0.03), catalogue=[SPRING, *ALL])
-    assert set(names(trace.entries)) == {GRAVITY.name, FRICTION.name}
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_noise_alone_is_no_effect(seed):
-    trace = traced(noise=0.02, seed=seed)
+def test_noise_alone_is_no_effect():
+    trace = traced(noise=0.02)
     assert trace.entries == ()
     assert trace.fit.effects == ()
     assert not trace.exact
+    assert trace.attempts
 
 
 @pytest.mark.slow
@@ -102,7 +98,9 @@ def test_effects_are_found_under_noise():
 @pytest.mark.parametrize(
     "truth",
     [
-        (Gravity(0.7), JointDamping(0.1)),  # each alone increases the loss as long as the other one is missing
+        pytest.param(  # each alone increases the loss as long as the other one is missing
+            (Gravity(0.7), JointDamping(0.1)), marks=pytest.mark.slow
+        ),
         (BodyMass(1.3), JointFrictionLoss(0.05)),  # equals a weaker motor, less friction, and negative damping
         pytest.param(  # a spring of 0.74 hides most of gravity
             (Gravity(1.2), JointSpring(0.5, joints="elbow"), ActionGain(0.8)), marks=pytest.mark.slow
@@ -127,12 +125,6 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
     armature = next(e for e in (trace.fit.effects[0], other.effect) if isinstance(e, Armature))
     assert armature.inertia == pytest.approx(0.01, rel=0.01)
     assert traced(Gravity(1.3)).groups == ((),)
-
-
-def test_effects_that_the_last_round_has_changed_get_their_alternatives(monkeypatch):
-    monkeypatch.setattr("torchrl_h2o.residuals.trace.search.spare", lambda state: replace(state, groups=()))
-    trace = traced(Armature(0.01), catalogue=[GRAVITY, INERTIA, ARMATURE, GAIN])
-    assert [len(group) for group in trace.groups] == [1]
 
 
 def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_reality():
@@ -195,9 +187,3 @@ def test_the_bar_moves_with_the_search():
     with LoopBar(file=io.StringIO()) as progress:
         trace_effects(SIMULATION, measured, ALL, rng=np.random.default_rng(0), progress=progress)
         assert STAGES[EFFECTS] < progress.n < STAGES[EFFECTS] + STAGES[OTHERS]
-
-
-def test_where_nothing_was_found_what_was_tried_is_told_all_the_same():
-    trace = traced(noise=0.01)
-    assert trace.entries == ()
-    assert trace.attempts

@@ -17,11 +17,12 @@ def noise(seed, windows=300, memory=0.0):
     return gain
 
 
-@pytest.mark.parametrize("level", [0.01, 0.05, 0.2])
-def test_p_values_of_no_gain_are_as_small_as_they_say_and_no_oftener(level):
-    share = np.mean([p_value(noise(seed)) < level for seed in range(400)])
-    assert stats.binomtest(round(share * 400), 400, level, alternative="greater").pvalue > 0.01
-    assert share > 0.2 * level
+def test_p_values_of_no_gain_are_as_small_as_they_say_and_no_oftener():
+    values = np.array([p_value(noise(seed)) for seed in range(300)])
+    for level in (0.01, 0.05, 0.2):
+        share = (values < level).mean()
+        assert stats.binomtest(round(share * 300), 300, level, alternative="greater").pvalue > 0.01
+        assert share > 0.2 * level
 
 
 def test_what_is_small_and_everywhere_is_seen_beside_what_is_large_and_rare():
@@ -34,7 +35,7 @@ def test_what_is_small_and_everywhere_is_seen_beside_what_is_large_and_rare():
 
 
 def test_neighbours_that_depend_on_each_other_are_not_taken_for_evidence():
-    chance = np.mean([p_value(noise(seed, 600, memory=0.6)) < 0.05 for seed in range(300)])
+    chance = np.mean([p_value(noise(seed, 600, memory=0.6)) < 0.05 for seed in range(150)])
     assert chance < 0.09
 
 
@@ -52,7 +53,7 @@ def test_no_gain_at_all_proves_nothing_and_the_same_everywhere_everything():
     assert p_value(np.full(50, 0.5)) == 0.0
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), scale=st.floats(1e-6, 1e6), windows=st.integers(2, 400))
 def test_the_unit_of_the_loss_does_not_matter_and_a_gain_one_way_is_none_the_other(seed, scale, windows):
     gain = noise(seed, windows)
@@ -69,12 +70,12 @@ def robust(residual):
 def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_be(dimensions, change):
     """Residuals of very different sizes, changed by independent noise."""
     significant = 0
-    for seed in range(200):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         size = np.exp(2.0 * rng.standard_normal((300, 1)))
         residual, moved = (size * rng.standard_normal((300, dimensions)) for _ in range(2))
         significant += p_value_of_losses(robust(residual), robust(residual + change * moved)) < 0.02
-    assert stats.binomtest(significant, 200, 0.02, alternative="greater").pvalue > 0.01
+    assert stats.binomtest(significant, 100, 0.02, alternative="greater").pvalue > 0.01
 
 
 def concentrated(rng, dimensions):
@@ -91,15 +92,15 @@ def rare(rng, dimensions):
 
 @pytest.mark.parametrize("residuals", [concentrated, rare])
 @pytest.mark.parametrize("dimensions", [1, 3])
-@pytest.mark.parametrize("change", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("change", [0.1, 1.0])
 def test_rare_residuals_that_change_by_chance_are_no_evidence(residuals, dimensions, change):
     """Where residuals are large, the change that an effect makes is large too, but it points anywhere."""
     significant = 0
-    for seed in range(400):
+    for seed in range(150):
         draw = residuals(np.random.default_rng(seed), dimensions)
         residual, moved = draw(), draw()
         significant += p_value_of_losses(robust(residual), robust(residual + change * moved)) < 0.02
-    assert stats.binomtest(significant, 400, 0.02, alternative="greater").pvalue > 0.01
+    assert stats.binomtest(significant, 150, 0.02, alternative="greater").pvalue > 0.01
 
 
 def test_what_vanishes_now_and_then_is_seen():
