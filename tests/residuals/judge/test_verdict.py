@@ -18,10 +18,8 @@ from torchrl_h2o.effects import (
     ObservationDelay,
     ObservationGain,
 )
-from torchrl_h2o.residuals.judge.headline import headline_error, headline_horizon
-from torchrl_h2o.residuals.judge.held_out_error import overall_error
+from torchrl_h2o.residuals.judge.held_out_error import error_summary
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
-from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED,
     EXPLAINED_IN_PART,
@@ -30,32 +28,15 @@ from torchrl_h2o.residuals.report.contents import (
     TwoSample,
     Verdict,
 )
-from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary
 
 SIMULATION = pendulum()
-
-
-def errors(simulation, mended, measured):
-    """The figures that a verdict reads: no floor, and no errors at other times ahead than the sentence's."""
-    steps, nan = headline_horizon(simulation, measured), float("nan")
-    names, white = simulation.state_map.names, autocorrelation(mended, measured)
-    return ErrorSummary(
-        metric="",
-        unit="1",
-        before=overall_error(simulation, measured),
-        after=overall_error(mended, measured),
-        floor=nan,
-        per_dimension=tuple(DimensionError(n, "1", nan, nan, nan, float(w)) for n, w in zip(names, white, strict=True)),
-        horizons=(),
-        headline=headline_error(simulation, mended, measured, steps),
-    )
 
 
 def verdict(truth, found=(), noise=0.01, rows=3000):
     """The verdict where a classifier cannot tell measured from simulated transitions."""
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     mended = SIMULATION.with_effects(*found)
-    error = errors(SIMULATION, mended, measured)
+    error = error_summary(SIMULATION, mended, measured)
     return reach_verdict(SIMULATION, mended, measured, found, error, TwoSample(None, 0.5))
 
 
@@ -94,7 +75,7 @@ def test_half_an_explanation_is_called_that():
 def test_a_classifier_that_sees_a_difference_counts_unless_all_errors_nearly_vanish(left, kind):
     """The sentence's quantity alone may be right by chance, such as the pitch of a robot with a larger wheel."""
     found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
-    error = errors(SIMULATION, SIMULATION.with_effects(*found), measured)
+    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
     head = replace(error.headline, after=0.001 * error.headline.before)
     error = replace(error, headline=head, after=left * error.before)
     reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.94))
@@ -104,7 +85,7 @@ def test_a_classifier_that_sees_a_difference_counts_unless_all_errors_nearly_van
 def test_a_small_share_of_an_absurd_error_is_no_small_error():
     """A simulator without the rotor of a light link is wrong by turns; what is left may still exceed the motion."""
     found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
-    error = errors(SIMULATION, SIMULATION.with_effects(*found), measured)
+    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
     error = replace(error, headline=replace(error.headline, before=1e3), before=1e3 * error.before)
     reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.8))
     assert reached.kind == EXPLAINED_IN_PART
@@ -129,7 +110,7 @@ def test_effects_that_make_a_quantity_worse_are_said_to_be_wrong():
 def test_effects_that_raise_the_error_of_the_sentence_are_not_recommended(factor, recommended):
     """No other test sees a fault here: the effect is right."""
     found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
-    error = errors(SIMULATION, SIMULATION.with_effects(*found), measured)
+    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
     error = replace(error, headline=replace(error.headline, after=factor * error.headline.before))
     reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.9, 0.5))
     assert reached.recommended == recommended
@@ -178,7 +159,7 @@ def test_an_unknown_kind_is_refused():
 def test_action_noise_that_stands_in_for_another_cause_is_not_recommended():
     """Noise lowers no error, so it is judged by the classifier."""
     measured, found = recorded(SIMULATION.with_effects(JointFrictionLoss(0.1)), 3000, noise=0.01), (ActionNoise(0.2),)
-    error = errors(SIMULATION, SIMULATION, measured)
+    error = error_summary(SIMULATION, SIMULATION, measured)
     worse, better, neither_tells = (
         reach_verdict(SIMULATION, SIMULATION, measured, found, error, TwoSample(before, after))
         for before, after in ((0.7, 0.75), (0.9, 0.75), (0.55, 0.6))
@@ -216,7 +197,7 @@ def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques
 
     def of(*found):
         mended = simulation.with_effects(*found)
-        error = errors(simulation, mended, noisy)
+        error = error_summary(simulation, mended, noisy)
         return reach_verdict(simulation, mended, noisy, found, error, TwoSample(None, 0.8))
 
     assert of(*friction).recommended
@@ -229,7 +210,7 @@ def test_effects_whose_value_the_data_leave_open_are_not_recommended():
     effect = JointFrictionLoss(0.1)
     measured = recorded(SIMULATION.with_effects(effect), 1500)
     mended = SIMULATION.with_effects(effect)
-    error = errors(SIMULATION, mended, measured)
+    error = error_summary(SIMULATION, mended, measured)
     plain, left_open = (
         reach_verdict(SIMULATION, mended, measured, (effect,), error, TwoSample(0.9, 0.5), undetermined=reasons)
         for reasons in ((), ("'friction' is not determined by the data",))
