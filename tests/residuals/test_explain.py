@@ -70,7 +70,7 @@ def test_an_error_in_the_search_leaves_what_was_found_before():
 
 
 def test_what_was_found_when_the_time_was_up_is_the_explanation():
-    explanation = explained(Gravity(1.3), RIPPLE, rows=1000, bar=EndsBeforeAlternatives(OutOfTimeError(OTHERS)))
+    explanation = explained(Gravity(1.3), RIPPLE, noise=0.002, bar=EndsBeforeAlternatives(OutOfTimeError(OTHERS)))
     assert explanation.ended_in == OTHERS
     assert all(part.declared for part in explanation.parts)  # no force is looked for
     assert Gravity in {type(effect) for effect in explanation.effects}
