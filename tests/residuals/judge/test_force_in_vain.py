@@ -7,7 +7,7 @@ import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.effects import JointFrictionLoss, ResidualForce
-from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
+from torchrl_h2o.residuals.judge.needs_more_force import force_in_vain
 
 SIMULATION = double_pendulum()
 AGAINST_THE_TORQUE = ResidualForce(("torque on elbow: -0.3 · a1",))

@@ -5,7 +5,7 @@ import pytest
 
 from torchrl_h2o.effects import ActionNoise, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import Simulation, StateMap
-from torchrl_h2o.residuals.judge.friction_beside_noise import friction_beside_noise
+from torchrl_h2o.residuals.judge.caveats import friction_beside_noise
 
 ARM = """
 <mujoco>

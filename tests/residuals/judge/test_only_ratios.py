@@ -8,7 +8,7 @@ import pytest
 
 from tests.residuals.pendulum import DOUBLE, double_pendulum
 from torchrl_h2o.effects import ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals.judge.only_ratios import only_ratios
+from torchrl_h2o.residuals.judge.caveats import only_ratios
 
 SIMULATION = double_pendulum()
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionDelay, ActionLag, Gravity, ObservationDelay
-from torchrl_h2o.residuals.judge.short_delays import short_delays
+from torchrl_h2o.residuals.judge.caveats import short_delays
 
 STEP = 0.02
 FILTERED = ObservationDelay(0.01, (1,))

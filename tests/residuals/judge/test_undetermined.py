@@ -4,7 +4,7 @@ import pytest
 
 from torchrl_h2o.effects import ActionLag, Armature, BodyMass, JointFrictionLoss, Payload
 from torchrl_h2o.residuals.explanation import Part
-from torchrl_h2o.residuals.judge.undetermined import undetermined_values
+from torchrl_h2o.residuals.judge.caveats import undetermined_values
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, JointFric
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.trace.begin import begin_in_longer_windows, begin_noise_free, begin_with
+from torchrl_h2o.residuals.trace.choose_horizon import longer_windows
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import grow
-from torchrl_h2o.residuals.trace.longer_windows import longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.search import _from_another_beginning, _outcome
 from torchrl_h2o.residuals.trace.state import SearchState

@@ -9,8 +9,8 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, JointDamping, JointFrictionLoss, ObservationDelay
 from torchrl_h2o.residuals import trace_effects
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.trace.choose_horizon import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.fit import fit
-from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
 
 TRUE = {"damping": 0.05, "torque": 0.12}

@@ -8,8 +8,8 @@ import pytest
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointDamping, ObservationGain
 from torchrl_h2o.residuals.trace.fit import Fit
-from torchrl_h2o.residuals.trace.noise_free import without_noise
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.rescale import without_noise
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()

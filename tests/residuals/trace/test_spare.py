@@ -9,7 +9,7 @@ from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import ActionGain, BodyMass, CatalogueEntry, Gravity, JointDamping
 from torchrl_h2o.residuals.trace.outcome import Attempt
 from torchrl_h2o.residuals.trace.problem import Problem
-from torchrl_h2o.residuals.trace.spare import spare
+from torchrl_h2o.residuals.trace.simplify import spare
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SIMULATION = pendulum()  # damping 0.1 N·m·s/rad

@@ -13,13 +13,13 @@ import numpy as np
 from torchrl_h2o.effects import CatalogueEntry, Effect, is_negligible
 from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Explanation, adds_noise
+from torchrl_h2o.residuals.judge.caveats import undetermined_values
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error, with_floor, with_horizons
 from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.undetectable import undetectable_effects
-from torchrl_h2o.residuals.judge.undetermined import undetermined_values
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals

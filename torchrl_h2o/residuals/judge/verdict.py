@@ -8,14 +8,11 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect, JointRange, selection
+from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios, short_delays
 from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
-from torchrl_h2o.residuals.judge.force_in_vain import force_in_vain
-from torchrl_h2o.residuals.judge.friction_beside_noise import friction_beside_noise
 from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, made_worse
-from torchrl_h2o.residuals.judge.needs_more_force import needs_more_force
-from torchrl_h2o.residuals.judge.only_ratios import only_ratios
+from torchrl_h2o.residuals.judge.needs_more_force import force_in_vain, needs_more_force
 from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
-from torchrl_h2o.residuals.judge.short_delays import short_delays
 from torchrl_h2o.residuals.measured.constant_velocity import NEGLIGIBLE_ERROR, errors_ahead
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion

@@ -26,13 +26,12 @@ from torchrl_h2o.residuals.measured.missing_force import LESS_FORCE, MORE_FORCE,
 from torchrl_h2o.residuals.measured.transitions import Split
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import sketched_set
-from torchrl_h2o.residuals.trace.choose_horizon import possible_horizons
+from torchrl_h2o.residuals.trace.choose_horizon import longer_windows, possible_horizons
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.grow import comparable_losses
 from torchrl_h2o.residuals.trace.inverse_dynamics import PROPOSED, propose_effects
-from torchrl_h2o.residuals.trace.longer_windows import longer_windows
-from torchrl_h2o.residuals.trace.noise_free import NOISE_FREE_LOSS
 from torchrl_h2o.residuals.trace.problem import Problem
+from torchrl_h2o.residuals.trace.rescale import NOISE_FREE_LOSS
 from torchrl_h2o.residuals.trace.screening import is_possible, screen
 from torchrl_h2o.residuals.trace.state import SearchState
 

@@ -1,9 +1,12 @@
-"""Backward elimination: removes effects without which the held-out loss is not significantly higher."""
+"""Removes effects that are not needed, and swaps effects that do not commute."""
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
+from torchrl_h2o.effects import ActionEffect, ObservationEffect
 from torchrl_h2o.residuals.trace.close_comparison import SAME_LOSS
 from torchrl_h2o.residuals.trace.fit import Fit
 from torchrl_h2o.residuals.trace.problem import MIN_GAIN, matters
@@ -69,3 +72,20 @@ def _is_beyond_rounding(state: SearchState, smaller: Fit) -> bool:
     """Whether a smaller fit misses a share of the first loss that rounding does not explain."""
     without, with_it = (state.first.selection_loss(which.effects) for which in (smaller, state.fit))
     return matters(state.first_loss, without, with_it, SAME_LOSS)
+
+
+def reorder(state: SearchState) -> SearchState:
+    """Swaps pairs of action effects, and of observation effects, if that lowers the held-out loss significantly."""
+    lowest = state.selection_losses(state.fit.effects)
+    for kind in (ActionEffect, ObservationEffect):
+        places = [index for index, entry in enumerate(state.entries) if isinstance(entry.effect, kind)]
+        for one, other in combinations(places, 2):
+            order = list(range(len(state.entries)))
+            order[one], order[other] = other, one
+            swapped = tuple(state.entries[index] for index in order)
+            fitted = state.refitted(swapped, [state.fit.effects[index] for index in order])
+            after = state.selection_losses(fitted.effects)
+            significant = state.p_value(lowest, after) < state.settings.level
+            if after.mean() < lowest.mean() and significant:
+                state, lowest = state.with_found(swapped, fitted), after
+    return state

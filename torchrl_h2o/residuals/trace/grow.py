@@ -16,9 +16,8 @@ import numpy as np
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.trace.add import BEAM_LOSS, BEAM_WIDTH, SAME_FIT, Additions, additions, distinct
-from torchrl_h2o.residuals.trace.eliminate import eliminate
+from torchrl_h2o.residuals.trace.eliminate import eliminate, reorder
 from torchrl_h2o.residuals.trace.families import number_of_effects
-from torchrl_h2o.residuals.trace.order import reorder
 from torchrl_h2o.residuals.trace.pairs import pairs_by_prediction
 from torchrl_h2o.residuals.trace.per_joint import divided_where_shared_harms
 from torchrl_h2o.residuals.trace.problem import matters

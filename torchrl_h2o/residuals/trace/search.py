@@ -22,17 +22,15 @@ from torchrl_h2o.residuals.trace.begin import (
     in_longer_windows,
     replaced_by_forces,
 )
-from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon
+from torchrl_h2o.residuals.trace.choose_horizon import choose_horizon, fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.eliminate import eliminate
 from torchrl_h2o.residuals.trace.families import entries_of_elements
 from torchrl_h2o.residuals.trace.grow import grow, is_beaten_by
-from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.outcome import Trace
 from torchrl_h2o.residuals.trace.per_joint import divide_by_element
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.rival_sets import with_most_usual_set
-from torchrl_h2o.residuals.trace.simplify import simplify
-from torchrl_h2o.residuals.trace.spare import spare
+from torchrl_h2o.residuals.trace.simplify import simplify, spare
 from torchrl_h2o.residuals.trace.state import SearchState
 
 SET_FITTED = 0.04  # share by which the fit of another set of effects brings the bar closer to the end of its stage

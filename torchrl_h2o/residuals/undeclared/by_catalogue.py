@@ -22,8 +22,8 @@ from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.force.term import ForceTerm
 from torchrl_h2o.residuals.explanation import Part
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.trace.choose_horizon import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.fit import fit
-from torchrl_h2o.residuals.trace.longer_windows import fitted_in_longer_windows
 from torchrl_h2o.residuals.trace.problem import Problem
 from torchrl_h2o.residuals.trace.screening import is_possible
 from torchrl_h2o.residuals.trace.significance import p_value_of_losses
