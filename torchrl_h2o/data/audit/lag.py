@@ -38,9 +38,11 @@ def check_lag(response: Response, caused: float, lateness: float) -> tuple[list[
     lag = int(lags[best])
     gained = 1.0 - explained[best] <= LAG_LEAVES * (1.0 - explained[none])
     sharp = 0 if gained else _lag_of_events(response)
-    if sharp >= CLEAR_LAG and sharp in lags and explained[none + sharp] > UNRELATED and _agreed(response, sharp):
+    shown = sharp >= CLEAR_LAG and sharp in lags and explained[none + sharp] > UNRELATED
+    if shown and -1 not in _votes(response, sharp):  # the whole motion need not show what sudden changes do
         return _late(response, sharp, lateness), sharp, fits[none + sharp]
-    if not gained or lag == 0 or not _agreed(response, lag):
+    votes = _votes(response, lag) if gained and lag else {-1}
+    if -1 in votes or votes == {0}:  # one driven joint has to agree, and none may contradict
         return [], 0, fits[none]
     if lag in (lags[0], lags[-1]):
         sure = lag in LAGS and not response.drowned  # beside a border that repeated actions set, it is not
@@ -107,27 +109,24 @@ def _explained(
     return found, 1.0 - found.unexplained / max(without.unexplained, 1e-300)
 
 
-def _agreed(response: Response, lag: int) -> bool:
-    """Whether the joints that actuators drive directly agree with a lag: at least one does, and none contradicts.
+def _votes(response: Response, lag: int) -> set[int]:
+    """What the joints that actuators drive directly say of a lag: 1 if one agrees, -1 if one contradicts, 0 if neither.
 
-    How a directly driven joint answers its motor depends least on what the simulator lacks elsewhere. Where no such
-    joint is observed, nothing contradicts.
+    How a directly driven joint answers its motor depends least on what the simulator lacks elsewhere.
     """
-    friction, votes = friction_responses(response), []
+    friction, votes = friction_responses(response), set()
     for index, velocity in enumerate(response.log.velocities):
         if not velocity.actuators or not np.ptp(response.limited[:, velocity.actuators], axis=0).any():
             continue
         known = response.mean_action(lag)[1] & response.mean_action(0)[1]
         if known.sum() < MIN_WINDOWS:
             continue
-        left = [
+        at_zero, at_lag = (
             1.0 - _explained(response, response.mean_action(rows)[0], known, friction, slice(index, index + 1))[1]
             for rows in (0, lag)
-        ]
-        if left[0] < LAG_LEAVES * left[1]:
-            return False
-        votes.append(left[1] < LAG_LEAVES * left[0])
-    return any(votes) or not votes
+        )
+        votes.add(1 if at_lag < LAG_LEAVES * at_zero else -1 if at_zero < LAG_LEAVES * at_lag else 0)
+    return votes
 
 
 def _lag_of_events(response: Response) -> int:
