@@ -117,8 +117,7 @@ class MujocoBackend(ABC):
             self.check_sizes(model)
             model.vis.global_.offwidth = self.model.vis.global_.offwidth
             model.vis.global_.offheight = self.model.vis.global_.offheight
-            if gap not in applied or not _copy_values(model, into=self.model):
-                self.load(model)
+            self.load(model)
         if pipeline.of_kind(ForceEffect):
             self.push()
         self.owner._dynamics_gaps = wanted
@@ -177,26 +176,6 @@ class MujocoBackend(ABC):
 
 def _together(gaps: Mapping[object, Sequence[Effect]]) -> Pipeline:
     return Pipeline(tuple(effect for effects in gaps.values() for effect in effects))
-
-
-def _copy_values(new: mujoco.MjModel, into: mujoco.MjModel) -> bool:
-    """Copies the numbers of a model into one in use; False if this does not make the two equal.
-
-    It takes a tenth of the time in which dm_control replaces a model, so gaps can be drawn at every reset.
-    """
-    if not np.array_equal(into.qpos0, new.qpos0):  # a task's own initial positions may depend on it
-        return False
-    for target, source in ((into, new), (into.opt, new.opt), (into.stat, new.stat)):
-        for name in dir(target):
-            value = None if name.startswith("_") else getattr(source, name)
-            if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
-                present = getattr(target, name)
-                if present.shape != value.shape:
-                    return False
-                present[...] = value
-            elif target is not into and isinstance(value, int | float):
-                setattr(target, name, value)
-    return saved_model(into) == saved_model(new)
 
 
 def base_env(env: EnvBase) -> EnvBase:
