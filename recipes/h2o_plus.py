@@ -35,7 +35,6 @@ from torchrl_h2o.training.judging import judge, run_settings, table_of_run, writ
 from torchrl_h2o.training.mending import find_missing_effects
 from torchrl_h2o.training.methods.h2o_plus import make_value_loss
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
-from torchrl_h2o.training.precision import at_precision
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
@@ -109,8 +108,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     bellman_loss = MixedBellmanLoss(actor, qvalues, value_loss.value_network, mixing=cfg.mixing)
     loss = H2OPlusLoss(bellman_loss, value_loss, ratio_loss, weighted=cfg.ratio, target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
-    loss_fn = at_precision(loss, cfg.precision)
-    loss_fn = maybe_compiled(loss_fn, cfg.compiled, cfg.updates, parameters=loss.parameters())
+    loss_fn = maybe_compiled(loss, cfg.compiled, cfg.updates, parameters=loss.parameters())
 
     # Optimiser, target networks, and the collector of simulated transitions
     budget = Budget(cfg.updates, cfg.updates_per_epoch, cfg.eval_every, cfg.checkpoint_every)

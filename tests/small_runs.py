@@ -2,12 +2,12 @@
 
 import csv
 import subprocess
-import zipfile
 from pathlib import Path
 
 import pytest
-from torchrl.checkpoint import CheckpointRotation
+import torch
 
+from torchrl_h2o.training.checkpoint import checkpoint_file, read_checkpoint
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.progress import Training
 
@@ -39,17 +39,17 @@ def run(options):
 
 
 def trained(directory, method="h2o+"):
-    """Reads the last checkpoint: the bytes of its components, by file name."""
-    latest = CheckpointRotation(directory / "checkpoints" / method, keep_last=1).latest()
-    contents = {}
-    with zipfile.ZipFile(latest) as archive:
-        for name in archive.namelist():
-            if name.endswith(".tdz"):  # an archive inside, whose members have dates
-                with zipfile.ZipFile(archive.open(name)) as state:
-                    contents |= {f"{name}/{inner}": state.read(inner) for inner in state.namelist()}
-            elif name.startswith("components"):
-                contents[name] = archive.read(name)
-    return contents
+    """Reads the components of a method's checkpoint: the bytes of tensors, and other values, by their places."""
+
+    def flat(place, value):
+        if isinstance(value, torch.Tensor):
+            return {place: (value.dtype, tuple(value.shape), value.numpy().tobytes())}
+        if isinstance(value, dict | list | tuple):
+            entries = value.items() if isinstance(value, dict) else enumerate(value)
+            return {key: leaf for name, one in entries for key, leaf in flat(f"{place}.{name}", one).items()}
+        return {place: value}
+
+    return flat("", read_checkpoint(checkpoint_file(directory, method))["components"])
 
 
 def rows(directory):
@@ -74,6 +74,5 @@ def assert_resumed_equals_whole(method, cfg, real, directory, monkeypatch):
         train(method, cfg, real, directory / "parts")
     monkeypatch.undo()
     train(method, cfg, real, directory / "parts")
-    (folder,) = [path.name for path in (directory / "whole" / "checkpoints").iterdir()]
-    assert trained(directory / "parts", folder) == trained(directory / "whole", folder)
+    assert trained(directory / "parts", method.title) == trained(directory / "whole", method.title)
     return policy, training

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import hydra
 import pandas as pd
 import pytest
-from torchrl.checkpoint import CheckpointRotation
 
 from tests.small_runs import ROBOT, ROOT, SMALL, trained
 from torchrl_h2o.comparison.launching import GridLauncher
@@ -20,6 +19,7 @@ from torchrl_h2o.comparison.results_file import (
 )
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.data.transition_checks import UnstableSimulatorError
+from torchrl_h2o.training.checkpoint import checkpoint_file
 from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.loop import train
@@ -155,7 +155,7 @@ def test_a_run_that_would_diverge_again_is_not_retried(grid_of, error):
 def checkpoint_of(folder, method):
     """Returns the folder of a method's run if it has a checkpoint, otherwise a false value."""
     found = list(folder.glob(f"outputs/paper/results/{method}__*"))
-    return found and CheckpointRotation(found[0] / "checkpoints" / method, keep_last=1).latest() and found[0]
+    return found and checkpoint_file(found[0], method).exists() and found[0]
 
 
 @pytest.mark.slow

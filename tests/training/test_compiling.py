@@ -7,12 +7,12 @@ import torch
 from omegaconf import OmegaConf
 from torch._inductor.utils import fresh_cache
 from torchrl.data import Bounded
+from torchrl_h2o.training.one_graph import OneGraph
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.training.compiling import PAYS_FROM, compiled, maybe_compiled
 from torchrl_h2o.training.methods import h2o, h2o_plus, weighted_td3
-from torchrl_h2o.training.one_graph import OneGraph
 
 
 def learner_of(cfg, real, make_learner=h2o_plus.make_learner):

@@ -7,11 +7,11 @@ import subprocess
 import pytest
 import torch
 from torch import nn
-from torchrl.checkpoint import CheckpointRotation
 
 from tests.small_runs import ROBOT, SMALL
 from torchrl_h2o.commands.one_line_errors import is_expected
 from torchrl_h2o.comparison import recorded_run
+from torchrl_h2o.training.checkpoint import checkpoint_file
 from torchrl_h2o.training.divergence import DivergenceError, are_finite, not_finite_losses
 from torchrl_h2o.training.progress import Budget, Training
 
@@ -69,7 +69,7 @@ def test_a_resumed_training_names_the_checkpoint_that_it_came_from(new_training)
 def test_a_training_that_diverges_before_its_first_checkpoint_says_so(new_training, tmp_path):
     with pytest.raises(DivergenceError, match=r"update 1 of 3,000 .*There is no checkpoint yet"):
         train(*new_training(), lambda number: {"loss_a": -INF})
-    assert CheckpointRotation(tmp_path / "checkpoints" / "h2o+", keep_last=1).latest() is None
+    assert not checkpoint_file(tmp_path, "H2O+").exists()
 
 
 def test_a_parameter_that_is_not_finite_stops_the_training_before_the_checkpoint_is_written(new_training):

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 
 from tests.small_runs import rows, trained
 from torchrl_h2o.objectives import make_actor
-from torchrl_h2o.training.checkpoint import load_checkpoint
+from torchrl_h2o.training.checkpoint import read_checkpoint
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.loop import train
@@ -112,8 +112,8 @@ def advance(folder, evaluator, done_before=None, stop_before=None):
     training = Training("H2O+", folder, Budget(6, 1, eval_every=3), actor=actor)
     saved = []
     for epoch, evaluating in training.epochs():
-        latest = training.rotation.latest()
-        saved.append(0 if latest is None else load_checkpoint(latest, training.checkpoint)["progress"]["epoch"])
+        there = training.checkpoint.exists()
+        saved.append(read_checkpoint(training.checkpoint)["progress"]["epoch"] if there else 0)
         if epoch == stop_before:
             break
         evaluator.is_done = epoch == done_before

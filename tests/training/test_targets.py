@@ -2,16 +2,11 @@
 
 import copy
 import json
-import os
 import subprocess
-import zipfile
 from types import SimpleNamespace
 
 import pytest
-import torch
 from omegaconf import OmegaConf
-from tensordict import TensorDict
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from tests.full_disk import full_disk
 from tests.residuals.report.made_up_reports import full_report
@@ -20,7 +15,6 @@ from torchrl_h2o.data import DataError
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.training import run_folder
-from torchrl_h2o.training.checkpoint import load_checkpoint
 from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.environments import task_of
 from torchrl_h2o.training.run_folder import resumable
@@ -196,52 +190,6 @@ def test_a_report_names_effects_only(tmp_path, effect):
     (tmp_path / "report.json").write_text(json.dumps(entries))
     with pytest.raises(DataError, match="there is no effect named"):
         Report.load(tmp_path)
-
-
-class Harmful:
-    def __init__(self, evidence):
-        self.evidence = str(evidence)
-
-    def __reduce__(self):
-        return os.mkdir, (self.evidence,)
-
-
-@pytest.mark.parametrize("kind", ["memory map", "torch"])
-def test_a_checkpoint_with_a_pickle_is_refused(tmp_path, kind):
-    evidence, network = tmp_path / "evidence", torch.nn.Linear(1, 1)
-    rotation = CheckpointRotation(tmp_path / "own", keep_last=1)
-    path = rotation.save(Checkpoint(format="archive", actor=network), step=1, metadata={"seconds": 3})
-    assert load_checkpoint(path, Checkpoint(actor=network)) == {"seconds": 3}
-    with zipfile.ZipFile(path) as archive:
-        archive.extractall(tmp_path / "unpacked")
-    (component,) = (tmp_path / "unpacked" / "components").iterdir()
-    if kind == "memory map":
-        state = TensorDict({"tensor_00000000": torch.zeros(1, 1), "tensor_00000001": torch.zeros(1)}, [])
-        state.set_non_tensor("more", Harmful(evidence))
-        state.memmap(component / "state")
-    else:
-        torch.save(Harmful(evidence), component / "state.pt")
-    manifest = json.loads((tmp_path / "unpacked" / "manifest.json").read_text())
-    files = [file for file in (tmp_path / "unpacked").rglob("*") if file.is_file()]
-    manifest["components"]["actor"]["files"] = [
-        str(file.relative_to(component)) for file in files if file.is_relative_to(component)
-    ]
-    (tmp_path / "unpacked" / "manifest.json").write_text(json.dumps(manifest))
-    with zipfile.ZipFile(path, "w") as archive:
-        for file in files:
-            archive.write(file, file.relative_to(tmp_path / "unpacked"))
-    with pytest.raises(DataError, match="could run code"):
-        load_checkpoint(path, Checkpoint(actor=network))
-    assert not evidence.exists()
-    if kind == "memory map":  # the danger is real
-        Checkpoint(actor=network).load(path)
-        assert evidence.exists()
-
-
-def test_a_checkpoint_that_is_a_folder_is_refused(tmp_path):
-    path = Checkpoint(actor=torch.nn.Linear(1, 1)).save(tmp_path / "checkpoint-000000000001")
-    with pytest.raises(DataError, match="not the archive of a checkpoint"):
-        load_checkpoint(path, Checkpoint(actor=torch.nn.Linear(1, 1)))
 
 
 def test_a_full_disk_leaves_the_earlier_configuration(tmp_path):

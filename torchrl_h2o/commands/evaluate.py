@@ -14,7 +14,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from torchrl_h2o.commands.hydra_main import hydra_main
-from torchrl_h2o.options import EvaluateOptions, TrainOptions, check_options
+from torchrl_h2o.options import EvaluateOptions
 from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of, task_of
 from torchrl_h2o.training.film import film
@@ -31,8 +31,7 @@ def main(options: DictConfig) -> None:
     directory, world = Path(options.checkpoint), options["in"]
     folder = directory if os.access(directory, os.W_OK) else Path.cwd()
     cfg = load_config(directory, trust=options.trust)
-    check_options(cfg, TrainOptions, saved=True)
-    method = options.method or method_named(cfg.get("method", "h2o_plus")).title
+    method = options.method or method_named(cfg.method).title
     policy = load_policy(cfg, directory, method)
     result = evaluate(WORLDS[world](cfg, options.episodes), policy, options.episodes, options.seed)
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]

@@ -3,23 +3,20 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pandas as pd
 import torch
 from omegaconf import DictConfig
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_h2o.comparison.results_file import identity, recorded
 from torchrl_h2o.envs.wheel_legged.env import OBSERVATIONS
-from torchrl_h2o.training.checkpoint import load_checkpoint
+from torchrl_h2o.training.checkpoint import checkpoint_file, load_checkpoint
 from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.environments import make_reality, make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import SEED
-from torchrl_h2o.training.run_folder import checkpoint_folder
 from torchrl_h2o.training.trained_policy import load_policy
 
 SHOWN = {"standing_still": "x", "moving_forward": "v"}
@@ -68,9 +65,7 @@ def ways(cfg: DictConfig, folder: Path) -> np.ndarray:
 def simulated_states(cfg: DictConfig, folder: Path) -> np.ndarray:
     """Read pitch (rad) and pitch rate (rad/s) of the simulated transitions in the run's last checkpoint, ``[N, 2]``."""
     replay = make_replay(cfg, task_of(cfg).read_real_data(cfg.data, cfg.columns, cfg.data_seconds))
-    title = METHODS[cfg.method].title
-    latest = CheckpointRotation(checkpoint_folder(folder, title), keep_last=1).latest()
-    load_checkpoint(cast(Path, latest), Checkpoint(replay=replay))  # a run with a summary has one
+    load_checkpoint(checkpoint_file(folder, METHODS[cfg.method].title), {"replay": replay})
     return _in_units(cfg, replay.storage[:]["observation"], ("theta", "theta_dot")).numpy()
 
 

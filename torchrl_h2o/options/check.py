@@ -25,9 +25,8 @@ def check_options(cfg: DictConfig, model: type[Options], *, saved: bool = False)
     Args:
         cfg: the command's configuration; entries that are ``???`` count as not given.
         model: the options with their types and bounds.
-        saved: whether this is the configuration of an existing run. An earlier version may have written it, so missing
-            and unknown entries are accepted. Its files may have been moved since, and it may name a device that this
-            machine does not have.
+        saved: whether this is the configuration of an existing run. Another recipe with further options may have
+            written it, its files may have been moved since, and it may name a device that this machine does not have.
 
     Raises:
         ValueError: in one line, for each wrong option: its value, what is allowed, and the most similar name.
@@ -46,7 +45,7 @@ def check_options(cfg: DictConfig, model: type[Options], *, saved: bool = False)
     try:
         model.model_validate(values)
     except ValidationError as error:
-        accepted = frozenset({MISSING, UNKNOWN, NOT_THERE} if saved else ())
+        accepted = frozenset({UNKNOWN, NOT_THERE} if saved else ())
         errors = error.errors(include_url=False)
         problems = _problems(errors, accepted, model.model_json_schema(), cast("Mapping[str, Any]", values))
         if problems:

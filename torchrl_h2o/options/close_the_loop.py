@@ -1,4 +1,4 @@
-"""Options of close-the-loop, config/close_the_loop.yaml and simulator/*.yaml."""
+"""Options of close-the-loop, and simulator/*.yaml."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_h2o.effects import Effect
 from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.options.run import MakeOptions
 from torchrl_h2o.options.sources import AnyPath, Data, Layout
-from torchrl_h2o.options.types import Count, Gap, Inside, Options, Positive, Seed
+from torchrl_h2o.options.types import Count, Gap, Inside, Options, Positive, Seed, option
 
 EFFECTS = sorted(
     name for name, one in vars(torchrl_h2o.effects).items() if isinstance(one, type) and issubclass(one, Effect)
@@ -28,6 +28,11 @@ def _require_match(pattern: str) -> str:
 
 Pattern = Annotated[
     str, AfterValidator(_require_match), Field(description="a pattern of effects' names, such as Joint*")
+]
+
+HeldOut = Annotated[
+    Inside | str | list[str],
+    Field(description="a share of the rows above 0 and below 1, or the names of logs, such as [c.csv]"),
 ]
 
 
@@ -61,15 +66,31 @@ class CloseTheLoopOptions(Options):
     """Options of close-the-loop."""
 
     simulator: SimulatorOptions
-    data: Data
-    columns: Layout | None
-    transitions: Count | None
-    first_row: Annotated[int, Field(ge=0)]
-    held_out: Inside | str | list[str] = Field(
-        description="a share of the rows above 0 and below 1, or the names of logs, such as [c.csv]"
+    data: Data = option(
+        "recorded",
+        "recorded (needs simulator.recorded), a Minari name or folder, a D4RL file, a log, or a TED folder; several "
+        "logs as [a.csv,b.csv], logs/*.csv or a folder",
     )
-    audit: bool | Literal["warn"]
-    start_from: AnyPath | None
-    minutes: Positive | None
-    catalogue: Pattern | list[Pattern] | None
-    seed: Seed
+    columns: Layout | None = option(
+        None, "layout of a log: a YAML file, or the name of one in torchrl_h2o/data/readers/logs"
+    )
+    transitions: Count | None = option(
+        5_000, "consecutive rows to use from a longer recording, of each log; null for all"
+    )
+    first_row: Annotated[int, Field(ge=0)] = option(0, "index of the first row used, of each log")
+    held_out: HeldOut = option(
+        0.25, "fraction of the rows, from the end, on which errors are reported; or names: [c.csv]"
+    )
+    audit: bool | Literal["warn"] = option(
+        True, "looks for faults in the data first; severe ones stop the run, unless audit=warn; false skips it"
+    )
+    start_from: AnyPath | None = option(
+        None, "report.json of an unfinished run, or its folder: the search begins with its effects"
+    )
+    minutes: Positive | None = option(
+        None, "time for the search; its result is reported when it is up; null: as long as it takes"
+    )
+    catalogue: Pattern | list[Pattern] | None = option(
+        None, "effects to try, as patterns of class names: [Gravity,Joint*]; null for all"
+    )
+    seed: Seed = option(0)

@@ -1,4 +1,4 @@
-"""Options of h2o-evaluate, config/evaluate.yaml."""
+"""Options of h2o-evaluate."""
 
 from __future__ import annotations
 
@@ -7,17 +7,23 @@ from typing import Literal
 from pydantic import Field
 
 from torchrl_h2o.options.sources import RunFolder
-from torchrl_h2o.options.types import Count, Options, Positive, Seed, Trust
+from torchrl_h2o.options.types import Few, Options, Positive, Seed, Trust, option
 
 
 class EvaluateOptions(Options):
     """Options of h2o-evaluate."""
 
     checkpoint: RunFolder = Field(description="the folder of a run")
-    method: str | None
-    world: Literal["reality", "simulator"] = Field(alias="in")
-    episodes: Count
-    seed: Seed
-    film: str | None
-    seconds: Positive
-    trust: Trust
+    method: str | None = option(None, 'null: the run\'s main method; otherwise a baseline: "SAC in the simulator"')
+    world: Literal["reality", "simulator"] = Field("reality", alias="in")
+    episodes: Few = option(5)
+    seed: Seed = option(1_000_000, "the default gives the same episodes as the table of the run")
+    film: str | None = option(
+        "evaluation.mp4", "file in the run's folder; without a suffix, a folder of PNG frames; null for none"
+    )
+    seconds: Positive = option(10.0, "length of the film")
+    trust: Trust = option(
+        False,
+        "names in the folder's config.yaml that this library does not have, as in [my_package.MyEnv], "
+        "or true for all. That code is run, so first read what it does",
+    )

@@ -1,4 +1,13 @@
-"""Options of a run, recipes/config/experiment.yaml and env/*.yaml."""
+"""Options of a run: type, bounds, default value and meaning, one line each.
+
+The default values are those of the authors' published code, except for ``n_steps`` and ``layer_norm``, which
+``preset=paper`` sets to the authors' values too. An environment's file env/*.yaml can set different ones.
+
+Hydra stays for what it composes: environments, presets, sweeps and launchers. Its ConfigStore holds the default values
+of these models (see :mod:`torchrl_h2o.options.defaults`), so that an option is one line here and no second one in YAML.
+tyro and jsonargparse would add a second parser beside it, with messages that neither name the allowed values of a gap
+or a file nor suggest the nearest name.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +18,9 @@ from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_v
 
 from torchrl_h2o.options.sources import AnyPath, Data, Layout, RunFolder
 from torchrl_h2o.options.types import (
+    MOST,
     Count,
+    Few,
     Gap,
     Inside,
     NotNegative,
@@ -20,7 +31,7 @@ from torchrl_h2o.options.types import (
     Share,
     Trust,
     Widths,
-    has_bf16,
+    option,
 )
 
 POSTERIOR_WORLDS = 10  # smallest number of worlds with mend=posterior; each of them has one draw for the whole run
@@ -80,66 +91,110 @@ class ExperimentOptions(Options):
     """The options that all methods share, each by itself."""
 
     env: EnvOptions
-    seed: Seed
-    gap: Gap | None
-    gap_strength: float | None
-    gap_fix: AnyPath | None
-    mend: bool | Literal["posterior"] | None
-    mended: dict[str, Any] | None
-    data: Data
-    columns: Layout | None
-    data_seconds: Positive | None
+    seed: Seed = option(0)
+    gap: Gap | None = option(None, "dynamics gap of the paper for the simulator")
+    gap_strength: float | None = option(None, "strength of the gap; null for the paper's")
+    gap_fix: AnyPath | None = option(
+        None, "report.json of close-the-loop, whose effects the simulator gets after all others"
+    )
+    mend: bool | Literal["posterior"] | None = option(
+        None,
+        "true: adds the effects that the run's own data show and the simulator lacks, found before training; "
+        "posterior: the same, and each world has values drawn from the report's intervals and alternatives",
+    )
+    mended: dict[str, Any] | None = option(None, "these effects; written by the run")
+    data: Data = option(
+        "recorded", "recorded, a Minari name or folder, a D4RL file, a robot's log, or a folder of TED; several: [a,b]"
+    )
+    columns: Layout | None = option(
+        None, "YAML file that describes a log's columns, or the name of one that ships with the library"
+    )
+    data_seconds: Positive | None = option(None, "only the first seconds of the real data, s; null uses all")
 
-    backbone: Literal["expectile", "sparse", "exponential"]
-    expectile: Inside
-    value_alpha: Positive
-    mixing: Share
-    ratio: bool
-    ratio_estimator: Literal["paper", "change", "pairs"]
-    input_noise: NotNegative
-    change_noise: Literal["auto"] | NotNegative
-    ratio_weight_penalty: NotNegative
-    ratio_logit_bound: Positive | None
+    # H2O+
+    backbone: Literal["expectile", "sparse", "exponential"] = option(
+        "expectile", "in-sample value loss: expectile (IQL), sparse (SQL) or exponential (EQL, XQL)"
+    )
+    expectile: Inside = option(0.7, "tau of the expectile backbone, IQL's own; the authors' robot script has 0.9")
+    value_alpha: Positive = option(
+        1.0, "alpha of the sparse and the exponential backbone, in units of the scaled return"
+    )
+    mixing: Share = option(0.1, "lambda of Eq. (7)")
+    ratio: bool = option(True, "whether simulated rows are weighted by the dynamics ratio")
+    ratio_estimator: Literal["paper", "change", "pairs"] = option(
+        "paper", "paper; change: reads s' - s, noise on it alone; pairs: trained on simulated real (s, a)"
+    )
+    input_noise: NotNegative = option(0.1, "paper: standard deviation of the noise on the discriminators' inputs")
+    change_noise: Literal["auto"] | NotNegative = option(
+        "auto", "change, pairs: std of the noise on s' - s, in units of its spread in the real data; auto: 1, 0.05"
+    )
+    ratio_weight_penalty: NotNegative = option(2e-3, "pairs: L2 penalty of the discriminator's weights")
+    ratio_logit_bound: Positive | None = option(
+        4.0, "change, pairs: bound of each logit given (s, a, s'); the log-ratio lies within twice this"
+    )
 
-    updates: Count
-    steps_per_epoch: Count
-    num_worlds: Count
-    updates_per_epoch: Count
-    batch_size: Rows
-    discriminator_batch_size: Rows
-    sim_capacity: Positive
-    sim_capacity_min: Count
+    # Budget: steps_per_epoch simulator steps, then updates_per_epoch updates, repeated
+    updates: Count = option(1_000_000, "updates of the networks, rounded up to whole epochs")
+    steps_per_epoch: Count = option(1000, "simulator steps between two blocks of updates, of all worlds together")
+    num_worlds: Few = option(1, "simulator worlds that are stepped at once")
+    updates_per_epoch: Count = option(1000)
+    batch_size: Rows = option([128, 128], "real, simulated")
+    discriminator_batch_size: Rows = option([256, 256], "real, simulated")
+    sim_capacity: Positive = option(
+        10.0, "size of the simulated buffer, as a multiple of the number of real transitions"
+    )
+    sim_capacity_min: Count = option(100_000, "smallest size of the simulated buffer, for runs with little real data")
 
-    n_steps: Count
-    gamma: Share
-    num_cells: Widths
-    layer_norm: bool
-    num_qvalue_nets: Count
-    lr: Positive
-    lr_end_factor: Share
-    tau: Annotated[float, Field(gt=0, le=1)]
-    target_entropy: Literal["auto"] | float
-    compiled: Literal["auto"] | bool | None
-    precision: Literal["float32", "bf16"] = "float32"
-    threads: Count
+    # Targets of Q
+    n_steps: Count = option(5, "rewards that are summed before the bootstrap; 1 is Eq. (7) of the paper")
+    gamma: Share = option(0.99)
 
-    reward_offset: float
-    reward_scale: float
-    normalise_observation: bool
-    observation_norm: NormOptions | None
-    frames: Count
-    action_history: Annotated[int, Field(ge=0)] = 0
+    # Networks and optimiser
+    num_cells: Widths = option([256, 256], "hidden layers")
+    layer_norm: bool = option(True, "layer normalisation in Q")
+    num_qvalue_nets: Few = option(2, "ensemble of Q; targets use its minimum")
+    lr: Positive = option(3e-4)
+    lr_end_factor: Share = option(1.0, "final learning rate as a fraction of lr; it changes linearly")
+    tau: Annotated[float, Field(gt=0, le=1)] = option(
+        0.005, "weight of the online networks in an update of the targets"
+    )
+    target_entropy: Literal["auto"] | float = option("auto", "in nats; auto is -dim(A)")
+    compiled: Literal["auto"] | bool = option("auto", "torch.compile: true, false, or auto (from 10,000 updates on)")
+    threads: Count = option(2, "number of threads of torch")
 
-    eval_every: Count
-    eval_episodes: Count
-    overlap: bool = False
-    keep: Literal["last", "best_in_simulator"]
-    trial_episodes: Count = 10
-    final_episodes: Count
-    checkpoint_every: Count
-    render: bool
-    resume: RunFolder | None = None
-    trust: Trust = False
+    # Preprocessing
+    reward_offset: float = option(0.0, "the reward in the losses is reward_scale * (reward + reward_offset)")
+    reward_scale: float = option(1.0)
+    normalise_observation: bool = option(
+        False, "whether observations are standardised with the real data's mean and std"
+    )
+    observation_norm: NormOptions | None = option(
+        None, "this mean and std, as {loc: [...], scale: [...]}; null measures them"
+    )
+    frames: Few = option(1, "number of successive observations that are stacked")
+    action_history: Annotated[int, Field(ge=0, le=MOST)] = option(
+        0, "number of past actions shown beside the observations"
+    )
+
+    # Evaluation and files
+    eval_every: Count = option(10, "epochs")
+    eval_episodes: Few = option(5)
+    overlap: bool = option(
+        False, "whether a second process evaluates in reality during the next updates (same results)"
+    )
+    keep: Literal["last", "best_in_simulator"] = option(
+        "last", "policy that the run returns; best_in_simulator, meant for mend=true, compares those at all evaluations"
+    )
+    trial_episodes: Few = option(10, "best_in_simulator: episodes of each policy in the simulator")
+    final_episodes: Few = option(5)
+    checkpoint_every: Count = option(1, "epochs")
+    render: bool = option(True, "whether to film the policy, where MuJoCo can render")
+    resume: RunFolder | None = option("???", "folder of an interrupted run")
+    trust: Trust = option(
+        False,
+        "with resume: names in the folder's config.yaml that this library does not have, as in [my_package.MyEnv], or "
+        "true for all. That code is run: read it first",
+    )
 
 
 class RunOptions(ExperimentOptions):
@@ -150,7 +205,6 @@ class RunOptions(ExperimentOptions):
         self._check_gap()
         self._check_steps()
         self._check_mending()
-        self._check_precision()
         return self
 
     @property
@@ -183,12 +237,6 @@ class RunOptions(ExperimentOptions):
             raise ValueError(
                 f"n_steps={self.n_steps}: must be from 1 to {max(1, per_world - 1)}, less than the {per_world} steps "
                 f"of each world in an epoch (steps_per_epoch={self.steps_per_epoch} of num_worlds={self.streams})"
-            )
-
-    def _check_precision(self) -> None:
-        if self.precision == "bf16" and not has_bf16():
-            raise ValueError(
-                "precision=bf16: this processor has no bfloat16 instructions; choose float32, which is faster on it"
             )
 
     def _check_mending(self) -> None:

@@ -32,8 +32,11 @@ def require_path(name: str) -> str:
     Raises:
         PydanticCustomError: if it does not, with the most similar name in the same folder.
     """
-    if Path(name).expanduser().exists():
+    path = Path(name).expanduser()
+    if path.is_file() or path.is_dir():
         return name
+    if path.exists():  # reading it may never end
+        raise ValueError("it is a device or a pipe, not a file or folder")
     raise not_there(f"there is no such file or folder{did_you_mean(name, _beside(name))}")
 
 
@@ -72,7 +75,9 @@ def require_data(name: str) -> str:
         PydanticCustomError: if there is no such source.
     """
     path = os.path.expanduser(name)
-    if name == RECORDED or os.path.exists(path) or any(glob.iglob(path, recursive=True)):
+    if os.path.exists(path):
+        return require_path(name)
+    if name == RECORDED or any(glob.iglob(path, recursive=True)):
         return name
     if looks_like_a_path(name):
         raise not_there(f"there is no such file or folder{did_you_mean(name, [RECORDED, *_beside(name)])}")

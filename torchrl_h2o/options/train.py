@@ -1,4 +1,4 @@
-"""Options of train.py, recipes/config/any_method.yaml and collector/*.yaml."""
+"""Options of train.py in addition to those of a run, and collector/*.yaml."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from torchrl_h2o.options.run import ExperimentOptions, RunOptions
 from torchrl_h2o.options.types import (
-    Count,
     Device,
     DeviceName,
+    Few,
     Gap,
     Inside,
     NotNegative,
@@ -19,6 +19,7 @@ from torchrl_h2o.options.types import (
     Positive,
     Seed,
     Share,
+    option,
 )
 
 Method = Literal["sac", "cql", "iql", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
@@ -39,8 +40,8 @@ Mixings = Annotated[list[Share], Field(min_length=1, examples=[[0.1, 0.5]]), Aft
 class H2OOptions(Options):
     """``h2o``: the conservative term."""
 
-    alpha_c: NotNegative
-    num_samples: Count
+    alpha_c: NotNegative = option(0.01, "weight of the conservative term, Eq. (1)")
+    num_samples: Few = option(10, "next states per row, for the estimate of the KL divergence")
 
 
 class IQLOptions(Options):
@@ -48,8 +49,8 @@ class IQLOptions(Options):
 
     model_config = ConfigDict(extra="allow")
 
-    expectile: Inside
-    temperature: Positive
+    expectile: Inside = option(0.7)
+    temperature: Positive = option(3.0, "inverse temperature: advantages are multiplied by it")
 
 
 class CQLOptions(Options):
@@ -57,8 +58,8 @@ class CQLOptions(Options):
 
     model_config = ConfigDict(extra="allow")
 
-    min_q_weight: NotNegative
-    num_random: Count
+    min_q_weight: NotNegative = option(5.0)
+    num_random: Few = option(10)
 
 
 class CollectorOptions(Options):
@@ -66,33 +67,42 @@ class CollectorOptions(Options):
 
     model_config = ConfigDict(extra="allow")
 
-    backend: Literal["direct", "process", "ray"]
-    workers: Count = 1
+    backend: Literal["direct", "process", "ray"] = "direct"
+    workers: Few = 1
     resources: dict[str, Any] | None = None
     init: dict[str, Any] | None = None
 
 
 class AnyMethodOptions(ExperimentOptions):
-    """The options of any_method.yaml, each by itself."""
+    """The options of train.py, each by itself."""
 
-    collector: CollectorOptions
-    method: Method
-    baselines: list[Method]
-    seeds: Seeds | None
-    gaps: Gaps | None
-    mixings: Mixings | None
-    device: DeviceName = "cpu"
-    h2o: H2OOptions
-    iql: IQLOptions
-    cql: CQLOptions
-    results: str | None
-    overrides: list[str] | None
+    collector: CollectorOptions = CollectorOptions()
+    method: Method = option("h2o_plus")
+    baselines: list[Method] = option([], "further methods, trained on the same data for comparison, such as [sac]")
+    device: DeviceName = option(
+        "cpu", "cuda: networks and batches on a GPU, an update a CUDA graph unless compiled=false"
+    )
+
+    # Population (method=h2o_plus only): every combination of these lists is trained together in one process
+    seeds: Seeds | None = option(None, "null uses the option seed")
+    gaps: Gaps | None = option(None, "such as [gravity,friction], each with gap_strength; null uses the option gap")
+    mixings: Mixings | None = option(None, "null uses the option mixing")
+
+    # Options of single methods
+    h2o: H2OOptions = H2OOptions()
+    iql: IQLOptions = IQLOptions()
+    cql: CQLOptions = CQLOptions()
+
+    results: str | None = option(
+        None, "CSV file to which the run's results are appended; its curve goes to a second file"
+    )
+    overrides: list[str] | None = option(None, "overrides on the command line of this run; written by the recipe")
 
 
 class TrainOptions(AnyMethodOptions, RunOptions):
     """Options of train.py, with the relations between them."""
 
-    device: Device = "cpu"
+    device: Device = option("cpu", "cuda: networks and batches on a GPU, an update a CUDA graph unless compiled=false")
 
     @model_validator(mode="after")
     def _fit_the_method(self) -> TrainOptions:
@@ -114,17 +124,6 @@ class TrainOptions(AnyMethodOptions, RunOptions):
         if self.gaps is None:
             super()._check_gap()
 
-    def _check_precision(self) -> None:
-        others = {self.method, *self.baselines} - {"h2o_plus", "rlpd"}
-        if self.precision == "bf16" and (others or self.is_population):
-            raise ValueError(
-                "precision=bf16 is for single runs of h2o_plus and rlpd: leave it out with "
-                f"{', '.join(sorted(others)) or 'a population'}"
-            )
-        if self.precision == "bf16" and self.device != "cpu":
-            raise ValueError(f"precision=bf16 device={self.device}: bf16 is for the CPU; leave one of them out")
-        super()._check_precision()
-
     @property
     def is_population(self) -> bool:
         """Whether several runs are trained together in one process."""
@@ -135,6 +134,8 @@ class TrainOptions(AnyMethodOptions, RunOptions):
             return
         if self.overlap:
             raise ValueError("overlap=true is for single runs: leave it out with a population")
+        if self.compiled is True and self.device == "cpu":
+            raise ValueError("compiled=true is for single runs: stacked networks are slower with it, leave it out")
         if self.method != "h2o_plus" or self.baselines:
             raise ValueError(
                 f"method={self.method} baselines=[{','.join(self.baselines)}]: a population trains h2o_plus alone; "

@@ -18,6 +18,11 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
+def option(default: Any, text: str = "") -> Any:
+    """An option with its default value, and what it is, in words for ``--help``."""
+    return Field(default, json_schema_extra={"help": text})
+
+
 @dataclass(frozen=True)
 class OneOf:
     """Accepts the names of a table, such as the paper's gaps; a ``Literal`` whose values are known at run time.
@@ -32,9 +37,10 @@ class OneOf:
         return core_schema.literal_schema(list(self.names))
 
 
-BF16_INSTRUCTIONS = ("avx512_bf16", "amx_bf16", "bf16")  # of x86 and of ARM processors, as torch names them
+MOST = 10_000  # worlds, frames, episodes at once: beyond it is a slip, or a file made to take all memory
 
 Count = Annotated[int, Field(ge=1)]
+Few = Annotated[int, Field(ge=1, le=MOST)]
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]  # NumPy's and Gymnasium's generators accept no larger ones
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -46,7 +52,10 @@ Rows = Annotated[
     Field(min_length=2, max_length=2, description="two integers of at least 1, [real,simulated], such as [128,128]"),
 ]
 Trust = Annotated[bool | list[str], Field(description="true, false or names, such as [my_package.MyEnv]")]
-Widths = Annotated[list[Count], Field(min_length=1, description="the sizes of at least one layer, such as [256,256]")]
+Widths = Annotated[
+    list[Annotated[int, Field(ge=1, le=4096)]],
+    Field(min_length=1, max_length=20, description="the sizes, up to 4096, of 1 to 20 layers, such as [256,256]"),
+]
 
 
 NOT_THERE = "not_there"  # type of the error for what this machine does not have: a file, a folder, a device
@@ -77,12 +86,6 @@ def require_available(device: str) -> str:
     if problem := why_unavailable(device):
         raise not_there(problem)
     return device
-
-
-def has_bf16() -> bool:
-    """Whether the processor multiplies matrices in bfloat16."""
-    available = torch.cpu.get_capabilities()
-    return any(available.get(name) for name in BF16_INSTRUCTIONS)
 
 
 DeviceName = Annotated[str, Field(pattern=r"^(cpu|cuda)$", description="cpu or cuda")]

@@ -81,7 +81,7 @@ def collecting(
 
 
 def _chosen(cfg: DictConfig) -> DictConfig:
-    return cfg.get("collector") or DIRECT  # configurations of earlier versions have no such entry
+    return cfg.get("collector") or DIRECT  # not an option of h2o_plus.py
 
 
 def _of_worker(cfg: DictConfig) -> EnvCreator:

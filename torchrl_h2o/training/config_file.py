@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, cast
 
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from torchrl_h2o.data import DataError
+from torchrl_h2o.options import TrainOptions, check_options
 from torchrl_h2o.training.targets import require_known_targets
 from torchrl_h2o.whole_file import write_text
 
@@ -17,32 +19,7 @@ FILE = "config.yaml"
 LARGEST = 2**24  # bytes; a population's or a posterior's configuration has some ten thousand
 DEEPEST = 40  # levels of nested lists and mappings; a run's configuration has at most eight
 _EVENTS = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_LAYOUT = {"env": dict, "env.name": str, "env.make": dict, "env.simulator": list, "env.reality": list}
 _REMEDY = "give the folder of a run, with the config.yaml that the run wrote"
-# options that the first version did not have, with the values for what versions without them did
-ADDED = {
-    "gap_fix": None,
-    "mend": None,
-    "mended": None,
-    "data_seconds": None,
-    "ratio_estimator": "paper",
-    "change_noise": 0.05,
-    "ratio_weight_penalty": 2e-3,
-    "ratio_logit_bound": None,
-    "num_worlds": 1,
-    "sim_capacity_min": 1,
-    "n_steps": 1,
-    "layer_norm": False,
-    "num_qvalue_nets": 2,
-    "lr_end_factor": 1.0,
-    "compiled": False,
-    "precision": "float32",
-    "reward_offset": 0.0,
-    "frames": 1,
-    "action_history": 0,
-    "overlap": False,
-    "keep": "last",
-}
 
 
 def save_config(cfg: DictConfig, directory: Path) -> None:
@@ -55,22 +32,24 @@ def load_config(
 ) -> DictConfig:
     """Reads the configuration of a run. It may come from somebody else, so what it can build is limited.
 
-    Options that the version of the run did not have get the values for what that version did.
-
     Args:
         directory: the run's folder.
         trust: the option ``trust``, see :func:`~torchrl_h2o.training.targets.require_known_targets`.
         typed: the configuration of this call of the program, whose own names are allowed.
 
+    Returns:
+        The configuration; options that it leaves out have their default values.
+
     Raises:
         FileNotFoundError: if the folder is not the folder of a run.
-        torchrl_h2o.data.DataError: if the file is not the configuration of a run, or names something to build that
-            neither this library nor the user knows.
+        torchrl_h2o.data.DataError: if the folder contains a link or a device, or the file is not the configuration of a
+            run, or names something to build that neither this library nor the user knows.
 
     Examples:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
-        >>> env = {"name": "mine", "make": {"_target_": "builtins.print"}, "simulator": [], "reality": []}
+        >>> make = {"_target_": "builtins.print"}
+        >>> env = {"name": "mine", "make": make, "simulator": [], "reality": [], "seconds_per_step": 0.1}
         >>> save_config(OmegaConf.create({"env": env}), folder)
         >>> load_config(folder)
         Traceback (most recent call last):
@@ -80,21 +59,37 @@ def load_config(
         'mine'
     """
     saved = Path(directory) / FILE
-    if not saved.exists():
+    if not os.path.lexists(saved):
         raise FileNotFoundError(f"{directory} is not the folder of a run: it has no {FILE}")
+    require_plain_files(directory)
     cfg = _read(saved)
-    entries = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=False))
-    for name, kind in _LAYOUT.items():
-        value = entries
-        for key in name.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-        if not isinstance(value, kind):
-            raise DataError(f"the entry is {value!r}, not a {kind.__name__}", _REMEDY, source=saved, column=name)
     require_known_targets(cfg, saved, trust=trust, typed=typed)
-    cfg.update({name: value for name, value in ADDED.items() if name not in entries})
-    if "trial_episodes" not in entries:  # earlier versions had one number for both
-        cfg.trial_episodes = cfg.get("eval_episodes", 1)
+    try:
+        check_options(cfg, TrainOptions, saved=True)
+    except ValueError as error:
+        raise DataError(str(error), _REMEDY, source=saved) from error
+    for name, default in TrainOptions.model_construct().model_dump(by_alias=True).items():
+        if name not in cfg:
+            cfg[name] = default
     return cfg
+
+
+def require_plain_files(directory: str | Path) -> None:
+    """Requires a run's folder to contain nothing but files and folders.
+
+    Through a link the run would write elsewhere, and reading a device or a pipe may never end. The folder itself may be
+    a link.
+
+    Raises:
+        torchrl_h2o.data.DataError: for the first link, pipe, socket or device.
+    """
+    for folder, folders, files in os.walk(directory):
+        for name in (*folders, *files):
+            path = Path(folder, name)
+            mode = path.lstat().st_mode
+            if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+                kind = "a link" if stat.S_ISLNK(mode) else "neither a file nor a folder"
+                raise DataError(f"this is {kind}", "copy the run's folder without it", source=path)
 
 
 def _read(path: Path) -> DictConfig:
@@ -110,16 +105,22 @@ def _read(path: Path) -> DictConfig:
         raise DataError(f"the file cannot be read as YAML: {error}", _REMEDY, source=path) from error
     if not isinstance(cfg, DictConfig):
         raise DataError("the file is not a mapping", _REMEDY, source=path)
-    return cast(DictConfig, cfg)
+    return cfg
 
 
 def _require_plain(text: str, path: Path) -> None:
-    """Raises DataError for aliases, which can stand for a billion entries in nine lines, and for deep nesting."""
+    """Raises DataError for what a run never writes, and what could stand for anything or for a billion entries.
+
+    These are values that are computed when they are read (``${oc.env:HOME}``), aliases, and deep nesting.
+    """
     depth = 0
     for event in yaml.parse(text, Loader=_EVENTS):
         if isinstance(event, yaml.AliasEvent):
             line = event.start_mark.line + 1
             raise DataError("an alias, which a run never writes", _REMEDY, source=path, row=line)
+        if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
+            problem = f"the value {event.value!r} is computed when it is read, which a run never needs"
+            raise DataError(problem, "write the value itself", source=path, row=event.start_mark.line + 1)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST:
             raise DataError(f"the entries are nested more than {DEEPEST} deep", _REMEDY, source=path)

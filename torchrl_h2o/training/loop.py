@@ -25,7 +25,6 @@ from torchrl_h2o.training.environments import make_replay, preprocessing_of, tas
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
-from torchrl_h2o.training.precision import at_precision
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy
@@ -153,7 +152,6 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     learner = trainee.learner
     if learner.trains_discriminators:
         learner.pairs = trainee.make_pairs(real)
-    learner.terms_of = at_precision(learner.terms_of, cfg.precision)
     if replay.device.type == "cpu":
         parameters = learner.parameters if learner.one_graph else None
         learner.terms_of = maybe_compiled(

@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 from torch import Tensor, nn
-from torchrl.checkpoint import CheckpointRotation
 from tqdm import tqdm
 
-from torchrl_h2o.training.checkpoint import load_checkpoint, make_checkpoint, save_checkpoint
+from torchrl_h2o.training.checkpoint import checkpoint_file, load_checkpoint, save_checkpoint
 from torchrl_h2o.training.divergence import DivergenceError, are_finite, not_finite_losses
 from torchrl_h2o.training.evaluators import Evaluator
-from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
+from torchrl_h2o.training.run_folder import uninterrupted
 from torchrl_h2o.whole_file import whole_file
 
 
@@ -69,25 +68,19 @@ class Training:
         **components: contents of a checkpoint (losses, optimisers, replay buffers).
 
     Raises:
-        RuntimeError: if the folder contains checkpoint files, but no readable checkpoint.
+        torchrl_h2o.data.DataError: if the checkpoint is damaged, or does not fit the components.
     """
 
     def __init__(self, name: str, directory: Path, budget: Budget, **components: Any) -> None:
         self.name, self.directory, self.budget = name, directory, budget
         self.progress: dict[str, Any] = {"epoch": 0, "seconds": 0.0, "update_seconds": 0.0, "rows": []}
-        self.checkpoint = make_checkpoint(**components)
         self._components = components
         self._update = 0  # of the current epoch
         self._awaited: tuple[Evaluator, int, dict[str, float]] | None = None  # the row of a running evaluation
         directory.mkdir(parents=True, exist_ok=True)
-        folder = checkpoint_folder(directory, name)
-        self.rotation = CheckpointRotation(folder, keep_last=1)
-        if (latest := self.rotation.latest()) is not None:
-            self.progress = load_checkpoint(latest, self.checkpoint)["progress"]
-        elif folder.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
-            raise RuntimeError(
-                f"{folder} contains no checkpoint that can be read: remove it to train {name} from the start"
-            )
+        self.checkpoint = checkpoint_file(directory, name)
+        if self.checkpoint.exists():
+            self.progress = load_checkpoint(self.checkpoint, components)
         self._saved = self.progress["epoch"]  # epochs in the last checkpoint
 
     @property
@@ -122,7 +115,7 @@ class Training:
             if due and self._awaited is None:
                 due = False
                 with uninterrupted():
-                    save_checkpoint(self.rotation, self.checkpoint, epoch + 1, {"progress": self.progress})
+                    save_checkpoint(self.checkpoint, self._components, self.progress)
                 self._saved = epoch + 1
         self._bar.close()
 

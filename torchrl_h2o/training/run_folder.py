@@ -17,12 +17,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tqdm import tqdm
 
-from torchrl_h2o.options import TrainOptions, check_options
 from torchrl_h2o.options.types import why_unavailable
-from torchrl_h2o.training.config_file import load_config, save_config
+from torchrl_h2o.training.checkpoint import require_widths
+from torchrl_h2o.training.config_file import load_config, require_plain_files, save_config
 from torchrl_h2o.training.mending import prepare_mending
-from torchrl_h2o.training.remnants import remove_remnants
 from torchrl_h2o.training.targets import foreign_names
+from torchrl_h2o.whole_file import remove_partial
 
 CHANGEABLE = ("overlap", "device")  # options that may change when a run is resumed
 
@@ -40,11 +40,12 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         The run's configuration and its folder.
 
     Raises:
-        ValueError: for other overrides together with ``resume``, for wrong options in the folder's configuration, and
-            for a device that this machine does not have.
+        ValueError: for other overrides together with ``resume``, and for a device that this machine does not have.
         FileNotFoundError: if the folder given by ``resume`` is not the folder of a run.
         FileExistsError: if the folder of a new run already contains a run.
-        torchrl_h2o.data.DataError: if the configuration in the folder cannot be read, or names what must not be built.
+        PermissionError: if the folder cannot be written to.
+        torchrl_h2o.data.DataError: if the configuration in the folder cannot be read, or names what must not be built,
+            or a checkpoint is damaged or has other networks.
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
     if not OmegaConf.is_missing(cfg, "resume"):
@@ -59,17 +60,19 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
             if any(o.startswith(f"{option}=") for o in overrides):
                 cfg[option] = typed[option]
                 _note_override(cfg, f"{option}={typed[option]}")
-        check_options(cfg, TrainOptions, saved=True)
         _name_results(cfg, typed.get("results"))
     elif (directory / "config.yaml").exists():
         if not go_on:
             raise FileExistsError(f"{directory} holds a run already: resume={directory} goes on with it")
         cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
-        check_options(cfg, TrainOptions, saved=True)
     else:
         prepare_mending(cfg)
         resolve_paths(cfg)
         save_config(cfg, directory)
+    if not os.access(directory, os.W_OK):
+        raise PermissionError(f"the run's folder {directory} cannot be written to: copy it, or change its permissions")
+    for checkpoint in sorted((directory / "checkpoints").glob("*.pt")):
+        require_widths(cfg, checkpoint)
     if problem := why_unavailable(cfg.get("device", "cpu")):
         raise ValueError(f"device={cfg.device}: {problem}")
     torch.set_num_threads(cfg.threads)
@@ -116,10 +119,12 @@ def claimed(directory: Path) -> Iterator[None]:
 
     Raises:
         RuntimeError: if another process has locked it.
+        torchrl_h2o.data.DataError: if the folder contains a link, through which the run would write elsewhere.
     """
+    require_plain_files(directory)
     try:
         with FileLock(directory / "run.lock", blocking=False):
-            remove_remnants(directory)
+            remove_partial(directory)
             yield
     except Timeout:
         raise RuntimeError(
@@ -157,8 +162,3 @@ def uninterrupted() -> Iterator[None]:
 def keeps_best(cfg: DictConfig) -> bool:
     """Whether the run returns the policy that was best in the simulator instead of the last one."""
     return cfg.keep == "best_in_simulator"
-
-
-def checkpoint_folder(directory: str | Path, name: str) -> Path:
-    """Returns the folder of a method's checkpoints."""
-    return Path(directory) / "checkpoints" / name.lower().replace(" ", "_")

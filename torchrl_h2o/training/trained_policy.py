@@ -1,16 +1,14 @@
 """Loads the policy of a finished or interrupted run from its folder."""
 
 from pathlib import Path
-from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from torchrl_h2o.objectives import make_actor
-from torchrl_h2o.training.checkpoint import load_checkpoint
+from torchrl_h2o.training.checkpoint import checkpoint_file, load_checkpoint, read_checkpoint, require_widths
 from torchrl_h2o.training.environments import make_reality
-from torchrl_h2o.training.run_folder import checkpoint_folder, keeps_best
+from torchrl_h2o.training.run_folder import keeps_best
 
 
 def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") -> torch.nn.Module:
@@ -23,15 +21,15 @@ def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") ->
 
     Raises:
         FileNotFoundError: if the folder has no checkpoint of that method.
-        torchrl_h2o.data.DataError: if the checkpoint contains more than tensors and numbers.
+        torchrl_h2o.data.DataError: if the checkpoint is damaged, or its networks are not those of the configuration.
     """
-    latest = CheckpointRotation(checkpoint_folder(directory, method), keep_last=1).latest()
-    if latest is None:
-        present = sorted(path.name for path in Path(directory, "checkpoints").glob("*"))
+    path = checkpoint_file(directory, method)
+    if not path.exists():
+        present = sorted(other.stem for other in path.parent.glob("*.pt"))
         raise FileNotFoundError(f"{directory} has no checkpoint of {method!r}; it has {present or 'none'}")
+    require_widths(cfg, path)
     env = make_reality(cfg)
     actor = make_actor(env.observation_spec["observation"].shape[-1], env.action_spec_unbatched, cfg.num_cells)
-    has_best = "policy" in Checkpoint.manifest(latest)["components"]  # offline methods have none
-    component: dict[str, Any] = {"policy" if keeps_best(cfg) and has_best else "actor": actor}
-    load_checkpoint(latest, Checkpoint(**component))
+    has_best = "policy" in read_checkpoint(path, mmap=True)["components"]  # offline methods have none
+    load_checkpoint(path, {"policy" if keeps_best(cfg) and has_best else "actor": actor})
     return actor

@@ -18,8 +18,7 @@ from torchrl_h2o.training.populations.replay import PopulationReplay
 class PopulationLearner:
     """The learners of N runs as one. A member is stopped when its losses or parameters are no longer finite.
 
-    On a CPU each member draws from its own random stream, in the order of a single run. On a GPU that would take a
-    thousand small kernels per update, so all members draw from torch's global generator, in a few calls.
+    All members draw from torch's global generator, in a few calls.
 
     Args:
         learners: one per member. Their individual optimisers and target updaters are not used.
@@ -31,10 +30,7 @@ class PopulationLearner:
     def __init__(self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float) -> None:
         self.learners, self.replay, self.tau = learners, replay, tau
         self.population = Population([cast(nn.Module, learner.terms_of) for learner in learners])  # H2O+'s are its loss
-        self.losses_of: Callable[..., dict[str, Tensor]] = self.population  # may be compiled
         self.optimiser = torch.optim.Adam(self.population.parameters(), lr=lr, fused=True)
-        on_cpu = replay.device.type == "cpu"
-        self.generators = [torch.Generator() for _ in learners] if on_cpu else None
         self.updates = 0
         self.failures: dict[int, dict] = {}
         self._batches: list[TensorDictBase] = []
@@ -49,11 +45,6 @@ class PopulationLearner:
             return differentiate()
 
         self._halves = with_present_lengths, step
-
-    def start_stream(self, number: int) -> None:
-        """Copy the state of torch's global generator to a member's random stream."""
-        if self.generators is not None:
-            self.generators[number].set_state(torch.get_rng_state())
 
     def update(self) -> dict[str, Tensor]:
         """Make one update and return the terms by name, ``[N]`` each."""
@@ -71,8 +62,7 @@ class PopulationLearner:
     def _differentiate(self) -> tuple[dict[str, Tensor], list[TensorDictBase]]:
         """Make the first half of an update: compute losses and gradients. Return the terms and the batches."""
         batches = self.sample()
-        noise = self.population.draw(*batches, generators=self.generators)
-        terms = self.losses_of(*batches, noise=noise)
+        terms = self.population(*batches)
         # on a GPU the gradients stay in the same memory, where a graph of the step reads them
         self.optimiser.zero_grad(set_to_none=self.replay.device.type == "cpu")
         total_loss(terms).sum().backward()  # a member's loss depends on its own parameters only
@@ -103,13 +93,8 @@ class PopulationLearner:
 
     def sample(self) -> list[TensorDictBase]:
         """Draw the batches of one update of all members, ``[N, B]`` each."""
-        sizes = self.learners[0].batch_sizes
+        first, *second = self.learners[0].batch_sizes
         if self.learners[0].pairs is None:
-            return [self.replay.sample(size, self.generators) for size in sizes]
-        generators = self.generators or [None] * len(self.learners)
-        first = self.replay.sample(sizes[0], self.generators)  # before the pairs, as in a single run
-        pairs = [
-            cast(PairedTransitions, learner.pairs).sample(sizes[1], generator)
-            for learner, generator in zip(self.learners, generators, strict=True)
-        ]
-        return [first, TensorDict.stack(pairs)]
+            return [self.replay.sample(size) for size in (first, *second)]
+        pairs = [cast(PairedTransitions, learner.pairs).sample(second[0]) for learner in self.learners]
+        return [self.replay.sample(first), TensorDict.stack(pairs)]

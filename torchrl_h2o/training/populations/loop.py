@@ -1,10 +1,10 @@
 """Many runs in one process: every combination of ``seeds``, ``gaps`` and ``mixings``, stacked and trained together.
 
-Each member has its own simulator, buffer and random stream, and draws from the stream in the order of a single run. On
-a CPU its results therefore equal that run's, up to rounding. A member is stopped when its losses or parameters are no
-longer finite, or when its simulator produces NaN: its networks are no longer changed, simulated or evaluated. The other
-members are not affected. Only a simulator that produces NaN in its first epoch ends the whole population, because each
-batch needs simulated rows of every member.
+Each member has its own simulator and buffer. Its simulator is seeded like that of a single run; its updates draw other
+numbers, so it equals a single run in its statistics, not to the digit. A member is stopped when its losses or
+parameters are no longer finite, or when its simulator produces NaN: its networks are no longer changed, simulated or
+evaluated. The other members are not affected. Only a simulator that produces NaN in its first epoch ends the whole
+population, because each batch needs simulated rows of every member.
 """
 
 from contextlib import ExitStack
@@ -16,12 +16,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch.optim.lr_scheduler import LinearLR
-from torchrl.checkpoint import CheckpointRotation
 from tqdm import tqdm
 
 from torchrl_h2o.data.transition_checks import UnstableSimulatorError
-from torchrl_h2o.training.checkpoint import make_checkpoint, save_checkpoint
-from torchrl_h2o.training.compiling import maybe_compiled
+from torchrl_h2o.training.checkpoint import checkpoint_file, save_checkpoint
 from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.cuda_graph import fit_to_device
 from torchrl_h2o.training.divergence import are_finite
@@ -29,8 +27,8 @@ from torchrl_h2o.training.environments import as_observed, sim_capacity_of
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
-from torchrl_h2o.training.progress import Budget, Training, write_metrics
-from torchrl_h2o.training.run_folder import checkpoint_folder, uninterrupted
+from torchrl_h2o.training.progress import Budget, Training, epoch_seed, write_metrics
+from torchrl_h2o.training.run_folder import uninterrupted
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
@@ -137,9 +135,7 @@ def train_population(
             pairs[own.gap] = trainees[name].make_pairs(real)
         trainees[name].learner.pairs = pairs[own.gap]
     learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
-    if replay.device.type == "cpu":  # pays=False: there, compiled losses of stacked networks are slower
-        learner.losses_of = maybe_compiled(learner.losses_of, cfg.compiled, cfg.updates, pays=False)
-    elif cfg.compiled is not False:
+    if replay.device.type != "cpu" and cfg.compiled is not False:  # on a CPU, compiled stacked networks are slower
         learner.use_cuda_graphs()
     budget = Budget.from_config(cfg)
     schedule = LinearLR(learner.optimiser, 1.0, cfg.lr_end_factor, total_iters=budget.epochs)
@@ -162,7 +158,7 @@ def train_population(
                     if not len(trainee.learner.replay.storage):  # a batch needs simulated rows of every member
                         raise UnstableSimulatorError(f"{name}: {error}") from error
                     learner.note_failure(number, str(error))
-                learner.start_stream(number)
+            torch.manual_seed(epoch_seed(cfg.seed, epoch))  # whichever members still simulate
             for _ in training.epoch_updates():
                 terms = learner.update()
             learner.check_parameters()
@@ -193,12 +189,11 @@ def _components(trainees: dict[str, Trainee], learner: PopulationLearner) -> dic
 def _outcome(name: str, trainee: Trainee, training: PopulationTraining) -> Outcome:
     """Build a member's result, and save its policy in the member's folder for evaluate.py."""
     policies = {key: trainee.components[key] for key in ("actor", "policy") if key in trainee.components}
-    rotation = CheckpointRotation(checkpoint_folder(training.directory / name, training.name), keep_last=1)
     failure = training.failures.get(name)
     updates = training.updates if failure is None else failure["updates"]
     if are_finite(policies.values()):  # a policy that diverged cannot be evaluated
         with uninterrupted():
-            save_checkpoint(rotation, make_checkpoint(**policies), updates)
+            save_checkpoint(checkpoint_file(training.directory / name, training.name), policies, training.progress)
     return Outcome(
         trainee.policy,
         training.rows_of(name),

@@ -6,16 +6,15 @@ ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams, is_tensor_collection
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 from torchrl.objectives import LossModule
-
-from torchrl_h2o.training.populations.noise_tape import Draw, Playback, Tape, record
 
 Stackable = TensorDictParams | Tensor
 
@@ -31,13 +30,9 @@ class Population(nn.Module):
     their device before they are stacked. Only the stack has gradients, so build the optimiser from the population's
     parameters.
 
-    Random numbers are drawn outside of ``vmap``, see :meth:`draw`, so that each member can have its own stream. Losses
-    and networks may draw normal and uniform numbers. The following are not supported and raise an error:
-
-    - other random functions, such as dropout or random permutations;
-    - draws or branches that depend on data or parameters;
-    - members that differ in structure;
-    - under ``torch.compile``, draws by another function than ``Tensor.normal_``.
+    Each member draws random numbers of its own from torch's global generator (``randomness="different"`` of ``vmap``):
+    other numbers than it would draw as a single run. So a member equals a single run in its statistics, not to the
+    digit. Branches must not depend on data or parameters, and members must not differ in structure.
 
     Buffers that a forward changes, such as the running means of batch normalisation, are not written back.
 
@@ -64,7 +59,7 @@ class Population(nn.Module):
         ...                    real=(torch.arange(8) < 4).expand(5, 8),
         ...                    next=TensorDict(observation=torch.randn(5, 8, 3), reward=torch.randn(5, 8, 1),
         ...                                    terminated=torch.zeros(5, 8, 1, dtype=torch.bool)), batch_size=[5, 8])
-        >>> terms = population(batch)  # or population(batch, noise=population.draw(batch, generators=...))
+        >>> terms = population(batch)
         >>> terms["loss_qvalue"].shape
         torch.Size([5])
         >>> total_loss(terms).sum().backward()
@@ -90,72 +85,26 @@ class Population(nn.Module):
         for number, tensors in enumerate(own):
             for path, held in tensors.items():
                 _look_into(held, self.stacked.get(path), number)
-        self._draws: dict[tuple, list[Draw]] = {}
-        self._tape = Tape()
-        self._playback = Playback(self._tape)
+        self._own_numbers = _OwnNumbers()  # a compiled forward pass cannot create one
 
     def __len__(self) -> int:
         return len(self.members)
 
-    def draw(self, *batches: TensorDictBase, generators: Sequence[torch.Generator] | None = None) -> tuple[Tensor, ...]:
-        """Draw the random numbers of one forward.
-
-        Args:
-            *batches: as of :meth:`forward`.
-            generators: one per member; each member then gets the numbers that a single run draws with this generator.
-                By default all members draw from torch's global generator, in one call per draw.
-
-        Returns:
-            The numbers of each draw, ``[N, *shape]``.
-
-        Raises:
-            NotImplementedError: for random functions whose numbers cannot be supplied, such as dropout.
-        """
-        draws = self._recorded(batches)
-        if generators is None:
-            return tuple(draw.make(members=[len(self)]) for draw in draws)
-        of_each = [[draw.make(generator) for draw in draws] for generator in generators]
-        return tuple(torch.stack(same) for same in zip(*of_each, strict=True))
-
-    def _recorded(self, batches: Sequence[TensorDictBase]) -> list[Draw]:
-        """Draws of the first member's forward pass, recorded once per batch shapes and training mode."""
-        modes = tuple(module.training for module in self.members[0].modules())
-        key = (tuple(batch.batch_size for batch in batches), modes)
-        if key not in self._draws:
-            first = [cast(TensorDictBase, batch[0]).copy() for batch in batches]
-            devices = {batch.device for batch in batches if batch.device is not None}
-            with _without_caches(self.members[0]):
-                self._draws[key] = record(lambda: self.members[0](*first), list(devices))
-        return self._draws[key]
-
-    def forward(self, *batches: TensorDictBase, noise: Sequence[Tensor] | None = None) -> dict[str, Tensor]:
+    def forward(self, *batches: TensorDictBase) -> dict[str, Tensor]:
         """Compute the terms of each member on the member's batches.
 
         Args:
             *batches: stacked inputs of the members' forward passes, ``[N, *B]``.
-            noise: random numbers from :meth:`draw`, required for a compiled population. By default they are drawn from
-                torch's global generator.
 
         Returns:
             The terms by name, ``[N]`` each; for losses with ``reduction="none"``, ``[N, *B]``.
         """
-        noise = self.draw(*batches) if noise is None else noise
-        return torch.vmap(self._terms_of_one)(self.stacked, tuple(noise), *batches)
+        return torch.vmap(self._terms_of_one, randomness="different")(self.stacked, *batches)
 
-    def _terms_of_one(
-        self, tensors: TensorDictBase, noise: tuple[Tensor, ...], *batches: TensorDictBase
-    ) -> dict[str, Tensor]:
-        self._tape.numbers, self._tape.position = noise, 0
+    def _terms_of_one(self, tensors: TensorDictBase, *batches: TensorDictBase) -> dict[str, Tensor]:
         own = {path: tensors.get(path) for path in self._paths}
-        with _in_place_of_own(self.members[0], own) as member, self._playback:
-            terms = dict(member(*batches).items())
-        if self._tape.position != len(noise):
-            raise RuntimeError(
-                f"a member's forward made {self._tape.position} of {len(noise)} recorded draws of random numbers: what "
-                "it draws must not depend on data."
-            )
-        self._tape.numbers = ()
-        return terms
+        with _in_place_of_own(self.members[0], own) as member, self._own_numbers:
+            return dict(member(*batches).items())
 
     @torch.no_grad()
     def move_targets(self, tau: float) -> None:
@@ -191,6 +140,18 @@ class Population(nn.Module):
             momentum = optimiser.state[parameter].get("exp_avg")
             if momentum is not None:
                 momentum[number] = 0.0
+
+
+class _OwnNumbers(TorchFunctionMode):
+    """Draws normal numbers out of place, because ``vmap`` refuses to fill one tensor for all members in place.
+
+    ``torch.distributions`` fills a tensor in place.
+    """
+
+    def __torch_function__(self, func: Callable, types: tuple, args: tuple = (), kwargs: dict | None = None) -> Any:
+        if func is torch.Tensor.normal_ and len(args) == 1 and not kwargs:
+            return torch.randn_like(args[0])
+        return func(*args, **({} if kwargs is None else kwargs))
 
 
 def _tensors(member: nn.Module) -> dict[tuple[str, ...], Stackable]:

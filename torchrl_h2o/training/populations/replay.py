@@ -42,8 +42,6 @@ class PopulationReplay:
         ...     buffer.extend(env.rollout(20))
         >>> replay.sample()["next", "reward"].shape
         torch.Size([3, 8, 1])
-        >>> streams = [torch.Generator().manual_seed(seed) for seed in range(3)]
-        >>> batch = replay.sample(generators=streams)  # row n equals a batch of buffers[n] with the same stream
     """
 
     def __init__(
@@ -83,15 +81,11 @@ class PopulationReplay:
         self._lengths = torch.zeros(2, num_members, 1, dtype=torch.long, device=device)  # of both streams
         self._known_lengths: tuple[list[int], list[int]] = ([], [])
 
-    def sample(
-        self, batch_size: tuple[int, int] | None = None, generators: Sequence[torch.Generator] | None = None
-    ) -> TensorDict:
-        """Draw a batch for every member.
+    def sample(self, batch_size: tuple[int, int] | None = None) -> TensorDict:
+        """Draw a batch for every member, from torch's global generator.
 
         Args:
             batch_size: (real, simulated) rows of a member's batch. Defaults to the batch size of the buffers.
-            generators: one per member; each member then gets the rows that its buffer draws with this generator. By
-                default all members draw from torch's global generator, in one call.
 
         Returns:
             TensorDict of batch size [N, real + simulated] with the buffers' entries and the boolean ``real``. The real
@@ -104,8 +98,8 @@ class PopulationReplay:
                 f"member {self._known_lengths[1].index(0)} has no simulated transitions yet; extend() its buffer "
                 "first, or sample((n, 0)) for real rows alone"
             )
-        index_real = self._draw(0, n_real, generators)
-        index_sim = self._draw(1, n_sim, generators) + self._first_sim
+        index_real = self._draw(0, n_real)
+        index_sim = self._draw(1, n_sim) + self._first_sim
         batch = {
             key: torch.cat([_gather(self._real[key], index_real), _gather(self._sim[key], index_sim)], 1)
             for key in self._real
@@ -124,17 +118,10 @@ class PopulationReplay:
             self._known_lengths = lengths
             self._lengths.copy_(torch.tensor(lengths)[..., None])
 
-    def _draw(self, stream: int, count: int, generators: Sequence[torch.Generator] | None) -> torch.Tensor:
+    def _draw(self, stream: int, count: int) -> torch.Tensor:
         """Draw row numbers below the length of each member's buffer, ``[N, count]``."""
-        if generators is None:
-            uniform = torch.rand(len(self.buffers), count, device=self.device, dtype=torch.double)
-            return (uniform * self._lengths[stream]).long()
-        rows = [
-            torch.randint(length, (count,), device=self.device, generator=generator)
-            for length, generator in zip(self._known_lengths[stream], generators, strict=True)
-            if count
-        ]
-        return torch.stack(rows) if count else self._first_sim[:, :0]
+        uniform = torch.rand(len(self.buffers), count, device=self.device, dtype=torch.double)
+        return (uniform * self._lengths[stream]).long()
 
 
 def _gather(rows: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
