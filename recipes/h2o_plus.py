@@ -38,7 +38,6 @@ from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
-from torchrl_h2o.training.real_data import behaviour_of, is_cut
 from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
 from torchrl_h2o.training.task import Task
@@ -63,7 +62,6 @@ def train(cfg: DictConfig, folder: Path) -> None:
     real = task.read_real_data(cfg.data, cfg.columns, cfg.data_seconds)
     cfg.mended = find_missing_effects(cfg, task, real, folder)  # null unless mend=true or mend=posterior
     task = task.mended(cfg.mended)
-    behaviour = behaviour_of(real, cut=is_cut(cfg))
     preprocessing = Preprocessing.fit(
         real,
         normalise=cfg.normalise_observation,
@@ -84,14 +82,12 @@ def train(cfg: DictConfig, folder: Path) -> None:
         gamma=cfg.gamma,
     )
 
-    # Environments: to collect, to evaluate during training, and for the evaluation at the end
+    # Environments: to collect, to evaluate during training, and to choose the best policy
     simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
     evaluator = evaluator_of(cfg, task, preprocessing)  # in reality; with overlap=true, beside the next updates
     trials = task.make_simulator(cfg.trial_episodes, preprocessing) if keeps_best(cfg) else None
-    final_reality = task.make_reality(cfg.final_episodes, preprocessing)
-    final_simulator = task.make_simulator(1, preprocessing)
-    observation_dim = final_reality.observation_spec["observation"].shape[-1]
-    action_spec = final_reality.action_spec_unbatched
+    observation_dim = simulator.observation_spec["observation"].shape[-1]
+    action_spec = simulator.action_spec_unbatched
     action_dim = action_spec.shape[-1]
 
     # Networks
@@ -173,19 +169,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
 
     # Results
     policy = actor if best is None else best.policy
-    in_reality = judge(
-        task,
-        final_reality,
-        final_simulator,
-        {"H2O+": policy},
-        {"H2O+": training},
-        behaviour,
-        folder,
-        episodes=cfg.final_episodes,
-        settings=run_settings(cfg, real),
-        wall_s=setup_s + training.progress["seconds"],
-        preprocessing=preprocessing,
-    )
+    wall_s = setup_s + training.progress["seconds"]
+    in_reality = judge(cfg, real, {"H2O+": policy}, {"H2O+": training}, folder, wall_s)
     film = try_to_film(task, preprocessing, policy, folder) if cfg.render else None
     print(table_of_run(in_reality, folder, film, task.seconds_per_step))
 

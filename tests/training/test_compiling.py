@@ -4,14 +4,12 @@ import shutil
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from torch._inductor.utils import fresh_cache
 from torchrl.data import Bounded
-from torchrl_h2o.training.one_graph import OneGraph
 
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import total_loss
-from torchrl_h2o.training.compiling import PAYS_FROM, compiled, maybe_compiled
+from torchrl_h2o.training.compiling import PAYS_FROM, OneGraph, compiled, maybe_compiled
 from torchrl_h2o.training.methods import h2o, h2o_plus, weighted_td3
 
 
@@ -146,13 +144,10 @@ def test_where_compiled_losses_are_asked_for_it_is_an_error_that_there_can_be_no
         ("auto", PAYS_FROM, False, False),
         (True, 1, False, True),
         (False, PAYS_FROM, True, False),
-        (None, PAYS_FROM, True, False),
     ],
 )
 def test_losses_are_compiled_where_it_pays_or_is_asked_for(chosen, updates, pays, compiles):
-    cfg = OmegaConf.create({"updates": updates} | ({} if chosen is None else {"compiled": chosen}))
-
     def losses_of(batch):
         return batch
 
-    assert (maybe_compiled(losses_of, cfg.get("compiled", False), cfg.updates, pays=pays) is not losses_of) == compiles
+    assert (maybe_compiled(losses_of, chosen, updates, pays=pays) is not losses_of) == compiles

@@ -12,7 +12,13 @@ from tensordict.nn import TensorDictModule
 
 from torchrl_h2o.data import episodes
 from torchrl_h2o.objectives import make_actor
-from torchrl_h2o.training.environments import as_observed, make_reality, measure_observation_norm, preprocessing_of
+from torchrl_h2o.training.environments import (
+    as_observed,
+    make_reality,
+    measure_observation_norm,
+    preprocessing_of,
+    task_of,
+)
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import SEED, evaluate
 
@@ -35,7 +41,7 @@ def rollout(env):
 
 
 def test_real_data_are_stacked_as_the_environment_stacks(cfg):
-    raw = rollout(make_reality(cfg, raw=True))
+    raw = rollout(task_of(cfg).make_reality())
     assert raw["observation"].shape == (20, 4)
     measure_observation_norm(cfg, raw)
     seen = rollout(make_reality(cfg))
@@ -52,7 +58,7 @@ def test_real_data_are_stacked_as_the_environment_stacks(cfg):
 
 def test_without_stacking_the_latest_observation_is_shown(cfg):
     cfg.frames = 1
-    raw = rollout(make_reality(cfg, raw=True))
+    raw = rollout(task_of(cfg).make_reality())
     measure_observation_norm(cfg, raw)
     torch.testing.assert_close(
         as_observed(cfg, raw)["observation"], rollout(make_reality(cfg))["observation"], atol=1e-5, rtol=1e-4
@@ -121,7 +127,7 @@ def test_an_evaluation_measures_observations_in_physical_units(cfg, worlds, past
 
     push = TensorDictModule(lambda seen: torch.full((*seen.shape[:-1], 1), 2.0), ["observation"], ["action"])
     measured = evaluate(make_reality(cfg, worlds), push, 3, physical=partial(preprocessing_of(cfg).physical, size=4))
-    raw = make_reality(cfg, worlds, raw=True)
+    raw = task_of(cfg).make_reality(worlds)
     torch.manual_seed(SEED)
     raw.set_seed(SEED)
     steps = raw.rollout(3 * 60, push, break_when_any_done=False)

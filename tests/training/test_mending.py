@@ -24,13 +24,21 @@ from torchrl_h2o.residuals.report.contents import (
     Verdict,
 )
 from torchrl_h2o.residuals.report.errors import ErrorSummary
-from torchrl_h2o.training import cache_key, cached_search
-from torchrl_h2o.training.cached_search import BLOCK, MOST_ROWS, digest, searched_rows
+from torchrl_h2o.training import cache, mending
+from torchrl_h2o.training.cache import cache_folder
 from torchrl_h2o.training.config_file import load_config, save_config
 from torchrl_h2o.training.environments import simulator_maker, task_of
 from torchrl_h2o.training.judging import table_of_population, table_of_run, write_summary
-from torchrl_h2o.training.mending import POSTERIOR_WORLDS, find_missing_effects, prepare_mending, report_of_run
-from torchrl_h2o.training.real_data import cache_folder
+from torchrl_h2o.training.mending import (
+    BLOCK,
+    MOST_ROWS,
+    POSTERIOR_WORLDS,
+    find_missing_effects,
+    prepare_mending,
+    report_of_run,
+    search_key,
+    searched_rows,
+)
 from torchrl_h2o.training.returns import Evaluation
 from torchrl_h2o.training.task import Task
 
@@ -79,7 +87,7 @@ def cached(pendulum_task, real):
 
 def key_of(task, real):
     """The key of a search in the cache."""
-    return digest(task.make_simulator(), task.simulator, task.config["make"], real)
+    return search_key(task, task.make_simulator(), real)
 
 
 def new_folder(folder, name):
@@ -155,7 +163,7 @@ def test_data_simulator_and_settings_tell_searches_apart(pendulum, monkeypatch):
     several["log"] = (torch.arange(len(real)) >= 200).long()
     others = {key_of(task, rows) for rows in (changed, estimated, several)}
     others |= {key_of(replace(task, simulator=effects), real) for effects in ((), (Gravity(1.9),), (ActionDelay(0.1),))}
-    monkeypatch.setitem(cached_search.SEARCH, "held_out", 0.4)
+    monkeypatch.setitem(mending.SEARCH, "held_out", 0.4)
     others.add(key_of(task, real))
     assert len(others) == 7
     assert one not in others
@@ -166,16 +174,16 @@ def test_the_model_and_the_code_tell_searches_apart(pendulum, monkeypatch, tmp_p
     one = key_of(task, real)
     simulator = task.make_simulator()
     mujoco_model(simulator).geom_size[-1, 0] *= 1.01  # as if the user had edited the model's file
-    assert digest(simulator, task.simulator, task.config["make"], real) != one
+    assert search_key(task, simulator, real) != one
     (tmp_path / "residuals").mkdir()
     (tmp_path / "residuals" / "fit.py").write_text("tolerance = 1")
-    monkeypatch.setattr(cache_key.torchrl_h2o, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(cache.torchrl_h2o, "__file__", str(tmp_path / "__init__.py"))
     keys = []
     for code in ("tolerance = 1", "tolerance = 2", "tolerance = 1"):
         (tmp_path / "residuals" / "fit.py").write_text(code)
-        cache_key.code_of.cache_clear()
+        cache._code_of.cache_clear()
         keys.append(key_of(task, real))
-    cache_key.code_of.cache_clear()
+    cache._code_of.cache_clear()
     assert one not in keys
     assert keys[0] == keys[2] != keys[1]
 
@@ -226,7 +234,7 @@ def test_a_defect_of_the_search_ends_the_run(pendulum, monkeypatch):
     def close_the_loop(*_, **__):
         raise AttributeError("a defect")
 
-    monkeypatch.setattr(cached_search, "close_the_loop", close_the_loop)
+    monkeypatch.setattr(mending, "close_the_loop", close_the_loop)
     with pytest.raises(AttributeError, match="a defect"):
         find_missing_effects(cfg, task, real, folder)
     assert not (folder / "mended").exists()  # the same command searches again

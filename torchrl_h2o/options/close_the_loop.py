@@ -87,9 +87,7 @@ class CloseTheLoopOptions(Options):
     start_from: AnyPath | None = option(
         None, "report.json of an unfinished run, or its folder: the search begins with its effects"
     )
-    minutes: Positive | None = option(
-        None, "time for the search; its result is reported when it is up; null: as long as it takes"
-    )
+    minutes: Positive | None = option(None, "for the command, with the audit and the report; null: as long as it takes")
     catalogue: Pattern | list[Pattern] | None = option(
         None, "effects to try, as patterns of class names: [Gravity,Joint*]; null for all"
     )

@@ -39,21 +39,14 @@ def measure_observation_norm(cfg: DictConfig, real: TensorDictBase) -> None:
     cfg.observation_norm = fitted.norm
 
 
-def make_reality(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:
-    """Builds reality with the run's preprocessing.
-
-    Args:
-        cfg: the run's configuration.
-        num_worlds: see :meth:`Task.make_reality`.
-        raw: whether observations stay in physical units, without preprocessing.
-        **kwargs: further arguments of the env, such as ``render_mode``.
-    """
-    return task_of(cfg).make_reality(num_worlds, None if raw else preprocessing_of(cfg), **kwargs)
+def make_reality(cfg: DictConfig, num_worlds: int | None = None) -> EnvBase:
+    """Builds reality with the run's preprocessing; ``num_worlds`` as for :meth:`Task.make_reality`."""
+    return task_of(cfg).make_reality(num_worlds, preprocessing_of(cfg))
 
 
-def make_simulator(cfg: DictConfig, num_worlds: int | None = None, *, raw: bool = False, **kwargs) -> EnvBase:
-    """Builds the simulator with the run's preprocessing; arguments as for :func:`make_reality`."""
-    return task_of(cfg).make_simulator(num_worlds, None if raw else preprocessing_of(cfg), **kwargs)
+def make_simulator(cfg: DictConfig, num_worlds: int | None = None) -> EnvBase:
+    """Builds the simulator with the run's preprocessing."""
+    return task_of(cfg).make_simulator(num_worlds, preprocessing_of(cfg))
 
 
 def simulator_maker(cfg: DictConfig) -> Callable[[], EnvBase]:

@@ -15,7 +15,6 @@ from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run, write_failure
 from torchrl_h2o.training.loop import Method, train
 from torchrl_h2o.training.mending import find_missing_effects
-from torchrl_h2o.training.real_data import behaviour_of, is_cut
 
 
 def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None:
@@ -44,21 +43,9 @@ def run_job(cfg: DictConfig, directory: Path, methods: Sequence[Method]) -> None
             raise
     wall_s += sum(training.progress["seconds"] for training in trainings.values())
 
-    task, preprocessing = task_of(cfg), preprocessing_of(cfg)
-    in_reality = judge(
-        task,
-        task.make_reality(cfg.final_episodes, preprocessing),
-        task.make_simulator(1, preprocessing),
-        policies,
-        trainings,
-        behaviour_of(real, cut=is_cut(cfg)),
-        directory,
-        episodes=cfg.final_episodes,
-        settings=run_settings(cfg, real),
-        wall_s=wall_s,
-        preprocessing=preprocessing,
-    )
-    film = try_to_film(task, preprocessing, policies[methods[0].title], directory) if cfg.render else None
+    in_reality = judge(cfg, real, policies, trainings, directory, wall_s)
+    task, policy = task_of(cfg), policies[methods[0].title]
+    film = try_to_film(task, preprocessing_of(cfg), policy, directory) if cfg.render else None
     tqdm.write(table_of_run(in_reality, directory, film, task.seconds_per_step))
 
 

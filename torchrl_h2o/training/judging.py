@@ -15,75 +15,65 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
 
 from torchrl_h2o.provenance import provenance
+from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
 from torchrl_h2o.training.mending import lines_of_mending, summary_of_mending
-from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.real_data import behaviour_of, is_cut
 from torchrl_h2o.training.returns import Evaluation, evaluate
-from torchrl_h2o.training.task import Task
 from torchrl_h2o.whole_file import write_text
 
 DATA = "the data's behaviour"
 
 
 def judge(
-    task: Task,
-    reality: EnvBase,
-    simulator: EnvBase,
+    cfg: DictConfig,
+    real: TensorDictBase,
     policies: Mapping[str, torch.nn.Module],
     trainings: Mapping[str, Trained],
-    behaviour: Evaluation,
     directory: Path,
-    *,
-    episodes: int,
-    settings: Mapping[str, Any],
     wall_s: float,
-    preprocessing: Preprocessing,
 ) -> dict[str, Evaluation]:
     """Evaluates the policies and writes summary.json and learning_curve.png.
 
+    If the task names its observations, they are measured in physical units.
+
     Args:
-        task: the task, for the picture's title.
-        reality: the environment of the evaluations, preprocessed as in training.
-        simulator: the simulator, in which one episode of the first policy is evaluated.
-        policies: by method; the first belongs to the main method, the others to baselines.
+        cfg: the run's complete configuration.
+        real: the measured transitions, ``[T]``.
+        policies: by method; the first belongs to the main method, the others to baselines. The first is also evaluated
+            in one episode in the simulator.
         trainings: finished trainings, by method.
-        behaviour: returns of the episodes in the data.
         directory: folder to write to.
-        episodes: number of episodes in reality.
-        settings: further entries of the summary, see :func:`run_settings`.
         wall_s: wall time of the run so far, in s.
-        preprocessing: that of both environments. With it the observations are measured in physical units, if the task
-            names them.
 
     Returns:
-        The evaluations in reality by method, and ``behaviour`` under its own name.
+        The evaluations in reality by method, and the returns of the episodes in the data under :data:`DATA`.
     """
     start = time.perf_counter()
-    main = next(iter(policies))
+    task, preprocessing = task_of(cfg), preprocessing_of(cfg)
+    behaviour, main = behaviour_of(real, cut=is_cut(cfg)), next(iter(policies))
     names = task.config.get("observations")
     physical = None if names is None else partial(preprocessing.physical, size=len(names))
-    in_reality = {name: evaluate(reality, policy, episodes, physical=physical) for name, policy in policies.items()}
+    reality = task.make_reality(cfg.final_episodes, preprocessing)
+    in_reality = {name: evaluate(reality, one, cfg.final_episodes, physical=physical) for name, one in policies.items()}
     observed = {} if names is None else {"observed": in_reality[main].observed(names)}
-    in_simulator = evaluate(simulator, policies[main], 1)
+    in_simulator = evaluate(task.make_simulator(1, preprocessing), policies[main], 1)
     draw_learning_curve(directory / "learning_curve.png", trainings, behaviour, task)
-    write_summary(
-        directory,
-        {
-            "method": main,
-            **settings,
-            "updates": trainings[main].updates,
-            "return_real": in_reality[main].summary() | observed,
-            "return_sim": in_simulator.summary(),
-            "return_trial": best_trial(trainings[main].rows),
-            "return_data": behaviour.summary(),
-            "baselines": {name: in_reality[name].summary() for name in policies if name != main},
-            "updates_per_second": trainings[main].updates_per_second,
-            "wall_s": wall_s + time.perf_counter() - start,
-        },
-    )
+    summary = {
+        "method": main,
+        **run_settings(cfg, real),
+        "updates": trainings[main].updates,
+        "return_real": in_reality[main].summary() | observed,
+        "return_sim": in_simulator.summary(),
+        "return_trial": best_trial(trainings[main].rows),
+        "return_data": behaviour.summary(),
+        "baselines": {name: in_reality[name].summary() for name in policies if name != main},
+        "updates_per_second": trainings[main].updates_per_second,
+        "wall_s": wall_s + time.perf_counter() - start,
+    }
+    write_summary(directory, summary)
     return in_reality | {DATA: behaviour}
 
 

@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
+import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_h2o.data.readers.sources import Source, words_of
+from torchrl_h2o.data.readers.whole_folder import whole_folder
 from torchrl_h2o.effects import Effect, effect_to_dict
 from torchrl_h2o.options.run import POSTERIOR_WORLDS
-from torchrl_h2o.residuals import Report
+from torchrl_h2o.residuals import LoopSettings, Report, close_the_loop
 from torchrl_h2o.residuals.close_the_loop import FAILURES
 from torchrl_h2o.residuals.report.contents import DataSummary
-from torchrl_h2o.training.cached_search import cached_report, write_whole
+from torchrl_h2o.training.cache import SEARCHES, cache_folder, cached, key_of
 from torchrl_h2o.training.task import Task
 
 FOLDER = "mended"
 POSTERIOR = "posterior"
+MOST_ROWS = 20_000  # a search fits and judges a few thousand windows; more rows cost time and add little precision
+BLOCK = 1_000  # rows in sequence, of data that are longer
+SEARCH = {"held_out": 0.25, "seed": 0}
+READ = (  # by the search, if the data have them
+    *("observation", "action", ("next", "observation"), ("next", "done")),
+    *("time", "log", "observation_std"),
+)
 
 
 def prepare_mending(cfg: DictConfig) -> None:
@@ -72,14 +85,57 @@ def report_of_run(directory: Path) -> Report | None:
 
 
 def _search(task: Task, real: TensorDictBase, data: Source, folder: Path) -> Report:
+    """Closes the loop, or reads the report of the same search from the cache, and copies its files into a folder."""
     source = Path(data).name if isinstance(data, str) and Path(data).exists() else words_of(data)
+    rows, simulator = searched_rows(real), task.make_simulator()
+    chosen = f"{len(rows)} of {len(real)} rows" if len(rows) < len(real) else f"all {len(real)} rows"
+
+    def search(cached_folder: Path) -> None:
+        tqdm.write(f"mend: searching {chosen} for effects that the simulator lacks; this takes minutes")
+        write_whole(close_the_loop(simulator, rows, source=f"{source}, {chosen}", **SEARCH), cached_folder)
+
     try:
-        return cached_report(task.make_simulator(), task.simulator, task.config["make"], real, source, folder)
+        found = cached(cache_folder() / "mended" / search_key(task, simulator, rows), search)
     except FAILURES as error:  # data that do not fit the simulator, or leave its equations singular
         reason = f"the search failed ({type(error).__name__}: {' '.join(str(error).split())})"
         report = Report(simulator=task.name, data=DataSummary(source, len(real), 0), conclusion=reason)
         write_whole(report, folder)
         return report
+    with whole_folder(folder) as partial:
+        shutil.copytree(found, partial, dirs_exist_ok=True)
+    return Report.load(folder)
+
+
+def write_whole(report: Report, folder: Path) -> None:
+    """Writes a report such that the folder appears with all its files or not at all."""
+    with whole_folder(folder) as partial:
+        report.save(partial)
+
+
+def searched_rows(real: TensorDictBase) -> TensorDictBase:
+    """The transitions that a search uses: all of them, or of longer data evenly spaced blocks of successive rows.
+
+    Returns:
+        At most ``MOST_ROWS`` transitions, in their order.
+    """
+    if len(real) <= MOST_ROWS:
+        return real
+    starts = np.linspace(0, len(real) - BLOCK, MOST_ROWS // BLOCK).round().astype(int)
+    return cast(TensorDictBase, torch.cat([real[start : start + BLOCK] for start in starts]))  # typed as a tensor
+
+
+def search_key(task: Task, simulator: EnvBase, rows: TensorDictBase) -> str:
+    """Identifies a search by the simulator and its effects, the data's values, the settings and the code.
+
+    The effects count beside the simulator's model, which does not show those on actions, observations and forces.
+    """
+    effects = [effect_to_dict(effect) for effect in task.simulator]
+    data = [
+        f"{key} {values.dtype} {tuple(values.shape)}".encode() + values.contiguous().numpy().tobytes()
+        for key in READ
+        if (values := rows.get(key, None)) is not None
+    ]
+    return key_of([dict(task.config["make"]), effects, asdict(LoopSettings()), SEARCH], simulator, SEARCHES, data)
 
 
 def _draws(report: Report, task: Task, num_worlds: int, seed: int) -> list[tuple[Effect, ...]]:

@@ -1,12 +1,10 @@
 """Real transitions of a run, read from a data set or a log, or recorded once in ``reality`` and cached."""
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from filelock import FileLock
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -16,7 +14,7 @@ from torchrl_h2o.data import check_specs, episodes, load, read_ted, write_ted
 from torchrl_h2o.data.readers.sources import Source, is_log, words_of
 from torchrl_h2o.envs import record
 from torchrl_h2o.options.sources import RECORDED
-from torchrl_h2o.training.cache_key import SIMULATES, begin_key
+from torchrl_h2o.training.cache import SIMULATES, cache_folder, cached, key_of
 from torchrl_h2o.training.returns import Evaluation
 
 
@@ -93,20 +91,13 @@ def _recorded(config: Mapping[str, Any], reality: EnvBase) -> TensorDictBase:
             "such as data=halfcheetah/medium-replay-v0"
         )
     made_of = [config[key] for key in ("make", "reality", "behaviour", "recording")]
-    digest = begin_key(made_of, reality, SIMULATES).hexdigest()[:12]
     name = re.sub(r"[^\w-]+", "_", config["name"])  # no path, because a folder from somebody else may name the env
-    folder = cache_folder() / f"{name}_{digest}"
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder.with_name(f"{folder.name}.lock")):  # several runs of a grid may begin at once
-        if not folder.exists():
-            write_ted(record(reality, instantiate(config["behaviour"]), **config["recording"]), folder)
-    return read_ted(folder)
+    folder = cache_folder() / f"{name}_{key_of(made_of, reality, SIMULATES)}"
 
+    def record_into(folder: Path) -> None:
+        write_ted(record(reality, instantiate(config["behaviour"]), **config["recording"]), folder)
 
-def cache_folder() -> Path:
-    """Folder for what runs share: recordings, and the reports of ``mend``."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "torchrl_h2o"
+    return read_ted(cached(folder, record_into))
 
 
 def is_cut(cfg: DictConfig) -> bool:

@@ -48,6 +48,8 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
             or a checkpoint is damaged or has other networks.
     """
     directory = Path(HydraConfig.get().runtime.output_dir)
+    if not os.access(directory, os.W_OK):
+        raise PermissionError(f"the run's folder {directory} cannot be written to: copy it, or change its permissions")
     if not OmegaConf.is_missing(cfg, "resume"):
         overrides = HydraConfig.get().overrides.task
         others = [o for o in overrides if o.partition("=")[0] not in ("resume", "trust", "results", *CHANGEABLE)]
@@ -69,8 +71,6 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         prepare_mending(cfg)
         resolve_paths(cfg)
         save_config(cfg, directory)
-    if not os.access(directory, os.W_OK):
-        raise PermissionError(f"the run's folder {directory} cannot be written to: copy it, or change its permissions")
     for checkpoint in sorted((directory / "checkpoints").glob("*.pt")):
         require_widths(cfg, checkpoint)
     if problem := why_unavailable(cfg.get("device", "cpu")):

@@ -1,8 +1,9 @@
-"""Members of a population get the same losses and parameters as single runs."""
+"""Members of a population learn as single runs do, with random numbers of their own."""
 
 import pytest
 import torch
 from torch import nn
+from torch.overrides import TorchFunctionMode
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
@@ -19,6 +20,24 @@ from torchrl_h2o.objectives import (
 from torchrl_h2o.training.populations import Population
 
 LR, TAU = 3e-3, 0.05
+
+
+class Zeros(TorchFunctionMode):
+    """Replaces normal numbers by zeros."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if func in (torch.Tensor.normal_, torch.randn_like):
+            return torch.zeros_like(args[0])
+        return func(*args, **(kwargs or {}))
+
+
+class Randomly(nn.Module):
+    def __init__(self, function):
+        super().__init__()
+        self.function = function
+
+    def forward(self, batch):
+        return {"drawn": self.function(batch["observation"])}
 
 
 class Run(nn.Module):
@@ -56,20 +75,15 @@ def stacked_batches(runs, update):
     return [torch.stack(list(same)) for same in together]
 
 
-def train_alone(run, member, updates):
-    torch.manual_seed(member)
-    return [run.update(*batches(member, update)).detach() for update in range(updates)]
-
-
 def train_together(runs, updates, spoil=lambda update, stacked: None):
     """Trains runs as a population; returns the terms of every update, the stopped members, and the population."""
     population, stopped, history = Population(runs), set(), []
     optimiser = torch.optim.Adam(population.parameters(), lr=LR, fused=True)
-    generators = [torch.Generator().manual_seed(member) for member in range(len(runs))]
+    torch.manual_seed(0)
     for update in range(updates):
         stacked = stacked_batches(runs, update)
         spoil(update, stacked)
-        terms = population(*stacked, noise=population.draw(*stacked, generators=generators))
+        terms = population(*stacked)
         optimiser.zero_grad()
         total_loss(terms).sum().backward()
         stopped |= set((~total_loss(terms).isfinite()).nonzero().flatten().tolist())
@@ -86,19 +100,31 @@ def numbers(run):
 
 
 @pytest.mark.parametrize("value_loss", [ExpectileValueLoss, SparseValueLoss, ExponentialValueLoss])
-def test_members_learn_what_single_runs_learn(value_loss):
+def test_without_random_numbers_members_learn_what_single_runs_learn(value_loss):
     alone, together = ([Run(seed, value_loss) for seed in range(3)] for _ in range(2))
-    expected = [train_alone(run, member, 20) for member, run in enumerate(alone)]
-    history, _, _ = train_together(together, 20)
+    with Zeros():
+        for update in range(10):
+            for member, run in enumerate(alone):
+                run.update(*batches(member, update))
+        train_together(together, 10)
     for member in range(3):
-        for update in range(20):
-            for name, term in expected[member][update].items():
-                torch.testing.assert_close(history[update][name][member], term, rtol=1e-5, atol=1e-5)
         before = Run(member, value_loss).state_dict()
         for name, tensor in numbers(alone[member]).items():
             torch.testing.assert_close(numbers(together[member])[name], tensor, rtol=1e-5, atol=1e-5)
             if name.endswith("weight"):
-                assert (tensor - before[name]).abs().max() > 1e-3, name  # far beyond rounding
+                assert (tensor - before[name]).abs().max() > 1e-4, name  # far beyond rounding
+
+
+def test_members_draw_numbers_of_their_own_that_are_distributed_as_those_of_a_single_run():
+    runs = [Randomly(lambda x: x + torch.distributions.Normal(0.0, 1.0).rsample(x.shape)) for _ in range(3)]
+    population, batch = Population(runs), torch.stack([make_batch(2000, 2000, 0, torch.float32)] * 3)
+    torch.manual_seed(0)
+    drawn = population(batch)["drawn"] - batch["observation"]
+    assert drawn.mean((1, 2)).abs().max() < 0.03
+    assert (drawn.std((1, 2)) - 1.0).abs().max() < 0.03
+    assert torch.corrcoef(drawn.flatten(1)).fill_diagonal_(0.0).abs().max() < 0.03
+    torch.manual_seed(0)
+    assert torch.equal(population(batch)["drawn"] - batch["observation"], drawn)
 
 
 def test_a_member_keeps_a_lambda_of_its_own():
@@ -118,20 +144,6 @@ def test_a_member_s_policy_acts_with_what_the_population_has_learnt():
         for parameter in population.parameters():
             parameter.add_(0.1)
     assert (parts.actor(observation=torch.ones(3))[0] - before).abs().max() > 0.01
-
-
-def test_a_member_s_own_loss_sees_what_the_population_has_learnt():
-    runs = [Run(seed) for seed in range(2)]
-    for member, run in enumerate(runs):
-        run(*batches(member, 0))
-    _, _, population = train_together(runs, 5)
-    stacked = stacked_batches(runs, 5)
-    generators = [torch.Generator().manual_seed(member) for member in range(2)]
-    together = population(*stacked, noise=population.draw(*stacked, generators=generators))
-    for member, run in enumerate(runs):
-        torch.manual_seed(member)
-        for name, term in run(*batches(member, 5)).items():
-            torch.testing.assert_close(together[name][member], term)
 
 
 def spoiled(update, stacked):
@@ -170,24 +182,6 @@ def test_members_of_unequal_shapes_are_refused():
         Population([])
 
 
-@pytest.mark.slow
-def test_compiled_losses_of_a_population_are_the_eager_ones():
-    runs = [Run(seed) for seed in range(2)]
-    population = Population(runs)
-    stacked = stacked_batches(runs, 0)
-    noise = population.draw(*stacked)
-    compiled = torch.compile(population, backend="eager", fullgraph=True)
-    eager = population(*stacked, noise=noise)
-    total_loss(eager).sum().backward()
-    expected = [parameter.grad.clone() for parameter in population.parameters()]
-    population.zero_grad()
-    terms = compiled(*stacked, noise=noise)
-    total_loss(terms).sum().backward()
-    for name, term in eager.items():
-        torch.testing.assert_close(terms[name], term)
-    torch.testing.assert_close([parameter.grad for parameter in population.parameters()], expected)
-
-
 def layer_norm_loss(seed):
     parts = Parts(seed, torch.float32)
     inputs = OBSERVATION_DIM + ACTION_DIM
@@ -206,21 +200,21 @@ def sac_loss(seed):
 
 @pytest.mark.parametrize("make", [layer_norm_loss, sac_loss])
 def test_members_may_be_any_loss_of_any_network(make):
+    """Without random numbers in its target and its policy, a member's loss is that of a single run."""
     alone, together = ([make(seed) for seed in range(3)] for _ in range(2))
     population = Population(together)
     batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(3)])
-    generators = [torch.Generator().manual_seed(member) for member in range(3)]
-    terms = population(batch.copy(), noise=population.draw(batch, generators=generators))
-    total_loss(terms).sum().backward()
-    for member, loss in enumerate(alone):
-        torch.manual_seed(member)
-        expected = loss(batch[member].copy())
-        for name, term in expected.items():
-            torch.testing.assert_close(terms[name][member], term, rtol=1e-5, atol=1e-5)
-        total_loss(expected).backward()
+    with Zeros():
+        terms = population(batch.copy())
+        total_loss(terms).sum().backward()
         stacks = {name.removeprefix("stacked."): p.grad for name, p in population.named_parameters()}
-        for name, parameter in loss.named_parameters():
-            torch.testing.assert_close(stacks[name][member], parameter.grad, rtol=1e-4, atol=1e-5)
+        for member, loss in enumerate(alone):
+            expected = loss(batch[member].copy())
+            for name, term in expected.items():
+                torch.testing.assert_close(terms[name][member], term, rtol=1e-5, atol=1e-5)
+            total_loss(expected).backward()
+            for name, parameter in loss.named_parameters():
+                torch.testing.assert_close(stacks[name][member], parameter.grad, rtol=1e-4, atol=1e-5)
 
 
 def test_a_network_that_two_losses_share_is_stacked_once():
@@ -229,76 +223,3 @@ def test_a_network_that_two_losses_share_is_stacked_once():
     assert len(list(population.parameters())) == len(list(runs[0].parameters()))
     read, trained = (population.stacked.get((name, "value_network_params")) for name in ("bellman_loss", "value_loss"))
     assert all(read.get(key) is trained.get(key) for key in read.keys(True, True))
-
-
-def test_without_noise_a_population_draws_from_the_global_generator():
-    population = Population([Run(seed) for seed in range(2)])
-    stacked = stacked_batches(population.members, 0)
-    torch.manual_seed(3)
-    first = population(*stacked)
-    other = population(*stacked)
-    torch.manual_seed(3)
-    again = population(*stacked)
-    assert torch.equal(first["loss_qvalue"], again["loss_qvalue"])
-    assert not torch.equal(first["loss_qvalue"], other["loss_qvalue"])
-
-
-def test_recording_the_draws_leaves_the_random_state_alone():
-    population = Population([Run(seed) for seed in range(2)])
-    stacked = stacked_batches(population.members, 0)
-    before = torch.get_rng_state()
-    generators = [torch.Generator().manual_seed(member) for member in range(2)]
-    assert len(population.draw(*stacked, generators=generators)) == 5  # three noisy inputs, two actions
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_evaluation_mode_draws_no_noise_for_the_discriminators():
-    population = Population([Run(seed) for seed in range(2)])
-    for run in population.members:
-        run.eval()
-    assert len(population.draw(*stacked_batches(population.members, 0))) == 2
-
-
-class Randomly(nn.Module):
-    def __init__(self, function):
-        super().__init__()
-        self.function = function
-
-    def forward(self, batch):
-        return {"loss": self.function(batch["observation"]).sum()}
-
-
-def filled_twice(x):
-    target = torch.empty_like(x)
-    target.normal_()
-    return target * x
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (nn.functional.dropout, "dropout"),
-        (lambda x: x[torch.randperm(len(x))], "randperm"),
-        (filled_twice, "in place"),
-        (lambda x: x + torch.randn(x.shape, generator=torch.Generator()), "generator of its own"),
-    ],
-)
-def test_draws_that_cannot_be_supplied_are_refused(function, message):
-    population = Population([Randomly(function), Randomly(function)])
-    batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(2)])
-    with pytest.raises(NotImplementedError, match=message):
-        population(batch)
-
-
-def test_bounds_and_moments_of_a_draw_are_kept():
-    def draws(x):
-        uniform = torch.empty_like(x).uniform_(-2.0, 3.0)
-        return uniform + torch.normal(x, 0.5) + torch.rand_like(x) + torch.empty_like(x).normal_(1.0, 2.0)
-
-    population = Population([Randomly(draws), Randomly(draws)])
-    batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(2)])
-    generators = [torch.Generator().manual_seed(member) for member in range(2)]
-    got = population(batch, noise=population.draw(batch, generators=generators))["loss"]
-    for member in range(2):
-        torch.manual_seed(member)
-        torch.testing.assert_close(got[member], draws(batch[member]["observation"]).sum())

@@ -1,10 +1,9 @@
-"""Buffers of many runs, sampled together, return the same batches as each buffer alone."""
+"""Buffers of many runs, sampled together, give each member its own rows."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.training.populations import PopulationReplay
 
 SIZES = (5, 3)
@@ -27,14 +26,6 @@ def transitions(count, seed):
 
 
 @pytest.fixture
-def alone():
-    """Three buffers, filled to different lengths, the last one beyond its capacity."""
-    buffers = [HybridReplayBuffer(transitions(50, 0), 20, SIZES) for _ in range(3)]
-    fill(buffers)
-    return buffers
-
-
-@pytest.fixture
 def together():
     replay = PopulationReplay(transitions(50, 0), 20, SIZES, 3)
     fill(replay.buffers)
@@ -47,20 +38,7 @@ def fill(buffers):
             buffer.extend(transitions(7, 10 * member + part))
 
 
-def streams():
-    return [torch.Generator().manual_seed(seed) for seed in range(3)]
-
-
-@pytest.mark.parametrize("sizes", [None, (4, 6), (4, 0), (0, 6)])
-def test_each_member_gets_what_its_own_buffer_draws(alone, together, sizes):
-    ours, theirs = streams(), streams()
-    for _ in range(3):
-        batch = together.sample(sizes, ours)
-        for member, buffer in enumerate(alone):
-            assert (batch[member] == buffer.sample(sizes, generator=theirs[member])).all()
-
-
-def test_without_generators_each_member_gets_its_own_rows_uniformly(together):
+def test_each_member_gets_its_own_rows_uniformly(together):
     torch.manual_seed(0)
     batch = together.sample((2000, 2000))
     for member, buffer in enumerate(together.buffers):
@@ -73,13 +51,18 @@ def test_without_generators_each_member_gets_its_own_rows_uniformly(together):
     assert batch["real"].sum(-1).tolist() == [2000] * 3
 
 
+def sample(replay):
+    torch.manual_seed(3)
+    return replay.sample()
+
+
 def test_a_member_goes_on_from_a_checkpoint_of_its_own(together):
     state = together.buffers[1].state_dict()
-    before = together.sample(generators=streams())
+    before = sample(together)
     together.buffers[1].extend(transitions(9, 99))
-    assert (together.sample(generators=streams()) != before).any()
+    assert (sample(together) != before).any()
     together.buffers[1].load_state_dict(state)
-    assert (together.sample(generators=streams()) == before).all()
+    assert (sample(together) == before).all()
 
 
 def test_a_member_without_simulated_rows_is_named():

@@ -7,7 +7,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from torchrl_h2o.training.divergence import DivergenceError
-from torchrl_h2o.training.environments import preprocessing_of, task_of
+from torchrl_h2o.training.environments import task_of
 from torchrl_h2o.training.job import prepare
 from torchrl_h2o.training.judging import DATA, best_trial, judge, run_settings, table_of_population, write_failure
 from torchrl_h2o.training.mending import find_missing_effects
@@ -37,33 +37,20 @@ def run_population(cfg: DictConfig, members: dict[str, DictConfig], directory: P
         own.mended = find_missing_effects(own, task_of(own), real, directory / name)
     wall_s = time.perf_counter() - start
     outcomes = train_population(make_learner, cfg, members, real, directory)
-    behaviour = behaviour_of(real, cut=is_cut(cfg))
     in_reality = {}
     for name, outcome in outcomes.items():
         own, folder = members[name], directory / name
-        settings, task, preprocessing = run_settings(own, real), task_of(own), preprocessing_of(own)
         if outcome.failure is not None:
-            write_failure(folder, outcome.failure, settings)
+            write_failure(folder, outcome.failure, run_settings(own, real))
             in_reality[name] = None
             continue
-        in_reality[name] = judge(
-            task,
-            task.make_reality(own.final_episodes, preprocessing),
-            task.make_simulator(1, preprocessing),
-            {"H2O+": outcome.policy},
-            {"H2O+": outcome},
-            behaviour,
-            folder,
-            episodes=own.final_episodes,
-            settings=settings,
-            wall_s=wall_s + outcome.seconds,
-            preprocessing=preprocessing,
-        )["H2O+"]
+        found = judge(own, real, {"H2O+": outcome.policy}, {"H2O+": outcome}, folder, wall_s + outcome.seconds)
+        in_reality[name] = found["H2O+"]
     trials = None
     if len(cfg.gaps or [None]) == 1:  # returns in different simulators cannot be compared
         trials = {name: best_trial(outcome.rows) for name, outcome in outcomes.items() if outcome.failure is None}
-    table = table_of_population(in_reality | {DATA: behaviour}, directory, task_of(cfg).seconds_per_step, trials)
-    tqdm.write(table)
+    behaviour = {DATA: behaviour_of(real, cut=is_cut(cfg))}
+    tqdm.write(table_of_population(in_reality | behaviour, directory, task_of(cfg).seconds_per_step, trials))
     failures = {name: outcome.failure for name, outcome in outcomes.items() if outcome.failure is not None}
     if failures:
         which = ", ".join(f"{name} after {one['updates']:,} updates ({one['why']})" for name, one in failures.items())
