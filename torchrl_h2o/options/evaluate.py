@@ -20,7 +20,7 @@ class EvaluateOptions(Options):
     seed: Seed = option(1_000_000, "the default gives the same episodes as the table of the run")
     film: str | None = option(
         "evaluation.mp4",
-        "file in the run's folder, or here if that cannot be written; without a suffix, a folder of PNG frames; or null",
+        "file in the run's folder, or here if that cannot be written; without suffix, a folder of PNG frames; or null",
     )
     seconds: Positive = option(10.0, "length of the film")
     trust: Trust = option(

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import Connection
-from typing import Protocol
 
 import torch
 from omegaconf import DictConfig
@@ -21,27 +20,6 @@ from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.training.task import Task
 
 ENDS_WITHIN = 3.0  # s, after which a second process that still evaluates is ended
-
-
-class Evaluator(Protocol):
-    """Evaluates one policy at a time."""
-
-    @property
-    def is_done(self) -> bool:
-        """Whether :meth:`result` returns without waiting."""
-        ...
-
-    def start(self, policy: torch.nn.Module) -> None:
-        """Begins to evaluate a policy with its present parameters."""
-        ...
-
-    def result(self) -> Evaluation:
-        """The evaluation of the last policy; waits for it."""
-        ...
-
-    def close(self) -> None:
-        """Ends the evaluator's process, if it has one."""
-        ...
 
 
 def evaluator_of(cfg: DictConfig, task: Task, preprocessing: Preprocessing) -> Evaluator:
@@ -56,27 +34,36 @@ def evaluator_of(cfg: DictConfig, task: Task, preprocessing: Preprocessing) -> E
         preprocessing: preprocessing of the observations.
     """
     make_env = partial(task.make_reality, cfg.eval_episodes, preprocessing)
-    return (_SecondProcess if cfg.overlap else _ThisProcess)(make_env, cfg.eval_episodes)
+    return (SecondProcess if cfg.overlap else ThisProcess)(make_env, cfg.eval_episodes)
 
 
-class _ThisProcess:
-    def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
-        self._env, self._episodes = make_env(), episodes
+class ThisProcess:
+    """Evaluates one policy at a time: in this process, as soon as it gets one.
+
+    Args:
+        make_env: builds ``reality``.
+        episodes: number of episodes of an evaluation.
+    """
 
     is_done = True
 
+    def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
+        self._env, self._episodes = make_env(), episodes
+
     def start(self, policy: torch.nn.Module) -> None:
+        """Begins to evaluate a policy with its present parameters."""
         self._result = evaluate(self._env, policy, self._episodes)
 
     def result(self) -> Evaluation:
+        """The evaluation of the last policy; waits for it."""
         return self._result
 
     def close(self) -> None:
-        pass
+        """Ends the evaluator's process, if it has one."""
 
 
-class _SecondProcess:
-    """Sends policies through a pipe to a second process.
+class SecondProcess:
+    """The same in a second process, to which it sends policies through a pipe.
 
     The second process ends when the pipe closes, also if this process is killed.
     """
@@ -91,6 +78,7 @@ class _SecondProcess:
 
     @property
     def is_done(self) -> bool:
+        """Whether :meth:`result` returns without waiting."""
         return self._pipe.poll()
 
     def start(self, policy: torch.nn.Module) -> None:
@@ -109,6 +97,9 @@ class _SecondProcess:
         self._process.join(ENDS_WITHIN)
         self._process.terminate()
         self._process.join()
+
+
+Evaluator = ThisProcess | SecondProcess
 
 
 @contextmanager
