@@ -67,28 +67,14 @@ class CloseTheLoopOptions(Options):
 
     simulator: SimulatorOptions
     data: Data = option(
-        "recorded",
-        "recorded (needs simulator.recorded), a Minari name or folder, a D4RL file, a log, or a TED folder; several "
-        "logs as [a.csv,b.csv], logs/*.csv or a folder",
+        "recorded", "recorded, Minari name, D4RL file, log, TED folder; several logs: [a.csv,b.csv], *.csv"
     )
-    columns: Layout | None = option(
-        None, "layout of a log: a YAML file, or the name of one in torchrl_h2o/data/readers/logs"
-    )
-    transitions: Count | None = option(
-        5_000, "consecutive rows to use from a longer recording, of each log; null for all"
-    )
+    columns: Layout | None = option(None, "layout of a log: a YAML file, or the name of one of the library's")
+    transitions: Count | None = option(5_000, "consecutive rows to use of each log; null for all")
     first_row: Annotated[int, Field(ge=0)] = option(0, "index of the first row used, of each log")
-    held_out: HeldOut = option(
-        0.25, "fraction of the rows, from the end, on which errors are reported; or names: [c.csv]"
-    )
-    audit: bool | Literal["warn"] = option(
-        True, "looks for faults in the data first; severe ones stop the run, unless audit=warn; false skips it"
-    )
-    start_from: AnyPath | None = option(
-        None, "report.json of an unfinished run, or its folder: the search begins with its effects"
-    )
+    held_out: HeldOut = option(0.25, "rows, from the end, on which errors are reported; or names of logs: [c.csv]")
+    audit: bool | Literal["warn"] = option(True, "looks for faults in the data; severe ones stop the run, unless warn")
+    start_from: AnyPath | None = option(None, "report.json of an unfinished run, with whose effects the search begins")
     minutes: Positive | None = option(None, "for the command, with the audit and the report; null: as long as it takes")
-    catalogue: Pattern | list[Pattern] | None = option(
-        None, "effects to try, as patterns of class names: [Gravity,Joint*]; null for all"
-    )
+    catalogue: Pattern | list[Pattern] | None = option(None, "effects to try, as patterns: [Gravity,Joint*]; null: all")
     seed: Seed = option(0)

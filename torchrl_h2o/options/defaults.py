@@ -34,12 +34,8 @@ def store_defaults(name: str, model: type[Options]) -> None:
     required = {field.alias or key: "???" for key, field in model.model_fields.items() if field.is_required()}
     store = ConfigStore.instance()
     store.store(name, required | model.model_construct().model_dump(by_alias=True))
-    text = {
-        "app_name": "${hydra.job.name}",
-        "header": "",
-        "footer": "",
-        "template": HELP.format(options=described(model)),
-    }
+    template = HELP.format(options=described(model))
+    text = {"app_name": "${hydra.job.name}", "header": "", "footer": "", "template": template}
     store.store(name, text, group="hydra/help")
 
 
@@ -53,8 +49,7 @@ def described(model: type[Options]) -> str:
     """
     schema, lines = model.model_json_schema(), []
     for name, entry in schema["properties"].items():
-        if "$ref" in entry:  # a group of options, such as env, which a file of its own describes
-            lines.append(f"{name}: a group of options")
+        if "$ref" in entry:  # a group of options, such as env, which files of its own describe
             continue
         default = f"={as_typed(entry['default'])}" if entry.get("default", "???") != "???" else ""
         meaning = f" {entry['help']}" if entry.get("help") else ""

@@ -18,13 +18,6 @@ class EvaluateOptions(Options):
     world: Literal["reality", "simulator"] = Field("reality", alias="in")
     episodes: Few = option(5)
     seed: Seed = option(1_000_000, "the default gives the same episodes as the table of the run")
-    film: str | None = option(
-        "evaluation.mp4",
-        "file in the run's folder, or here if that cannot be written; without suffix, a folder of PNG frames; or null",
-    )
+    film: str | None = option("evaluation.mp4", "in the run's folder, or here; without suffix, a folder of PNG frames")
     seconds: Positive = option(10.0, "length of the film")
-    trust: Trust = option(
-        False,
-        "names in the folder's config.yaml that this library does not have, as in [my_package.MyEnv], "
-        "or true for all. That code is run, so first read what it does",
-    )
+    trust: Trust = option(False, "foreign names in the folder's config.yaml whose code is run: first read what it does")

@@ -94,44 +94,24 @@ class ExperimentOptions(Options):
     seed: Seed = option(0)
     gap: Gap | None = option(None, "dynamics gap of the paper for the simulator")
     gap_strength: float | None = option(None, "strength of the gap; null for the paper's")
-    gap_fix: AnyPath | None = option(
-        None, "report.json of close-the-loop, whose effects the simulator gets after all others"
-    )
-    mend: bool | Literal["posterior"] | None = option(
-        None,
-        "true: adds the effects that the run's own data show and the simulator lacks, found before training; "
-        "posterior: the same, and each world has values drawn from the report's intervals and alternatives",
-    )
+    gap_fix: AnyPath | None = option(None, "report.json of close-the-loop, whose effects the simulator gets as well")
+    mend: bool | Literal["posterior"] | None = option(None, "adds effects that the simulator lacks, or draws of them")
     mended: dict[str, Any] | None = option(None, "these effects; written by the run")
-    data: Data = option(
-        "recorded", "recorded, a Minari name or folder, a D4RL file, a robot's log, or a folder of TED; several: [a,b]"
-    )
-    columns: Layout | None = option(
-        None, "YAML file that describes a log's columns, or the name of one that ships with the library"
-    )
+    data: Data = option("recorded", "recorded, Minari name, D4RL file, robot's log or TED folder; several: [a,b]")
+    columns: Layout | None = option(None, "YAML file that describes a log's columns, or a name of the library's")
     data_seconds: Positive | None = option(None, "only the first seconds of the real data, s; null uses all")
 
     # H2O+
-    backbone: Literal["expectile", "sparse", "exponential"] = option(
-        "expectile", "in-sample value loss: expectile (IQL), sparse (SQL) or exponential (EQL, XQL)"
-    )
+    backbone: Literal["expectile", "sparse", "exponential"] = option("expectile", "value loss: IQL's, SQL's or EQL's")
     expectile: Inside = option(0.7, "tau of the expectile backbone, IQL's own; the authors' robot script has 0.9")
-    value_alpha: Positive = option(
-        1.0, "alpha of the sparse and the exponential backbone, in units of the scaled return"
-    )
+    value_alpha: Positive = option(1.0, "alpha of sparse and exponential, in units of the scaled return")
     mixing: Share = option(0.1, "lambda of Eq. (7)")
     ratio: bool = option(True, "whether simulated rows are weighted by the dynamics ratio")
-    ratio_estimator: Literal["paper", "change", "pairs"] = option(
-        "paper", "paper; change: reads s' - s, noise on it alone; pairs: trained on simulated real (s, a)"
-    )
+    ratio_estimator: Literal["paper", "change", "pairs"] = option("paper", "see torchrl_h2o/training/ratio.py")
     input_noise: NotNegative = option(0.1, "paper: standard deviation of the noise on the discriminators' inputs")
-    change_noise: Literal["auto"] | NotNegative = option(
-        "auto", "change, pairs: std of the noise on s' - s, in units of its spread in the real data; auto: 1, 0.05"
-    )
+    change_noise: Literal["auto"] | NotNegative = option("auto", "change, pairs: noise on s' - s; auto: 1, 0.05")
     ratio_weight_penalty: NotNegative = option(2e-3, "pairs: L2 penalty of the discriminator's weights")
-    ratio_logit_bound: Positive | None = option(
-        4.0, "change, pairs: bound of each logit given (s, a, s'); the log-ratio lies within twice this"
-    )
+    ratio_logit_bound: Positive | None = option(4.0, "change, pairs: bound of each logit given (s, a, s')")
 
     # Budget: steps_per_epoch simulator steps, then updates_per_epoch updates, repeated
     updates: Count = option(1_000_000, "updates of the networks, rounded up to whole epochs")
@@ -140,9 +120,7 @@ class ExperimentOptions(Options):
     updates_per_epoch: Count = option(1000)
     batch_size: Rows = option([128, 128], "real, simulated")
     discriminator_batch_size: Rows = option([256, 256], "real, simulated")
-    sim_capacity: Positive = option(
-        10.0, "size of the simulated buffer, as a multiple of the number of real transitions"
-    )
+    sim_capacity: Positive = option(10.0, "size of the simulated buffer, in multiples of the real transitions")
     sim_capacity_min: Count = option(100_000, "smallest size of the simulated buffer, for runs with little real data")
 
     # Targets of Q
@@ -155,9 +133,7 @@ class ExperimentOptions(Options):
     num_qvalue_nets: Few = option(2, "ensemble of Q; targets use its minimum")
     lr: Positive = option(3e-4)
     lr_end_factor: Share = option(1.0, "final learning rate as a fraction of lr; it changes linearly")
-    tau: Annotated[float, Field(gt=0, le=1)] = option(
-        0.005, "weight of the online networks in an update of the targets"
-    )
+    tau: Annotated[float, Field(gt=0, le=1)] = option(0.005, "weight of the online networks in an update of targets")
     target_entropy: Literal["auto"] | float = option("auto", "in nats; auto is -dim(A)")
     compiled: Literal["auto"] | bool = option("auto", "torch.compile: true, false, or auto (from 10,000 updates on)")
     threads: Count = option(2, "number of threads of torch")
@@ -165,35 +141,23 @@ class ExperimentOptions(Options):
     # Preprocessing
     reward_offset: float = option(0.0, "the reward in the losses is reward_scale * (reward + reward_offset)")
     reward_scale: float = option(1.0)
-    normalise_observation: bool = option(
-        False, "whether observations are standardised with the real data's mean and std"
-    )
-    observation_norm: NormOptions | None = option(
-        None, "this mean and std, as {loc: [...], scale: [...]}; null measures them"
-    )
+    normalise_observation: bool = option(False, "standardises observations with the real data's mean and std")
+    observation_norm: NormOptions | None = option(None, "{loc: [...], scale: [...]} for that; null measures them")
     frames: Few = option(1, "number of successive observations that are stacked")
-    action_history: Annotated[int, Field(ge=0, le=MOST)] = option(
-        0, "number of past actions shown beside the observations"
-    )
+    action_history: Annotated[int, Field(ge=0, le=MOST)] = option(0, "number of past actions beside the observations")
 
     # Evaluation and files
     eval_every: Count = option(10, "epochs")
     eval_episodes: Few = option(5)
-    overlap: bool = option(
-        False, "whether a second process evaluates in reality during the next updates (same results)"
-    )
-    keep: Literal["last", "best_in_simulator"] = option(
-        "last", "policy that the run returns; best_in_simulator, meant for mend=true, compares those at all evaluations"
-    )
+    overlap: bool = option(False, "whether a second process evaluates during the next updates (same results)")
+    keep: Literal["last", "best_in_simulator"] = option("last", "policy that the run returns; the latter for mend=true")
     trial_episodes: Few = option(10, "best_in_simulator: episodes of each policy in the simulator")
     final_episodes: Few = option(5)
     checkpoint_every: Count = option(1, "epochs")
     render: bool = option(True, "whether to film the policy, where MuJoCo can render")
     resume: RunFolder | None = option("???", "folder of an interrupted run")
     trust: Trust = option(
-        False,
-        "with resume: names in the folder's config.yaml that this library does not have, as in [my_package.MyEnv], or "
-        "true for all. That code is run: read it first",
+        False, "with resume: foreign names in the folder's config.yaml whose code is run: read it first"
     )
 
 
