@@ -33,36 +33,8 @@ def evaluators(compose):
         evaluator.close()
 
 
-def test_a_second_process_evaluates_the_policy_as_it_was_at_the_start(evaluators):
-    here, beside, actor = evaluators
-    for _ in range(2):
-        here.start(actor)
-        beside.start(actor)
-        for parameter in actor.parameters():
-            parameter.data.mul_(1.5)
-        assert beside.result() == here.result()
-
-
 def refuse(observation):
     raise ValueError(f"no action for {len(observation)} values")
-
-
-def test_an_error_in_the_second_process_is_raised_in_this_one(evaluators):
-    _, beside, actor = evaluators
-    beside.start(TensorDictModule(refuse, in_keys=["observation"], out_keys=["action"]))
-    with pytest.raises(ValueError, match="no action for"):
-        beside.result()
-    beside.start(actor)
-    assert len(beside.result().returns) == 1
-
-
-def test_a_second_process_that_is_gone_is_named_with_what_to_do(evaluators):
-    _, beside, actor = evaluators
-    beside.start(actor)
-    (process,) = multiprocessing.active_children()
-    process.kill()
-    with pytest.raises(RuntimeError, match="overlap=false"):
-        beside.result()
 
 
 def refuse_with_a_lambda(observation):
@@ -71,13 +43,29 @@ def refuse_with_a_lambda(observation):
     raise error
 
 
-@pytest.mark.slow
-def test_an_error_that_cannot_be_sent_arrives_with_its_text_and_its_traceback(evaluators):
-    _, beside, _ = evaluators
+def test_a_second_process_gives_the_returns_and_the_errors_of_this_one(evaluators):
+    """One test, because starting a process takes as long as all of it."""
+    here, beside, actor = evaluators
+    for _ in range(2):  # the policy as it is at the start
+        here.start(actor)
+        beside.start(actor)
+        for parameter in actor.parameters():
+            parameter.data.mul_(1.5)
+        assert beside.result() == here.result()
+
+    beside.start(TensorDictModule(refuse, in_keys=["observation"], out_keys=["action"]))
+    with pytest.raises(ValueError, match="no action for"):
+        beside.result()
     beside.start(TensorDictModule(refuse_with_a_lambda, in_keys=["observation"], out_keys=["action"]))
-    with pytest.raises(RuntimeError, match="ValueError: no action") as caught:
+    with pytest.raises(RuntimeError, match="ValueError: no action") as caught:  # an error that cannot be sent
         beside.result()
     assert "in refuse_with_a_lambda" in caught.value.__notes__[0]
+
+    beside.start(actor)
+    (process,) = multiprocessing.active_children()
+    process.kill()
+    with pytest.raises(RuntimeError, match="overlap=false"):
+        beside.result()
 
 
 @pytest.mark.slow

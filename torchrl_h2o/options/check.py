@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -47,9 +48,14 @@ def check_options(cfg: DictConfig, model: type[Options], *, saved: bool = False)
     except ValidationError as error:
         accepted = frozenset({UNKNOWN, NOT_THERE} if saved else ())
         errors = error.errors(include_url=False)
-        problems = _problems(errors, accepted, model.model_json_schema(), cast("Mapping[str, Any]", values))
+        problems = _problems(errors, accepted, _schema_of(model), cast("Mapping[str, Any]", values))
         if problems:
             raise ValueError("; ".join(problems)) from None
+
+
+@cache
+def _schema_of(model: type[Options]) -> Schema:
+    return model.model_json_schema()
 
 
 def _given(cfg: DictConfig) -> Any:
