@@ -30,6 +30,7 @@ class PopulationLearner:
     def __init__(self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float) -> None:
         self.learners, self.replay, self.tau = learners, replay, tau
         self.population = Population([cast(nn.Module, learner.terms_of) for learner in learners])  # H2O+'s are its loss
+        self.losses_of: Callable[..., dict[str, Tensor]] = self.population  # may be compiled
         self.optimiser = torch.optim.Adam(self.population.parameters(), lr=lr, fused=True)
         self.updates = 0
         self.failures: dict[int, dict] = {}
@@ -62,7 +63,7 @@ class PopulationLearner:
     def _differentiate(self) -> tuple[dict[str, Tensor], list[TensorDictBase]]:
         """Make the first half of an update: compute losses and gradients. Return the terms and the batches."""
         batches = self.sample()
-        terms = self.population(*batches)
+        terms = self.losses_of(*batches)
         # on a GPU the gradients stay in the same memory, where a graph of the step reads them
         self.optimiser.zero_grad(set_to_none=self.replay.device.type == "cpu")
         total_loss(terms).sum().backward()  # a member's loss depends on its own parameters only
