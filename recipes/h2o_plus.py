@@ -5,7 +5,7 @@ python recipes/h2o_plus.py data=standing_still.txt                     # the sam
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/h2o_plus.py mend=true                                   # first adds what the simulator lacks to it
 python recipes/h2o_plus.py ratio_estimator=pairs                       # another estimator of the dynamics ratio
-python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # every option of config/ can be overridden
+python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # --help lists the options
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run
 
 Other methods, baselines, many runs at once and simulators in worker processes: recipes/train.py.
