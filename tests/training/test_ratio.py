@@ -24,12 +24,6 @@ def test_paper_has_two_networks_and_no_pairs(compose):
     assert make_ratio_loss(cfg, 4, 1, replay).estimator.sa_network is not None
 
 
-def test_an_unknown_estimator_is_refused(compose):
-    cfg, real = compose("ratio_estimator=best", config="train")
-    with pytest.raises(ValueError, match="choose paper, change or pairs"):
-        pairs_of(cfg, real)
-
-
 def test_pairs_of_a_simulator_equal_to_reality_are_equal(compose):
     options = ("ratio_estimator=pairs", "env.simulator=${env.reality}", "frames=2")
     cfg, real = compose(*options, config="train")

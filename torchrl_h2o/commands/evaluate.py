@@ -18,7 +18,7 @@ from torchrl_h2o.options import EvaluateOptions
 from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.training.environments import make_reality, make_simulator, preprocessing_of, task_of
 from torchrl_h2o.training.film import film
-from torchrl_h2o.training.methods import method_named
+from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.returns import evaluate
 from torchrl_h2o.training.trained_policy import load_policy
 from torchrl_h2o.whole_file import write_text
@@ -31,7 +31,7 @@ def main(options: DictConfig) -> None:
     directory, world = Path(options.checkpoint), options["in"]
     folder = directory if os.access(directory, os.W_OK) else Path.cwd()
     cfg = load_config(directory, trust=options.trust)
-    method = options.method or method_named(cfg.method).title
+    method = options.method or METHODS[cfg.method].title
     policy = load_policy(cfg, directory, method)
     result = evaluate(WORLDS[world](cfg, options.episodes), policy, options.episodes, options.seed)
     seconds = [round(length * cfg.env.seconds_per_step, 2) for length in result.lengths]

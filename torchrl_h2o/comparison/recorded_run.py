@@ -10,7 +10,7 @@ from torchrl_h2o.comparison.results_file import append_run
 from torchrl_h2o.options import TrainOptions, check_options
 from torchrl_h2o.training.divergence import DivergenceError
 from torchrl_h2o.training.job import run_job
-from torchrl_h2o.training.methods import method_named
+from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.run_folder import claimed, open_run
 
 
@@ -30,7 +30,7 @@ def train_and_record(cfg: DictConfig, directory: Path) -> None:
         message = f"{failure} in an earlier attempt, and the same settings repeat it; remove {directory} to try again"
         raise DivergenceError(message, failure, 0)
     if not summary.exists():
-        run_job(cfg, directory, [method_named(name) for name in (cfg.method, *(cfg.get("baselines") or ()))])
+        run_job(cfg, directory, [METHODS[name] for name in (cfg.method, *(cfg.get("baselines") or ()))])
     if cfg.results is not None:
         append_run(Path(cfg.results), cfg, directory)
 

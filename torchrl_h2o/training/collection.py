@@ -70,12 +70,10 @@ def collecting(
             stack.callback(torch.set_num_threads, threads)
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": {"num_threads": threads}}
             collector = Collector(_of_worker(cfg), actor, backend="process", set_truncated=True, **options)
-        elif chosen.backend == "ray":
+        else:  # ray
             stack.enter_context(_ray(chosen))
             options |= {"num_collectors": chosen.workers, "sync": True, "backend_options": _ray_options(cfg, keys)}
             collector = Collector(_of_worker(cfg), actor, backend="ray", **options)
-        else:
-            raise ValueError(f"collector.backend={chosen.backend}: choose direct, process or ray")
         stack.callback(collector.shutdown)
         yield collector
 

@@ -18,20 +18,7 @@ from torchrl_h2o.residuals import Simulation, simulate_transitions
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.task import Task
 
-PAPER, CHANGE, PAIRS = "paper", "change", "pairs"
-CHANGE_NOISE = {CHANGE: 1.0, PAIRS: 0.05}  # change_noise=auto
-
-
-def ratio_estimator_of(cfg: DictConfig) -> str:
-    """Returns ``ratio_estimator``.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
-    name = cfg.ratio_estimator
-    if name not in (PAPER, CHANGE, PAIRS):
-        raise ValueError(f"ratio_estimator={name}: choose {PAPER}, {CHANGE} or {PAIRS}")
-    return name
+CHANGE_NOISE = {"change": 1.0, "pairs": 0.05}  # change_noise=auto
 
 
 def make_ratio_loss(
@@ -49,15 +36,15 @@ def make_ratio_loss(
     """
     following = replay.next_observation
     sizes = observation_dim, action_dim, cfg.num_cells
-    if ratio_estimator_of(cfg) == PAPER:
+    if cfg.ratio_estimator == "paper":
         estimator = make_dynamics_ratio_estimator(*sizes, next_observation=following)
         return DynamicsRatioLoss(estimator, input_noise=cfg.input_noise)
     change = {
         "next_observation": following,
         "change_scale": fit_change_scale(replay.real[:], next_observation=following),
     }
-    noise = CHANGE_NOISE[ratio_estimator_of(cfg)] if cfg.change_noise == "auto" else cfg.change_noise
-    if ratio_estimator_of(cfg) == CHANGE:
+    noise = CHANGE_NOISE[cfg.ratio_estimator] if cfg.change_noise == "auto" else cfg.change_noise
+    if cfg.ratio_estimator == "change":
         estimator = make_dynamics_ratio_estimator(*sizes, **change, logit_bound=(None, cfg.ratio_logit_bound))
         return DynamicsRatioLoss(estimator, input_noise={following: noise}, delay_estimator=delayed)
     estimator = make_dynamics_ratio_estimator(
@@ -91,7 +78,7 @@ def make_pairs(
     Raises:
         ValueError: if the state of the simulator cannot be set from the task's observation.
     """
-    if ratio_estimator_of(cfg) != PAIRS:
+    if cfg.ratio_estimator != "pairs":
         return None
     simulation = Simulation.from_env(task.make_simulator())
     following = simulate_transitions(simulation, real)

@@ -1,6 +1,5 @@
 """The six methods of the paper's comparison and two further ones, by name."""
 
-from torchrl_h2o.training.loop import Method
 from torchrl_h2o.training.methods.cql import CQL
 from torchrl_h2o.training.methods.darc import DARC
 from torchrl_h2o.training.methods.h2o import H2O
@@ -20,14 +19,3 @@ METHODS = {
     "rlpd": RLPD,  # both; not in the paper
     "td3": WEIGHTED_TD3,
 }
-
-
-def method_named(name: str) -> Method:
-    """Returns one of :data:`METHODS`.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
-    if name not in METHODS:
-        raise ValueError(f"method={name}: choose {', '.join(METHODS)}")
-    return METHODS[name]

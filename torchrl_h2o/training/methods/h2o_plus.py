@@ -55,16 +55,9 @@ H2O_PLUS = Method("H2O+", make_learner)
 
 
 def make_value_loss(cfg: DictConfig, observation_dim: int) -> InSampleValueLoss:
-    """Build the value loss given by ``cfg.backbone``.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
+    """Build the value loss given by ``cfg.backbone``."""
     value_network = make_value(observation_dim, cfg.num_cells)
     if cfg.backbone == "expectile":
         return ExpectileValueLoss(value_network, cfg.expectile)
-    if cfg.backbone == "sparse":
-        return SparseValueLoss(value_network, cfg.value_alpha)
-    if cfg.backbone == "exponential":
-        return ExponentialValueLoss(value_network, cfg.value_alpha)
-    raise ValueError(f"backbone={cfg.backbone}: choose expectile, sparse or exponential")
+    loss = {"sparse": SparseValueLoss, "exponential": ExponentialValueLoss}[cfg.backbone]
+    return loss(value_network, cfg.value_alpha)
