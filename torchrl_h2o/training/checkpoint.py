@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from torchrl_h2o.data import DataError
 from torchrl_h2o.whole_file import whole_file
@@ -148,11 +149,11 @@ def _compact(state: Any) -> Any:
         is_view = isinstance(value, Tensor) and value.nbytes < value.untyped_storage().nbytes()
         return value.clone() if is_view else value
 
-    return torch.utils._pytree.tree_map(one, state)
+    return pytree.tree_map(one, state)
 
 
 def _tensors(state: Any) -> Iterator[Tensor]:
-    return (value for value in torch.utils._pytree.tree_leaves(state) if isinstance(value, Tensor))
+    return (value for value in pytree.tree_leaves(state) if isinstance(value, Tensor))
 
 
 def _require_alike(saved: Mapping[str, Any], own: Mapping[str, Any]) -> None:

@@ -92,10 +92,10 @@ def foreign_names(cfg: DictConfig | None) -> dict[str, tuple[str, str]]:
     collector = entries.get("collector")
     for part, known in RAY.items():
         settings = collector.get(part) if isinstance(collector, Mapping) else None
-        for key in settings.keys() - known if isinstance(settings, Mapping) else ():
-            if settings[key] is not None:
+        for key, value in settings.items() if isinstance(settings, Mapping) else ():
+            if key not in known and value is not None:
                 entry = f"collector.{part}.{key}"
-                problem = f"{key}={settings[key]!r} of Ray starts programs or connects to other machines"
+                problem = f"{key}={value!r} of Ray starts programs or connects to other machines"
                 found.setdefault(entry, (entry, problem))
     return found
 
