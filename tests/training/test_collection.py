@@ -121,11 +121,3 @@ def test_ray_that_is_not_installed_is_named_with_what_to_do(compose, monkeypatch
     monkeypatch.setattr("torchrl_h2o.options.train.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl_h2o\[ray\]'"):
         check_options(compose("collector=ray")[0], TrainOptions)
-
-
-def test_a_run_of_an_earlier_version_collects_in_its_own_process(compose, actor):
-    cfg, _ = compose()
-    del cfg.collector
-    check_options(cfg, TrainOptions, saved=True)
-    with open_collector(cfg, actor) as collector:
-        assert next(iter(collector)).shape == (1, 40)

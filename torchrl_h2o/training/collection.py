@@ -19,8 +19,6 @@ from torchrl_h2o.training.environments import simulator_maker
 from torchrl_h2o.training.ongoing_episodes import saves_episodes
 from torchrl_h2o.training.progress import Budget
 
-DIRECT = OmegaConf.create({"backend": "direct"})
-
 
 class SeededCollector(Collector):
     """Collector of a Ray worker whose seed also seeds the policy's noise, as in TorchRL's other workers."""
@@ -60,7 +58,7 @@ def collecting(
         actor: the policy.
         keys: the entries of a transition that Ray's workers send back.
     """
-    chosen = _chosen(cfg)
+    chosen = cfg.collector
     options = {"frames_per_batch": cfg.steps_per_epoch, "reset_at_each_iter": True}
     with ExitStack() as stack:
         if chosen.backend == "direct":
@@ -76,10 +74,6 @@ def collecting(
             collector = Collector(_of_worker(cfg), actor, backend="ray", **options)
         stack.callback(collector.shutdown)
         yield collector
-
-
-def _chosen(cfg: DictConfig) -> DictConfig:
-    return cfg.get("collector") or DIRECT  # not an option of h2o_plus.py
 
 
 def _of_worker(cfg: DictConfig) -> EnvCreator:
