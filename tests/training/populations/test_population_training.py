@@ -37,16 +37,16 @@ def test_every_combination_is_a_member_with_a_name(compose):
 
 @pytest.mark.slow
 def test_each_member_learns_with_its_own_settings(compose, tmp_path):
-    """From the networks of a single run: its losses are near, and its Q learns to explain the same rewards."""
-    cfg, real = compose("updates=200", "updates_per_epoch=100", "seeds=[0,1]", "gaps=[null,gravity]", "lr=0.003")
+    """Its discriminators become about as accurate as those of a single run from the same networks."""
+    cfg, real = compose("updates=200", "updates_per_epoch=100", "seeds=[0,1]", "gaps=[null,gravity]")
     outcomes = train_all(cfg, real, tmp_path / "population")
     assert len({outcome.rows[-1]["loss_qvalue"] for outcome in outcomes.values()}) == 4
     name = "seed_0_gravity"
     _, training = train(H2O_PLUS, members_of(cfg)[name], real, tmp_path / name)
-    for figure in ("loss_qvalue", "loss_value", "accuracy"):
+    for figure, tolerance in (("accuracy", 0.2), ("ratio_of_sim", 0.5)):
         mine, alone = ([row[figure] for row in rows] for rows in (outcomes[name].rows, training.rows))
-        assert mine != alone
-        assert mine == pytest.approx(alone, rel=0.7, abs=0.2), figure
+        assert mine != alone  # other random numbers
+        assert mine == pytest.approx(alone, abs=tolerance), figure
 
 
 @pytest.mark.slow
