@@ -8,6 +8,8 @@ import hydra
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+import torchrl_h2o.options  # noqa: F401  (makes the default values known to Hydra)
+
 CONFIG = Path(__file__).parents[1] / "config"
 
 
