@@ -76,6 +76,7 @@ def report_page(report: ReportContents) -> str:
         remedy=REMEDY,
         held=_held(report),
         pictures=_pictures(report),
+        colours={"before": plots.BEFORE, "after": plots.AFTER},
     )
 
 

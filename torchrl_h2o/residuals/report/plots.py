@@ -3,11 +3,17 @@
 They are small, so that a grid of them also fits on a phone.
 """
 
-from collections.abc import Callable, Sequence
-from html import escape
-from typing import Any
+import html
+import re
+from collections.abc import Sequence
+from io import StringIO
+from typing import Any, Literal
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from torchrl_h2o.residuals.report.contents import Interval
 from torchrl_h2o.residuals.report.errors import DimensionError, HorizonError
@@ -15,61 +21,76 @@ from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import ShownWindow, WindowQuantity
 from torchrl_h2o.residuals.report.words import number
 
-# sizes in the units of the pictures, of which 800 are a picture's width
-WIDTH, HEIGHT, LETTER = 800, 480, 12
-SERIES = ("before", "after")
-Range = tuple[float, float]
+# placeholder colours, and the page variables that replace them
+_INK, _MUTED, _SHADE, _FLOOR, _ASIDE = "#010101", "#020202", "#030303", "#040404", "#050505"
+_VARIABLES = {_INK: "--ink", _MUTED: "--muted", _SHADE: "--shade", _FLOOR: "--floor", _ASIDE: "--aside"}
+# points are drawn as an image with fixed colours, which are legible on light and dark pages
+BEFORE, AFTER = "#d9730d", "#2a7de1"
+
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "report",  # makes the page reproducible
+    "text.parse_math": False,  # column names may contain a dollar sign
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "axes.unicode_minus": True,
+    **dict.fromkeys(("text.color", "axes.titlecolor"), _INK),
+    **dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), _MUTED),
+}
 
 
 def error_bars(dimensions: Sequence[DimensionError]) -> str:
     """Draws the errors before and after, and the floor, of dimensions with the same unit on a logarithmic scale."""
-    unit = _unit(dimensions[0].unit)
-    values = [value for d in dimensions for value in (d.before, d.after, d.floor)]
-    widest = 24 + LETTER * max(len(dimension.name) for dimension in dimensions)
-    picture = _Picture(
-        _log_range(values), (len(dimensions) - 0.5, -0.5), height=150 + 84 * len(dimensions), left=min(widest, 400)
-    )
-    picture.ticks_below(_log_ticks(picture.x))
-    for row, dimension in enumerate(dimensions):
-        picture.text(picture.left - 12, picture.down(row) + 6, dimension.name, "end", "--ink")
-        for errors, offset in zip(SERIES, (-0.35, 0.0), strict=True):
-            if (value := getattr(dimension, errors)) in picture:
-                picture.box((picture.x[0], value), (row + offset, row + offset + 0.35), f"--{errors}")
-        if dimension.floor in picture:
-            picture.line([dimension.floor] * 2, [row - 0.4, row + 0.4], "--floor")
-    return picture.svg(f"error before and after, {unit}", below=f"error, {unit}")
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure(height=0.75 + 0.42 * len(dimensions))
+        rows = np.arange(len(dimensions))
+        floors = [_positive(dimension.floor) for dimension in dimensions]
+        axes.barh(rows - 0.18, [_positive(d.before) for d in dimensions], 0.34, color=BEFORE)
+        axes.barh(rows + 0.18, [_positive(d.after) for d in dimensions], 0.34, color=AFTER)
+        axes.vlines(floors, rows - 0.4, rows + 0.4, color=_FLOOR, linewidth=2)
+        axes.set_yticks(rows, [dimension.name for dimension in dimensions], color=_INK)
+        axes.invert_yaxis()
+        _log_scale(axes, "x", [v for d, f in zip(dimensions, floors, strict=True) for v in (d.before, d.after, f)])
+        axes.set_xlabel(f"error, {_unit(dimensions[0].unit)}")
+        return _svg(figure, f"error before and after, {_unit(dimensions[0].unit)}")
 
 
 def horizon_lines(horizons: Sequence[HorizonError], dimension: DimensionError) -> str:
     """Draws the error of one dimension against the prediction horizon."""
-    horizons = [horizon for horizon in horizons if dimension.name in horizon.before]
-    seconds = [horizon.seconds for horizon in horizons]
-    drawn = {errors: [getattr(horizon, errors).get(dimension.name) for horizon in horizons] for errors in SERIES}
-    picture = _Picture(
-        (0.0, 1.05 * max(seconds, default=1.0)), _log_range([*drawn["before"], *drawn["after"]]), log=True
-    )
-    picture.ticks_below(_ticks(picture.x))
-    picture.ticks_beside(_log_ticks(picture.y))
-    for errors, values in drawn.items():
-        picture.line(seconds, [_positive(value) for value in values], f"--{errors}")
-        picture.dots(seconds, [_positive(value) for value in values], f"--{errors}", 12)
-    title = f"{dimension.name} ({_unit(dimension.unit)})"
-    return picture.svg(f"error of {dimension.name} against the horizon", title, "predicted ahead (s)")
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure()
+        horizons = [horizon for horizon in horizons if dimension.name in horizon.before]
+        seconds = [horizon.seconds for horizon in horizons]
+        drawn = []
+        for errors, colour in (("before", BEFORE), ("after", AFTER)):
+            values = [_positive(getattr(horizon, errors).get(dimension.name)) for horizon in horizons]
+            axes.plot(seconds, values, "o-", color=colour, markersize=3.5, linewidth=1.8)
+            drawn += values
+        _log_scale(axes, "y", drawn)
+        axes.set_title(f"{dimension.name} ({_unit(dimension.unit)})")
+        axes.set_xlabel("predicted ahead (s)")
+        return _svg(figure, f"error of {dimension.name} against the horizon")
 
 
 def window_lines(window: ShownWindow, quantity: WindowQuantity) -> str:
     """Draws one quantity in a window: measured, and simulated before and after the effects are put in."""
-    picture = _Picture((window.ahead[0], window.ahead[-1]), _frame(quantity), height=420)
-    picture.ticks_below(_ticks(picture.x))
-    picture.ticks_beside(_ticks(picture.y))
-    for errors in SERIES:
-        picture.line(window.ahead, getattr(quantity, errors), f"--{errors}")
-    picture.dots(window.ahead, quantity.measured, "--ink", 9)
-    label = f"{quantity.name}, measured and simulated, in the {window.rank} window"
-    return picture.svg(label, f"{quantity.name} ({_unit(quantity.unit)})", "time since the start of the window (s)")
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure(height=2.1)
+        axes.plot(window.ahead, quantity.measured, "o", color=_INK, markersize=3.0, mew=0, zorder=3)
+        for values, colour in ((quantity.before, BEFORE), (quantity.after, AFTER)):
+            axes.plot(window.ahead, values, "-", color=colour, linewidth=1.8)
+        axes.set_ylim(*_frame(quantity))
+        _plain_ticks(axes)
+        axes.set_title(f"{quantity.name} ({_unit(quantity.unit)})")
+        axes.set_xlabel("time since the start of the window (s)")
+        return _svg(figure, f"{quantity.name}, measured and simulated, in the {window.rank} window")
 
 
-def _frame(quantity: WindowQuantity) -> Range:
+def _frame(quantity: WindowQuantity) -> tuple[float, float]:
     """Limits that show the measured values and the simulation with the effects, but not all of one that diverges."""
     measured, simulated = np.array(quantity.measured), np.array([*quantity.before, *quantity.after])
     low, high = measured.min(), measured.max()
@@ -82,56 +103,28 @@ def _frame(quantity: WindowQuantity) -> Range:
 
 def residual_in_time(trace: ResidualTrace, dimension: int, aside: Sequence[Interval] = ()) -> str:
     """Draws the residual of one dimension over time; held-out and excluded intervals are shaded."""
-    fitted = _fitted(trace, aside)
-    ends = (float(trace.time[0]), float(trace.time[-1])) if len(trace.time) > 1 else (0.0, 1.0)
-    picture = _Picture(ends, _size(trace, dimension, fitted))
-    changes = np.flatnonzero(np.diff(np.concatenate([[False], trace.held_out, [False]]).astype(int)))
-    for first, stop in changes.reshape(-1, 2):
-        picture.box((float(trace.time[first]), float(trace.time[stop - 1])), picture.y, "--shade")
-    for interval in aside:
-        picture.box((interval.start, interval.end), picture.y, "--aside")
-    _points(picture, trace.time, trace, dimension)
-    return picture.svg(f"residual of {trace.names[dimension]} in time", _title(trace, dimension), "time (s)")
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure()
+        span = {"transform": axes.get_xaxis_transform(), "linewidth": 0}
+        axes.fill_between(trace.time, 0, 1, where=trace.held_out, step="mid", color=_SHADE, **span)
+        for interval in aside:
+            axes.axvspan(interval.start, interval.end, color=_ASIDE, linewidth=1)
+        _points(axes, trace.time, trace, dimension, framed=_fitted(trace, aside))
+        if len(trace.time) > 1:
+            axes.set_xlim(trace.time[0], trace.time[-1] or 1.0)
+        axes.set_xlabel("time (s)")
+        return _svg(figure, f"residual of {trace.names[dimension]} in time")
 
 
 def residual_against_state(trace: ResidualTrace, dimension: int, state: int, aside: Sequence[Interval] = ()) -> str:
     """Draws the residual of one dimension against one state, without excluded intervals."""
-    fitted = _fitted(trace, aside)
-    states = np.where(fitted, trace.states[:, state], np.nan)
-    shown = states[np.isfinite(states)]
-    picture = _Picture((shown.min(), shown.max()) if len(shown) else (0.0, 1.0), _size(trace, dimension, fitted))
-    _points(picture, states, trace, dimension)
-    below = f"{trace.names[state]} ({_unit(trace.units[state])})"
-    label = f"residual of {trace.names[dimension]} against {trace.names[state]}"
-    return picture.svg(label, _title(trace, dimension), below)
-
-
-def _points(picture: "_Picture", x: np.ndarray, trace: ResidualTrace, dimension: int) -> None:
-    picture.ticks_below(_ticks(picture.x))
-    picture.ticks_beside(_ticks(picture.y))
-    picture.line(picture.x, [0.0, 0.0], "--muted", 1)
-    for errors in SERIES:
-        picture.dots(x, getattr(trace, errors)[:, dimension], f"--{errors}", 5)
-
-
-def _size(trace: ResidualTrace, dimension: int, framed: np.ndarray) -> Range:
-    """Limits around zero for the residuals of some rows, without their outliers."""
-    sizes = np.abs([trace.before[framed, dimension], trace.after[framed, dimension]])
-    sizes = sizes[np.isfinite(sizes)]
-    limit = float(1.5 * np.quantile(sizes, 0.99)) if len(sizes) else 0.0
-    return (-limit, limit) if limit > 0.0 else (-1.0, 1.0)
-
-
-def _fitted(trace: ResidualTrace, aside: Sequence[Interval]) -> np.ndarray:
-    """Mask, (T,), of the rows outside the excluded intervals."""
-    fitted = np.ones(len(trace.time), dtype=bool)
-    for interval in aside:
-        fitted &= (trace.time < interval.start) | (trace.time > interval.end)
-    return fitted
-
-
-def _title(trace: ResidualTrace, dimension: int) -> str:
-    return f"residual of {trace.names[dimension]} ({_unit(trace.units[dimension])})"
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure()
+        fitted = _fitted(trace, aside)
+        states = np.where(fitted, trace.states[:, state], np.nan)
+        _points(axes, states, trace, dimension, framed=fitted)
+        axes.set_xlabel(f"{trace.names[state]} ({_unit(trace.units[state])})")
+        return _svg(figure, f"residual of {trace.names[dimension]} against {trace.names[state]}")
 
 
 def telling_pairs(trace: ResidualTrace, pictures: int = 12) -> list[tuple[int, int]]:
@@ -163,121 +156,56 @@ def _explained(state: np.ndarray, residual: np.ndarray, groups: int = 12) -> flo
     return 1.0 - sum(len(part) * part.var() for part in parts) / (len(residual) * residual.var())
 
 
-class _Picture:
-    """A frame with a horizontal and a vertical axis, and the marks in it.
-
-    Args:
-        x: values at the left and right ends; positive ones for a logarithmic axis.
-        y: values at the lower and upper ends.
-        log: whether the vertical axis is logarithmic; with ``left``, the horizontal one is.
-        height: height of the picture.
-        left: space for names beside the frame.
-    """
-
-    def __init__(self, x: Range, y: Range, *, log: bool = False, height: int = HEIGHT, left: int | None = None):
-        self.x, self.y, self.height = _not_empty(x), _not_empty(y), height
-        self.left, self.right, self.top, self.bottom = left or 110, WIDTH - 24, 46 if left is None else 8, height - 76
-        self._scales: tuple[Callable, Callable] = (
-            np.asarray if left is None else np.log,
-            np.log if log else np.asarray,
-        )
-        self._marks: list[str] = []
-
-    def __contains__(self, value: float | None) -> bool:
-        return value is not None and self.x[0] <= value <= self.x[1]
-
-    def across(self, x: Any) -> Any:
-        """Horizontal place of values."""
-        return self.left + (self.right - self.left) * _share(x, self.x, self._scales[0])
-
-    def down(self, y: Any) -> Any:
-        """Vertical place of values."""
-        return self.bottom - (self.bottom - self.top) * _share(y, self.y, self._scales[1])
-
-    def line(self, x: Any, y: Any, colour: str, width: int = 4) -> None:
-        """A line through points, interrupted where a value is not finite, within the frame."""
-        steps, drawn = [], False
-        for right, down in zip(self.across(x), np.clip(self.down(y), self.top, self.bottom), strict=True):
-            finite = np.isfinite(down) and np.isfinite(right)
-            steps += [f"{'L' if drawn else 'M'}{right:.0f} {down:.0f}"] if finite else []
-            drawn = bool(finite)
-        self._path("".join(steps), colour, f'stroke-width="{width}"')
-
-    def dots(self, x: Any, y: Any, colour: str, size: int) -> None:
-        """A dot at each point inside the frame."""
-        right, down = self.across(x), self.down(y)
-        with np.errstate(invalid="ignore"):
-            inside = (right >= self.left) & (right <= self.right) & (down >= self.top) & (down <= self.bottom)
-        places = np.unique(np.stack([right[inside], down[inside]], -1).round().astype(int), axis=0)
-        steps = "".join(f"M{right} {down}h0" for right, down in places)
-        self._path(steps, colour, f'stroke-width="{size}" stroke-linecap="round" opacity="0.6"')
-
-    def _path(self, steps: str, colour: str, style: str) -> None:
-        if steps:
-            self._marks.append(f'<path d="{steps}" fill="none" stroke="var({colour})" {style}/>')
-
-    def box(self, x: Range, y: Range, colour: str) -> None:
-        """A filled rectangle."""
-        (left, right), (low, high) = np.sort(self.across(x)), np.sort(self.down(y))
-        size = f'x="{left:.0f}" y="{low:.0f}" width="{max(right - left, 1):.0f}" height="{high - low:.0f}"'
-        self._marks.append(f'<rect {size} fill="var({colour})"/>')
-
-    def text(self, x: float, y: float, words: str, anchor: str, colour: str = "--muted") -> None:
-        """Words at a place of the picture."""
-        place = f'x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}" fill="var({colour})"'
-        self._marks.append(f"<text {place}>{escape(words)}</text>")
-
-    def ticks_below(self, values: Sequence[float]) -> None:
-        """Numbers below the frame, with lines through it."""
-        for value, x in zip(values, self.across(values), strict=True):
-            self.line([value] * 2, self.y, "--shade", 1)
-            self.text(x, self.bottom + 26, number(value, 4), "middle")
-
-    def ticks_beside(self, values: Sequence[float]) -> None:
-        """Numbers on the left of the frame, with lines through it."""
-        for value, y in zip(values, self.down(values), strict=True):
-            self.line(self.x, [value] * 2, "--shade", 1)
-            self.text(self.left - 10, y + 6, number(value), "end")
-
-    def svg(self, label: str, title: str = "", below: str = "") -> str:
-        """The picture as an SVG element for an HTML page, with a label for screen readers."""
-        self.text(self.left, 26, title, "start", "--ink")
-        self.text((self.left + self.right) / 2, self.height - 14, below, "middle")
-        frame = f'viewBox="0 0 {WIDTH} {self.height}" font-size="20" role="img" aria-label="{escape(label)}"'
-        return f'<svg xmlns="http://www.w3.org/2000/svg" {frame}>{"".join(self._marks)}</svg>'
+def _fitted(trace: ResidualTrace, aside: Sequence[Interval]) -> np.ndarray:
+    """Mask, (T,), of the rows outside the excluded intervals."""
+    fitted = np.ones(len(trace.time), dtype=bool)
+    for interval in aside:
+        fitted &= (trace.time < interval.start) | (trace.time > interval.end)
+    return fitted
 
 
-def _share(values, ends: Range, scale: Callable) -> np.ndarray:
-    """How far values are from the first to the second end of an axis, from 0 to 1."""
-    first, last = scale(ends[0]), scale(ends[1])
-    return (scale(np.asarray(values, float)) - first) / (last - first)
+def _points(axes: Axes, x: np.ndarray, trace: ResidualTrace, dimension: int, framed: np.ndarray) -> None:
+    """Draws points as an image, to keep the file small; the axis range covers the framed rows without outliers."""
+    for residual, colour in ((trace.before, BEFORE), (trace.after, AFTER)):
+        axes.plot(x, residual[:, dimension], ".", color=colour, alpha=0.6, markersize=3, mew=0, rasterized=True)
+    sizes = np.abs([trace.before[framed, dimension], trace.after[framed, dimension]])
+    sizes = sizes[np.isfinite(sizes)]
+    limit = 1.5 * np.quantile(sizes, 0.99) if len(sizes) else 0.0
+    axes.set_ylim(*((-limit, limit) if limit > 0.0 else (-1.0, 1.0)))
+    axes.axhline(0.0, color=_MUTED, linewidth=0.6)
+    _plain_ticks(axes)
+    axes.set_title(f"residual of {trace.names[dimension]} ({_unit(trace.units[dimension])})")
 
 
-def _not_empty(ends: Range) -> Range:
-    return ends if ends[0] != ends[1] else (ends[0] - 1.0, ends[1] + 1.0)
+def _plain_ticks(axes: Axes) -> None:
+    """Sets few ticks in plain numbers on both axes."""
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 4)))
 
 
-def _ticks(ends: Range, most: int = 5) -> list[float]:
-    """Round numbers between the ends of a linear axis."""
-    rough = (ends[1] - ends[0]) / most
-    power = 10.0 ** np.floor(np.log10(rough))
-    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= rough)
-    return [float(i * step) for i in range(int(np.ceil(ends[0] / step)), int(np.floor(ends[1] / step)) + 1)]
+def _figure(width: float = 4.0, height: float = 2.4) -> tuple[Figure, Axes]:
+    """A figure outside pyplot's registry; sizes in inches."""
+    figure = Figure((width, height), layout="constrained")
+    figure.patch.set_alpha(0.0)
+    axes = figure.subplots()
+    axes.patch.set_alpha(0.0)
+    return figure, axes
 
 
-def _log_ticks(ends: Range, most: int = 6) -> list[float]:
-    """Powers of ten between the ends of a logarithmic axis, with their 2 and 5 fold if there are few."""
-    low, high = np.log10(ends)
-    factors = (1.0, 2.0, 5.0) if high - low < 2.0 else (1.0,)
-    step = max(1, round((high - low) / most))
-    powers = range(int(np.floor(low)), int(np.ceil(high)) + 1, step)
-    ticks = [factor * 10.0**power for power in powers for factor in factors]
-    return [tick for tick in ticks if ends[0] <= tick <= ends[1]]
-
-
-def _log_range(values: Sequence[float | None]) -> Range:
+def _log_scale(axes: Axes, name: Literal["x", "y"], values: Sequence[float | None]) -> None:
+    """Sets a logarithmic scale around the values, with ticks in plain numbers."""
     finite = [value for value in map(_positive, values) if np.isfinite(value)]
-    return (min(finite) / 2.0, max(finite) * 1.5) if finite else (0.1, 1.0)
+    low, high = (min(finite), max(finite)) if finite else (0.1, 1.0)
+    axes.set(**{f"{name}scale": "log", f"{name}lim": (low / 2.0, high * 1.5)})
+    axis = getattr(axes, f"{name}axis")
+    decades = np.log10(high / low) + 0.5
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2 else (1.0,), numticks=6))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axis.set_minor_locator(NullLocator())
+    axes.grid(axis=name, color=_SHADE, linewidth=0.8)
+    axes.set_axisbelow(True)
 
 
 def _positive(value: float | None) -> float:
@@ -287,3 +215,16 @@ def _positive(value: float | None) -> float:
 
 def _unit(unit: str) -> str:
     return "no unit" if unit in ("", "1") else unit
+
+
+def _svg(figure: Figure, label: str) -> str:
+    """The figure as an SVG element for an HTML page, with a label for screen readers."""
+    file = StringIO()
+    figure.savefig(file, format="svg", dpi=160, metadata={"Date": None})
+    text = file.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'<g id="[^"]*"', "<g", text)  # ids would repeat on the page, and nothing refers to them
+    for colour, variable in _VARIABLES.items():
+        text = text.replace(colour, f"var({variable})")
+    return text.replace("<svg ", f'<svg role="img" aria-label="{html.escape(label)}" ', 1)
