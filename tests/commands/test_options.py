@@ -124,8 +124,6 @@ OTHERS = {
     ("report", "groups=[retuns]"): "retuns: there is no outputs/results/retuns.csv; did you mean returns?",
     ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
     "environment, such as +references.mine=[0,1000]",
-    ("simulator", "seconds=0"): "seconds=0: must be a number above 0",
-    ("population", "device=gpu"): "device=gpu: must be cpu or cuda",
 }
 
 
