@@ -59,16 +59,18 @@ def test_each_part_ends_when_its_time_is_up_and_all_within_the_minutes():
     with LoopBar(disable=True, minutes=1.0, clock=lambda: now) as bar:
         bar.keep_for_report(evaluation=0.1)  # the report takes many of them
         bar.stage(EFFECTS)
-        now = 40.0
+        now = 50.0  # nothing is found that would have to be judged
         bar.closer(0.5)
-        now = 50.0
+        bar.has_result()
         with pytest.raises(OutOfTimeError, match=EFFECTS):
             bar.closer(0.5)
-        bar.begin_last_fit()
+        bar.begin_last_fit(anything_found=True)
         bar.check()
-        now = 55.0
+        now = 53.0
         with pytest.raises(OutOfTimeError):
             bar.check()
+        bar.begin_last_fit(anything_found=False)
+        bar.check()
         bar.stage(REPORT)
         assert bar.within_time("errors", lambda: 3, 0) == 3
         now = 60.0
@@ -82,6 +84,7 @@ def test_the_search_ends_earlier_where_simulating_takes_longer():
         now = 0.0
         with LoopBar(disable=True, minutes=1.0, clock=lambda: now) as bar:  # noqa: B023
             bar.keep_for_report(evaluation)
+            bar.has_result()
             while not bar.time_is_up:
                 now += 1.0
         ends.append(now)

@@ -37,7 +37,7 @@ class LoopBar(tqdm):
     Args:
         minutes: time for all stages, above 0; None for as long as they take. :meth:`check` raises
             :class:`OutOfTimeError` when the time of the present part is up: of the search, then of its last fit, then
-            of the report.
+            of the report. Until something is found, the search has all the time but the least share of the report.
         clock: returns the present time, in s.
         **options: options of ``tqdm``, such as ``disable=True`` or ``file``.
 
@@ -63,8 +63,9 @@ class LoopBar(tqdm):
         self._stage = MEASURING
         self._seconds = math.inf if minutes is None else 60.0 * minutes
         self._clock = clock
-        self._deadline = self._last = clock() + self._seconds
-        self._for_report = REPORT_LEAST * self._seconds
+        self._last = clock() + self._seconds
+        self._for_report = self._for_short_report = REPORT_LEAST * self._seconds
+        self._deadline = self._last if minutes is None else self._last - self._for_short_report
         self.left_out: list[str] = []  # parts of the report that were not computed because the time was up
 
     @property
@@ -73,7 +74,7 @@ class LoopBar(tqdm):
         return self._clock() >= self._deadline
 
     def keep_for_report(self, evaluation: float) -> None:
-        """Sets when the search ends, so that there is time for the last fit and the report.
+        """Sets the time that the report needs where something was found.
 
         Args:
             evaluation: duration of a one-step simulation of all rows, in s.
@@ -81,11 +82,15 @@ class LoopBar(tqdm):
         if self._seconds < math.inf:
             share = min(max(REPORT_EVALUATIONS * evaluation / self._seconds, REPORT_LEAST), REPORT_MOST)
             self._for_report = share * self._seconds
+
+    def has_result(self) -> None:
+        """Ends the search earlier from now on, so that there is time to fit and to judge what it has found."""
+        if self._seconds < math.inf:
             self._deadline = self._last - self._for_report - LAST_FIT * self._seconds
 
-    def begin_last_fit(self) -> None:
-        """Gives the last fit of the effects found the time that was kept for it."""
-        self._deadline = self._last - self._for_report
+    def begin_last_fit(self, anything_found: bool) -> None:
+        """Gives the last fit of the effects found the time that was kept for it, and the search for forces the rest."""
+        self._deadline = self._last - (self._for_report if anything_found else self._for_short_report)
 
     def within_time(self, what: str, compute: Callable[[], Computed], otherwise: Computed) -> Computed:
         """Computes a part of the report, or returns ``otherwise`` and keeps ``what`` if the time is up before its end.

@@ -72,14 +72,16 @@ def trace_effects(
     progress.stage(EFFECTS)
     horizon = choose_horizon(simulation, measured, rng, settings)
     problem = Problem.pose(simulation, measured, horizon)
-    best = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
-    found(_outcome(best))
 
     def keep(state: SearchState) -> None:
         nonlocal best
         best = state
+        if state.entries:
+            progress.has_result()
         found(_outcome(state))
 
+    best = begin_with(SearchState.begin(problem, catalogue, rng, settings), known)
+    keep(best)
     others, ended_in = (), None
     try:
         best, others = with_most_usual_set(
@@ -87,7 +89,7 @@ def trace_effects(
         )
     except OutOfTimeError as end:
         ended_in = str(end)
-    progress.begin_last_fit()
+    progress.begin_last_fit(bool(best.entries))
     try:
         if ended_in is None:
             best = _divided_in_longer_windows(best, catalogue, rng)
@@ -228,6 +230,6 @@ def _outcome(state: SearchState) -> Trace:
     tried = sorted(state.attempts.values(), key=lambda attempt: attempt.loss)
     attempts = tuple(attempt for attempt in tried if attempt.entry.name not in names)
     groups = state.groups or ((),) * len(state.entries)  # alternatives are looked for after the effects
-    loss = math.nan if state.entries else float(state.problem.selection_losses(()).mean())
+    loss = math.nan if state.entries else state.first_loss
     horizon = state.chosen_horizon or state.problem.horizon
     return Trace(state.entries, state.fit, attempts, groups, state.exact, horizon=horizon, loss=loss)
