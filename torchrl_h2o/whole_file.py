@@ -53,6 +53,37 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+@contextmanager
+def whole_files(folder: str | Path) -> Iterator[Path]:
+    """Yields a temporary folder, whose files are moved into ``folder`` when the block succeeds.
+
+    Args:
+        folder: created if it does not exist; its other files stay.
+
+    Raises:
+        OSError: if a file cannot be written.
+
+    Examples:
+        >>> import tempfile
+        >>> with whole_files(Path(tempfile.mkdtemp()) / "out") as partial:
+        ...     _ = (partial / "table.csv").write_text("a,b")
+        >>> [file.name for file in (partial.parent).iterdir()]
+        ['table.csv']
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = partial_name(folder / "files")
+    try:
+        partial.mkdir()
+        yield partial
+        written = sorted(partial.rglob("*"), key=Path.is_file)  # folders first: a full disk may have no room for them
+        for path in written:
+            into = folder / path.relative_to(partial)
+            into.mkdir(parents=True, exist_ok=True) if path.is_dir() else os.replace(path, into)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
 def write_text(path: str | Path, text: str) -> Path:
     """Writes a text file in UTF-8, see :func:`whole_file`, and returns its path."""
     with whole_file(path) as partial:

@@ -305,6 +305,7 @@ def test_a_full_disk_does_not_lose_the_result(robot, monkeypatch, capsys):
     monkeypatch.chdir(robot)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     report(Gravity(0.5)).save(robot / "out")
+    (robot / "out" / "mended.xml").write_text("with gravity × 0.5")
     before = {path: path.read_bytes() for path in (robot / "out").iterdir()}
     chosen = ["simulator=robot.xml", "data=log.csv", "columns=log.yaml", "simulator.coordinates={angle: pivot}"]
     chosen += ["catalogue=[JointDamping]", "audit=false", "hydra.run.dir=out"]

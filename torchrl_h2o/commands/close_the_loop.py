@@ -34,6 +34,7 @@ from torchrl_h2o.residuals import Report, Simulation, close_the_loop
 from torchrl_h2o.residuals.report.json_file import write_json
 from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
 from torchrl_h2o.residuals.report.sentence import sentences
+from torchrl_h2o.whole_file import whole_files
 
 FOR_FILES = 0.04  # share of ``minutes`` for writing the report and the mended model
 
@@ -106,9 +107,12 @@ def main(cfg: DictConfig) -> None:
         so_far=so_far,
     )
     print_result(report)  # before it is written, because the disk may be full
-    if report.recommended:
-        report = replace(report, mended_model=save_mended_model(simulation, report.effects, directory))
-    report.save(directory)
+    with whole_files(directory) as files:
+        if report.recommended:
+            report = replace(report, mended_model=save_mended_model(simulation, report.effects, files))
+        report.save(files)
+    if report.mended_model is None or report.mended_model.file is None:
+        (directory / FILE).unlink(missing_ok=True)  # of an earlier run, with other effects
     print_files(report, directory)
 
 

@@ -119,7 +119,6 @@ def test_what_is_left_out_is_described_with_the_units_of_the_joint(tmp_path):
 
 
 def test_a_model_that_cannot_be_written_is_no_failure_of_the_report(tmp_path):
-    (tmp_path / "mended.xml").write_text("of an earlier run")
     gone = Simulation(pendulum().spec, 2, pendulum().state_map)
     mended = save_mended_model(gone, [JointDamping(0.1, "wrist")], tmp_path)
     assert mended.file is None

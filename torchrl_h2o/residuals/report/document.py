@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.report.json_file import entries_from_json, read_json,
 from torchrl_h2o.residuals.report.page import write_page
 from torchrl_h2o.residuals.report.sampling import sample
 from torchrl_h2o.residuals.report.sentence import sentence
+from torchrl_h2o.whole_file import whole_files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,9 +138,10 @@ class Report(ReportContents):
         Returns:
             The path of ``report.json``.
         """
-        path = write_json(self, folder)
-        write_page(self, folder)
-        return path
+        with whole_files(folder) as files:
+            path = write_json(self, files)
+            write_page(self, files)
+        return Path(folder) / path.name
 
     @classmethod
     def load(cls, path: str | Path) -> Report:

@@ -69,7 +69,7 @@ def save_mended_model(simulation: Simulation, effects: Sequence[Effect], folder:
         folder: created if it does not exist; meshes and textures are copied into it.
 
     Returns:
-        The name of the file and the effects that are not in it. If MuJoCo cannot write the model, there is no file,
+        The name of the file and the effects that are not in it. If the model cannot be written, an earlier file stays,
         and all effects are left out.
 
     Examples:
@@ -81,13 +81,12 @@ def save_mended_model(simulation: Simulation, effects: Sequence[Effect], folder:
         >>> mended.file, [left.words for left in mended.left_out]
         ('mended.xml', ['all actuators late by 0.004 s'])
     """
-    path, every = Path(folder) / FILE, (*simulation.effects, *effects)
+    every = (*simulation.effects, *effects)
     try:
         spec = simulation.spec()
         left_out = tuple((left.effect, left.reason) for left in put_into_spec(spec, every))
-        write_mjcf(spec, path)
+        write_mjcf(spec, Path(folder) / FILE)
     except (ValueError, OSError) as error:  # the report is worth more than this file
-        path.unlink(missing_ok=True)  # of an earlier run, with other effects
         lacking = tuple((effect, "there is no file") for effect in every if not effect.is_neutral)
         return MendedModel(None, _described(simulation, lacking), str(error))
     return MendedModel(FILE, _described(simulation, left_out))
