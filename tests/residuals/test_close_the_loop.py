@@ -53,7 +53,7 @@ def test_the_missing_effect_is_named_first_with_its_value(truth):
 
 
 def test_where_nothing_is_missing_nothing_is_named():
-    report = closed(recorded(SIMULATION, 2000))
+    report = closed(recorded(SIMULATION, 800))
     assert report.effects == ()
     assert report.sentence().startswith("Nothing is missing")
 
@@ -88,6 +88,7 @@ def test_mass_and_gain_are_one_group_where_the_data_cannot_tell_them_apart():
     assert "These data cannot tell" in report.sentence()
 
 
+@pytest.mark.slow
 def test_mass_and_gain_are_told_apart_where_weight_shows():
     mass = CatalogueEntry(BodyMass(), ({"scale": 0.8}, {"scale": 1.25}))
     gain = CatalogueEntry(ActionGain(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -96,10 +97,9 @@ def test_mass_and_gain_are_told_apart_where_weight_shows():
     assert report.indistinguishable == ()
 
 
-@pytest.mark.slow
 def test_a_torque_on_no_list_is_marked_so_and_explained():
     ripple = UnknownForce(0.2, lambda q, v, t: np.sin(7.0 * q))
-    report = closed(recorded(SIMULATION.with_effects(ripple), ROWS))
+    report = closed(recorded(SIMULATION.with_effects(ripple), 1200), catalogue=[GRAVITY, FRICTION])
     assert [found.declared for found in report.found] == [False]
     assert report.error.after < 0.2 * report.error.before
     assert report.sentence().startswith("Your simulator lacks: outside the catalogue: torque on joint elbow")
@@ -107,7 +107,7 @@ def test_a_torque_on_no_list_is_marked_so_and_explained():
 
 def test_two_effects_are_found_together():
     report = closed(
-        recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(0.05)), 1000), catalogue=[GRAVITY, FRICTION]
+        recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(0.05)), 600), catalogue=[GRAVITY, FRICTION]
     )
     found = {type(effect): effect for effect in report.effects}
     assert found[Gravity].scale == pytest.approx(1.3, rel=0.02)
@@ -205,6 +205,7 @@ def test_the_same_seed_gives_the_same_report():
     assert first.to_json() == again.to_json()
 
 
+@pytest.mark.slow
 def test_what_is_in_the_simulator_is_not_found_again():
     half = SIMULATION.with_effects(Gravity(1.3))
     report = closed(recorded(half.with_effects(JointFrictionLoss(0.05)), 1000), half, [GRAVITY, FRICTION])
@@ -225,10 +226,10 @@ def test_held_out_rows_are_not_fitted():
     assert gravity.scale == pytest.approx(1.3, rel=0.02)
 
 
-@pytest.mark.parametrize(("rows", "known"), [(6, False), (300, True)])
+@pytest.mark.parametrize(("rows", "known"), [(6, False), pytest.param(300, True, marks=pytest.mark.slow)])
 def test_where_rows_are_too_few_to_choose_by_the_catalogue_is_not_said_to_lack_the_cause(rows, known):
-    measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 1500, noise=0.01)
-    split = np.full(1500, Split.FIT)
+    measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 1200, noise=0.01)
+    split = np.full(1200, Split.FIT)
     split[700 : 700 + rows], split[700 + rows :] = Split.SELECTION, Split.REPORT
     report = closed(replace(measured, split=split), catalogue=[GRAVITY])
     assert bool(report.found) == known

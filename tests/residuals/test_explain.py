@@ -47,11 +47,12 @@ def test_a_force_that_nobody_declared_stands_beside_declared_effects():
 
 def test_a_force_stands_in_the_place_of_effects_that_it_explains_better():
     """The explanation is the force alone; friction and gravity of the catalogue do not explain a part of the ripple."""
-    (part,) = explained(RIPPLE).parts
+    (part,) = explained(RIPPLE, rows=1200).parts
     assert not part.declared
     assert part.effect.parameters["frequency_1"].value == pytest.approx(7.0, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_force_that_starts_late_is_not_called_one_that_was_always_there():
     """No term beside the catalogue's constant force fits the residual; a step in time replaces this force."""
     late = UnknownForce(0.2, lambda q, v, t: (t >= 8.0) + 0.0 * q)
@@ -70,7 +71,8 @@ def test_an_error_in_the_search_leaves_what_was_found_before():
 
 
 def test_what_was_found_when_the_time_was_up_is_the_explanation():
-    explanation = explained(Gravity(1.3), RIPPLE, noise=0.002, bar=EndsBeforeAlternatives(OutOfTimeError(OTHERS)))
+    bar = EndsBeforeAlternatives(OutOfTimeError(OTHERS))
+    explanation = explained(Gravity(1.3), RIPPLE, rows=800, noise=0.002, bar=bar)
     assert explanation.ended_in == OTHERS
     assert all(part.declared for part in explanation.parts)  # no force is looked for
     assert Gravity in {type(effect) for effect in explanation.effects}
@@ -78,7 +80,7 @@ def test_what_was_found_when_the_time_was_up_is_the_explanation():
 
 
 def test_where_the_catalogue_explains_all_no_force_is_made():
-    explanation = explained(Gravity(1.3))
+    explanation = explained(Gravity(1.3), rows=800)
     assert [part.declared for part in explanation.parts] == [True]
     assert explanation.trace.exact
 
@@ -98,7 +100,9 @@ def test_noise_of_the_action_stands_behind_what_else_is_missing():
     assert parts[1].effect.std == pytest.approx(0.2, rel=0.1)
 
 
-@pytest.mark.parametrize(("own", "missing"), [(0.1, np.sqrt(0.3**2 - 0.1**2)), (0.5, -0.4)])
+@pytest.mark.parametrize(
+    ("own", "missing"), [(0.1, np.sqrt(0.3**2 - 0.1**2)), pytest.param(0.5, -0.4, marks=pytest.mark.slow)]
+)
 def test_noise_is_what_the_simulator_has_too_little_or_too_much(own, missing):
     simulation = SIMULATION.with_effects(ActionNoise(own))
     (part,) = explained(ActionNoise(0.3), simulation=simulation, catalogue=[GRAVITY]).parts
@@ -107,6 +111,7 @@ def test_noise_is_what_the_simulator_has_too_little_or_too_much(own, missing):
     assert low < missing < high
 
 
+@pytest.mark.slow
 def test_noise_that_both_have_is_no_effect():
     simulation = SIMULATION.with_effects(ActionNoise(0.3))
     assert explained(ActionNoise(0.3), simulation=simulation, catalogue=[GRAVITY]).parts == ()

@@ -82,10 +82,11 @@ def close_the_loop(
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from torchrl_h2o.effects import CatalogueEntry, Gravity
         >>> from torchrl_h2o.envs import DynamicsGap
-        >>> measured = GymEnv("InvertedPendulum-v5").rollout(600, break_when_any_done=False)
+        >>> measured = GymEnv("InvertedPendulum-v5").rollout(300, break_when_any_done=False)
         >>> simulator = TransformedEnv(GymEnv("InvertedPendulum-v5"), DynamicsGap(Gravity(2.0)))
         >>> gravity = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
-        >>> report = close_the_loop(simulator, measured, [gravity], progress=False)
+        >>> quick = LoopSettings(classifier_updates=50)
+        >>> report = close_the_loop(simulator, measured, [gravity], progress=False, settings=quick)
         >>> [effect.describe() for effect in report.effects]
         ['gravity × 0.5']
     """

@@ -18,6 +18,9 @@ STRONG = CatalogueEntry(JointDamping(), ({"damping": 1e-6}, {"damping": 0.5}))
 NOISE = CatalogueEntry(ActionNoise(), ({"std": 0.1},))
 
 
+QUICK = LoopSettings(classifier_updates=20)  # the classifier has its own tests
+
+
 def missed(*catalogue, noise):
     return undetectable_effects(SIMULATION, recorded(SIMULATION, 1000, noise=noise), catalogue)
 
@@ -74,7 +77,8 @@ def test_without_data_for_a_choice_nothing_is_said():
 
 
 def test_a_report_that_finds_nothing_names_them():
-    report = close_the_loop(SIMULATION, recorded(SIMULATION, 1000, noise=0.01), [GRAVITY, DAMPING], progress=False)
+    measured = recorded(SIMULATION, 1000, noise=0.01)
+    report = close_the_loop(SIMULATION, measured, [GRAVITY, DAMPING], progress=False, settings=QUICK)
     assert report.effects == ()
     assert report.sentence().startswith("Nothing is missing")
     assert report.sentence().endswith(

@@ -32,7 +32,7 @@ from torchrl_h2o.residuals.report.contents import (
 SIMULATION = pendulum()
 
 
-def verdict(truth, found=(), noise=0.01, rows=3000):
+def verdict(truth, found=(), noise=0.01, rows=2000):
     """The verdict where a classifier cannot tell measured from simulated transitions."""
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     mended = SIMULATION.with_effects(*found)
@@ -100,7 +100,7 @@ def test_an_effect_that_does_not_lower_the_error_is_not_recommended():
 
 def test_effects_that_make_a_quantity_worse_are_said_to_be_wrong():
     """Gravity is right, but no reading is scaled: the sum of all errors falls, that of the position rises."""
-    wrong = verdict((Gravity(1.5),), (Gravity(1.5), ObservationGain(1.3, (1,))))
+    wrong = verdict((Gravity(1.5),), (Gravity(1.5), ObservationGain(1.3, (1,))), rows=3000)
     assert (wrong.kind, wrong.recommended) == (NOT_EXPLAINED, False)
     (reason,) = [reason for reason in wrong.reasons if "is wrong: they raise" in reason]
     assert "error of elbow 100 ms ahead: 24 → 30 mrad (+25 %)" in reason
@@ -170,6 +170,7 @@ def test_action_noise_that_stands_in_for_another_cause_is_not_recommended():
     assert neither_tells.recommended
 
 
+@pytest.mark.slow
 def test_action_noise_that_was_found_is_not_missing():
     noise = ActionNoise(0.2)
     explained = verdict((noise,), (noise,), noise=0.003)
@@ -188,6 +189,7 @@ def test_a_mass_far_from_the_model_s_gets_a_caveat():
     assert "could as well be everything else × 5" in caveat
 
 
+@pytest.mark.slow
 def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques_spoil_the_motion():
     """The noise is on the logged torques alone. A rotor that hides it is not recommended."""
     simulation, friction = double_pendulum(), (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"))

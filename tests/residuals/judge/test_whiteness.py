@@ -1,6 +1,7 @@
 """Autocorrelation of the remaining residual: about zero where only noise remains."""
 
 import numpy as np
+import pytest
 from torchrl.envs import TransformedEnv
 
 from tests.residuals.pendulum import pendulum, recorded
@@ -12,6 +13,7 @@ from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 SIMULATION = pendulum()
 
 
+@pytest.mark.slow
 def test_noise_of_the_action_leaves_a_white_residual():
     measured = recorded(SIMULATION.with_effects(ActionNoise(0.3)), 4000)
     np.testing.assert_allclose(autocorrelation(SIMULATION, measured), 0.0, atol=0.1)
@@ -21,6 +23,7 @@ def test_what_the_simulator_lacks_goes_on():
     assert (autocorrelation(SIMULATION, recorded(SIMULATION.with_effects(Gravity(1.5)), 2000)) > 0.8).all()
 
 
+@pytest.mark.slow
 def test_what_noise_of_the_sensors_adds_it_takes_off_again():
     found = autocorrelation(SIMULATION, recorded(SIMULATION, 4000, noise=0.02))
     assert ((found > -0.6) & (found < -0.3)).all()
@@ -43,6 +46,7 @@ def robot(*effects):
     )
 
 
+@pytest.mark.slow
 def test_an_unobserved_coordinate_is_no_residual():
     """The estimated height of the robot is wrong by a little, and for several steps."""
     assert np.isnan(robot()).all()
