@@ -1,5 +1,7 @@
 """Measured transitions, simulated once more: the same next observations if the simulator equals reality."""
 
+from functools import cache
+
 import pytest
 import torch
 from torchrl.envs import TransformedEnv
@@ -9,15 +11,21 @@ from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controll
 from torchrl_h2o.residuals import Simulation, simulate_transitions
 from torchrl_h2o.residuals.measured.transitions import SETTLING_STEPS
 
-ROWS, SETTLING = 300, SETTLING_STEPS
+ROWS, SETTLING = 250, SETTLING_STEPS
 
 
 def robot(*effects):
     return TransformedEnv(WheelLeggedEnv(), DynamicsGap(*effects))
 
 
+@cache
+def recording(*effects):
+    """A run of the robot with effects."""
+    return record(robot(*effects), noisy_balance_controller(), ROWS, seed=0, progress=False)
+
+
 def error_of(real_effects, sim_effects, seed=0):
-    real = record(robot(*real_effects), noisy_balance_controller(), ROWS, seed=0, progress=False)
+    real = recording(*real_effects)
     following = simulate_transitions(Simulation.from_env(robot(*sim_effects)), real, seed=seed)
     return following - real["next", "observation"]
 

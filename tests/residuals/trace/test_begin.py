@@ -47,6 +47,7 @@ def test_known_effects_are_fitted_again_and_the_missing_one_is_added():
     assert list(dict.fromkeys(map(len, seen))) == [1, 2]  # at the beginning, and with the missing one
 
 
+@pytest.mark.slow
 def test_every_addition_is_reported():
     found, seen = traced([])
     assert found.keys() == {Gravity, JointFrictionLoss}
@@ -78,6 +79,7 @@ def from_another_beginning(state, catalogue):
         return _from_another_beginning(state, catalogue, np.random.default_rng(0), bar, seen.append), seen
 
 
+@pytest.mark.slow
 def test_a_search_without_noise_counts_if_it_explains_everything():
     state = with_gravity_found(1.3, 0.0)
     after, seen = from_another_beginning(state, [GRAVITY, GAIN])
@@ -85,6 +87,7 @@ def test_a_search_without_noise_counts_if_it_explains_everything():
     assert seen == [after]
 
 
+@pytest.mark.slow
 def test_where_it_does_not_longer_windows_show_the_gain_beside_damping_that_the_catalogue_lacks():
     state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
     after, seen = from_another_beginning(state, [GRAVITY, GAIN])
@@ -95,6 +98,7 @@ def test_where_it_does_not_longer_windows_show_the_gain_beside_damping_that_the_
     assert {type(effect) for effect in after.fit.effects} == {Gravity, ObservationGain}
 
 
+@pytest.mark.slow
 def test_the_first_search_stays_where_the_one_in_longer_windows_explains_less(monkeypatch):
     state = with_gravity_found(1.3, 0.0, JointDamping(0.1))
     first = {entry.name for entry in state.entries}
@@ -122,6 +126,7 @@ def test_a_better_list_in_longer_windows_is_kept_if_the_time_ends_before_the_sea
     assert kept[0].chosen_horizon == state.problem.horizon
 
 
+@pytest.mark.slow
 def test_a_search_in_longer_windows_that_finds_the_same_effects_does_not_count():
     state = with_gravity_found(1.0, 0.01)
     assert longer_windows(state.problem) == 10

@@ -90,6 +90,7 @@ def begun_anew(measured, found, begin=begin_anew, catalogue=CATALOGUE):
         return begin(state.with_found(entries, state.refitted(entries, found)), catalogue, rng, bar)
 
 
+@pytest.mark.slow
 def test_a_search_that_has_found_only_heavy_rotors_begins_anew_and_finds_the_friction():
     truth = (JointFrictionLoss(0.1, "shoulder"), JointDamping(1.0, "*"))
     slow = recorded(SIMULATION.with_effects(*truth), 2000, noise=0.002)
@@ -243,6 +244,7 @@ def test_friction_that_the_data_do_not_have_is_taken_away():
     assert mended.dof_damping == pytest.approx([0.3, 0.0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_nothing_replaces_a_wrong_effect_if_no_force_is_missing():
     """Noisy torques alone must not make an effect."""
     assert by_forces(with_noisy_torques(recorded(SIMULATION, 2000, noise=0.002)), (Armature(0.5, "*"),)) is None
@@ -257,6 +259,7 @@ def test_intervals_cover_the_true_friction():
     assert abs(found.effects[index].torque - 0.08) < 2.0 * found.half_widths[index]["torque"]
 
 
+@pytest.mark.slow
 def test_what_the_model_has_too_much_is_taken_away_to_the_last_digit():
     """A sum that is negative by rounding, as it is with 0.013, would be refused by the model."""
     heavy = SIMULATION.with_effects(Armature(0.013, "*"), JointDamping(0.3, "*"))
@@ -268,7 +271,8 @@ def test_what_the_model_has_too_much_is_taken_away_to_the_last_digit():
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.2)
 
 
-@pytest.mark.parametrize("other", [ActionGain(0.7), pytest.param(ActionDelay(0.02), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("other", [ActionGain(0.7), ActionDelay(0.02)])
 def test_effects_that_no_regression_proposes_stay_beside_the_friction(other):
     """Without the gain, masses × 1.4 would explain the forces as well."""
     noisy = with_noisy_torques(recorded(SIMULATION.with_effects(*FRICTION, other), 2000, noise=0.002))
@@ -279,6 +283,7 @@ def test_effects_that_no_regression_proposes_stay_beside_the_friction(other):
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.25)
 
 
+@pytest.mark.slow
 def test_friction_of_a_light_link_is_dry_beside_its_rotor():
     """The solver softens friction of 0.1 N·m on a link of 0.5 g to a viscous one; with its rotor it is dry."""
     simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(with_light_lower_link(0.0005)))
@@ -313,7 +318,7 @@ def test_noise_does_not_make_a_link_light_that_no_actuator_moves():
     ("without", "moved", "body", "scale"),
     [
         ("shoulder", "elbow", "upper", 1.6),
-        ("elbow", "shoulder", "lower", 1.6),
+        pytest.param("elbow", "shoulder", "lower", 1.6, marks=pytest.mark.slow),
     ],
 )
 def test_masses_are_found_with_one_motor(without, moved, body, scale):

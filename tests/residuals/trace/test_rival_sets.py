@@ -25,6 +25,7 @@ def kinds(effects):
     return {type(effect) for effect in effects}
 
 
+@pytest.mark.slow
 def test_a_weak_motor_and_a_heavier_arm_with_more_damping_are_both_named():
     """u = m l² q̈ + m g l sin q + d q̇: half the torque has the effect of twice the mass and twice the damping."""
     trace = traced(ActionGain(0.55), catalogue=[GAIN, MASS, DAMPING])

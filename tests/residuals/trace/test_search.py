@@ -101,7 +101,9 @@ def test_effects_are_found_under_noise():
         pytest.param(  # each alone increases the loss as long as the other one is missing
             (Gravity(0.7), JointDamping(0.1)), marks=pytest.mark.slow
         ),
-        (BodyMass(1.3), JointFrictionLoss(0.05)),  # equals a weaker motor, less friction, and negative damping
+        pytest.param(  # equals a weaker motor, less friction, and negative damping
+            (BodyMass(1.3), JointFrictionLoss(0.05)), marks=pytest.mark.slow
+        ),
         pytest.param(  # a spring of 0.74 hides most of gravity
             (Gravity(1.2), JointSpring(0.5, joints="elbow"), ActionGain(0.8)), marks=pytest.mark.slow
         ),
@@ -127,6 +129,7 @@ def test_what_looks_the_same_is_a_group_and_what_does_not_is_none():
     assert traced(Gravity(1.3)).groups == ((),)
 
 
+@pytest.mark.slow
 def test_actions_pass_through_effects_in_the_order_that_they_pass_through_in_reality():
     """Delay and backlash do not commute; alone, backlash explains more of the residual than the delay."""
     play, late = ActionBacklash(0.4), ActionDelay(0.013)

@@ -37,6 +37,7 @@ def test_a_force_is_looked_for_where_effects_leave_enough_and_the_motion_shows_i
     assert found.effects == (Gravity(gravity),)
 
 
+@pytest.mark.slow
 def test_a_force_is_looked_for_where_nothing_is_explained():
     simulation = pendulum()
     measured = recorded(simulation.with_effects(RIPPLE), noise=0.002)
@@ -48,7 +49,7 @@ def test_a_force_is_looked_for_where_nothing_is_explained():
     assert force.describe().startswith("torque on joint elbow: ")
 
 
-@pytest.mark.parametrize("offered", [True, False])
+@pytest.mark.parametrize("offered", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_dry_friction_is_a_force_only_where_the_catalogue_lacks_it(offered):
     simulation = pendulum()
     measured = recorded(simulation.with_effects(JointFrictionLoss(0.1)), 1200, noise=0.005)

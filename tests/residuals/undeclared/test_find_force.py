@@ -15,9 +15,10 @@ LAWS = {
     "a force that starts late": (0.2, lambda q, v, t: (t >= 9.7) + 0.0 * q),
     "friction that depends on position": (-0.08, lambda q, v, t: np.sign(v) * (1.0 + 0.8 * np.cos(5.0 * q))),
 }
+FAST = "a force that starts late"
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [FAST, *(pytest.param(law, marks=pytest.mark.slow) for law in LAWS if law != FAST)])
 def test_force_that_no_catalogue_holds_is_found(name):
     size, law = LAWS[name]
     simulation, truth = pendulum(), UnknownForce(size, law)
@@ -59,6 +60,7 @@ def test_force_that_ceases_before_the_selection_data_is_not_kept():
     assert find_undeclared(simulation, recorded(simulation.with_effects(burst), noise=0.01)) is None
 
 
+@pytest.mark.slow
 def test_a_weak_drift_shows_only_in_long_windows():
     """One step ahead, the sensors' noise hides it."""
     drift = UnknownForce(0.03, lambda q, v, t: t / 40.0 + 0.0 * q)
@@ -70,6 +72,7 @@ def test_a_weak_drift_shows_only_in_long_windows():
     assert [term.split(": ")[1].split(" · ")[1] for term in found.effect.terms] == ["t"]
 
 
+@pytest.mark.slow
 def test_no_power_of_a_control_is_beside_its_saturation():
     """Both explain the same; the data would leave the values of both open."""
     simulation = pendulum()
