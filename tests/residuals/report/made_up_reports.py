@@ -50,6 +50,12 @@ def full_report() -> Report:
     )
 
 
+def few_pictures(report: Report) -> Report:
+    """The report without most of what is drawn, so that its page costs little: no trace and no error further ahead."""
+    error = None if report.error is None else dataclasses.replace(report.error, horizons=())
+    return dataclasses.replace(report, trace=None, windows=report.windows[:1], error=error)
+
+
 def windowed() -> Report:
     """The full report with windows, runs and a model, as a file of today has them."""
     ahead = tuple(0.02 * i for i in range(6))
@@ -107,6 +113,12 @@ def trace(rows: int = 5000) -> ResidualTrace:
         np.concatenate([q, v], -1),
         np.arange(rows) >= 3500,
     )
+
+
+def narrow(whole: ResidualTrace, columns: int) -> ResidualTrace:
+    """The first columns of a trace."""
+    parts = {name: getattr(whole, name)[:, :columns] for name in ("before", "after", "states")}
+    return dataclasses.replace(whole, names=whole.names[:columns], units=whole.units[:columns], **parts)
 
 
 def nothing_missing() -> Report:

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from tests.residuals.report.made_up_reports import DATA, full_report, no_conclusion, nothing_missing
+from tests.residuals.report.made_up_reports import DATA, few_pictures, full_report, no_conclusion, nothing_missing
 from torchrl_h2o.data.audit import Audit, Finding
 from torchrl_h2o.effects import Gravity
 from torchrl_h2o.residuals.progress import FORCES, NOISE, OTHERS
@@ -92,7 +92,7 @@ def test_where_nothing_is_missing_the_sentence_names_what_the_data_could_not_hav
     ],
 )
 def test_the_sentence_says_what_a_search_whose_time_was_up_has_not_done(stage, words, tmp_path):
-    report = dataclasses.replace(full_report(), ended_in=stage)
+    report = dataclasses.replace(few_pictures(full_report()), ended_in=stage)
     assert words in report.sentence()
     assert report.sentence().startswith("The best explanation so far" if stage == OTHERS else "Your simulator lacks")
     assert report.recommended is (stage != OTHERS)
