@@ -160,7 +160,12 @@ class HybridReplayBuffer(TensorDictReplayBuffer):
 
     def __len__(self) -> int:
         """Return the number of transitions of both streams."""
-        return len(self.real) + len(self._storage)
+        return len(self.real) + self.num_sim
+
+    @property
+    def num_sim(self) -> int:
+        """Number of simulated transitions."""
+        return len(self._storage)  # pyright: ignore[reportArgumentType]  (Storage.__len__ has no type)
 
     def __repr__(self) -> str:
         return (

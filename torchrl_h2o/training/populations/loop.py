@@ -155,7 +155,7 @@ def train_population(
                 try:
                     trainee.begin_epoch(epoch)
                 except UnstableSimulatorError as error:
-                    if not len(trainee.learner.replay.storage):  # a batch needs simulated rows of every member
+                    if trainee.learner.replay.num_sim == 0:  # a batch needs simulated rows of every member
                         raise UnstableSimulatorError(f"{name}: {error}") from error
                     learner.note_failure(number, str(error))
             torch.manual_seed(epoch_seed(cfg.seed, epoch))  # whichever members still simulate

@@ -113,7 +113,7 @@ class PopulationReplay:
 
         :meth:`sample` does so itself. Where a CUDA graph replays it, call this method first.
         """
-        lengths = [len(buffer.real) for buffer in self.buffers], [len(buffer.storage) for buffer in self.buffers]
+        lengths = [len(buffer.real) for buffer in self.buffers], [buffer.num_sim for buffer in self.buffers]
         if lengths != self._known_lengths:
             self._known_lengths = lengths
             self._lengths.copy_(torch.tensor(lengths)[..., None])
