@@ -107,6 +107,9 @@ class _Beam:
             added = state.with_found(addition.entries, addition.fit)
             added = _remember_leads(added, possible.leads, added.entries[len(state.entries) :])
             added = rescale(reorder(eliminate(divided_where_shared_harms(added))))
+            if not state.entries and not grown and added.entries:
+                self.progress.show_found(added.entries)
+                self.found(added)  # a first result, in case that the time does not suffice for the others
             self.progress.closer(ADDITION)
             if _names(added) not in self.seen:
                 self.seen.add(_names(added))
