@@ -43,6 +43,7 @@ def refuse_with_a_lambda(observation):
     raise error
 
 
+@pytest.mark.slow
 def test_a_second_process_gives_the_returns_and_the_errors_of_this_one(evaluators):
     """One test, because starting a process takes as long as all of it."""
     here, beside, actor = evaluators

@@ -50,7 +50,13 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
     assert all((p != q).any() for p, q in zip(policy.parameters(), first.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("name", sorted(METHODS.keys() - {"darc"}))  # darc also counts its reward correction n times
+FAST = {"h2o_plus", "sac"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in sorted(METHODS.keys() - {"darc"})],
+)  # darc also counts its reward correction n times
 def test_the_discount_of_each_method_is_that_of_the_steps_of_a_row(compose, name):
     def loss_qvalue(gamma, steps):
         cfg, real = compose(f"method={name}", f"gamma={gamma}", "n_steps=1")

@@ -56,7 +56,14 @@ def test_the_first_epoch_depends_on_its_seed_only(make):
     torch.testing.assert_close(batches[0]["observation"], batches[1]["observation"], rtol=0.0, atol=0.0)
 
 
-@pytest.mark.parametrize("overrides", [(), ("frames=3",), ("action_history=3",), ("gap=joint_noise",)], ids=str)
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        *(pytest.param(one, marks=pytest.mark.slow) for one in [(), ("frames=3",), ("action_history=3",)]),
+        ("gap=joint_noise",),
+    ],
+    ids=str,
+)
 def test_a_resumed_run_goes_on_with_the_episodes_of_the_interrupted_one(make, overrides):
     rollouts, episodes = make(*overrides)
     for epoch in range(2):

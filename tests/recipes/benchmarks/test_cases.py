@@ -105,6 +105,7 @@ def test_an_undeclared_effect_is_no_entry_of_the_catalogue_and_can_be_seen(numbe
     assert VISIBLE[0] / 2 < visibility(effect, *plain(case.system, 0)) < 2 * VISIBLE[1]
 
 
+@pytest.mark.slow
 def test_an_undeclared_effect_sees_the_time_since_the_recording_began():
     case = short_case(draw_case(FAMILIES, "undeclared", 3, SEED), 1200)
     (late,) = case.truth
@@ -187,7 +188,9 @@ def test_sensor_noise_is_drawn_once_an_observation_and_leaves_the_data_alone():
     assert (clean == SYSTEMS["Walker2d"].record((), 300, 0, episode=60)).all()
 
 
-@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize(
+    "system", ["pendulum", *(pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS if s != "pendulum")]
+)
 def test_a_recording_is_the_simulator_s_own_when_nothing_is_missing(system):
     simulation, measured = plain(system, 1)
     starts = measured.windows(1)

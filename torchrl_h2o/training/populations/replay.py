@@ -39,7 +39,7 @@ class PopulationReplay:
         >>> env = GymEnv("Pendulum-v1")
         >>> replay = PopulationReplay(env.rollout(50), sim_capacity=1000, batch_size=(4, 4), num_members=3)
         >>> for buffer in replay.buffers:
-        ...     buffer.extend(env.rollout(20))
+        ...     _ = buffer.extend(env.rollout(20))
         >>> replay.sample()["next", "reward"].shape
         torch.Size([3, 8, 1])
     """
