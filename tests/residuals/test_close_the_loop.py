@@ -130,6 +130,7 @@ def test_noise_of_the_action_that_the_control_range_cuts_off_is_no_saturation():
     assert noise.std == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.slow
 def test_noise_that_only_the_simulator_has_is_taken_away():
     simulation = SIMULATION.with_effects(ActionNoise(1.0))
     report = closed(recorded(SIMULATION, 2000), simulation)

@@ -45,6 +45,7 @@ def test_a_force_that_nobody_declared_stands_beside_declared_effects():
     np.testing.assert_allclose(force, 0.2 * np.sin(7.0 * q), atol=0.04)
 
 
+@pytest.mark.slow
 def test_a_force_stands_in_the_place_of_effects_that_it_explains_better():
     """The explanation is the force alone; friction and gravity of the catalogue do not explain a part of the ripple."""
     (part,) = explained(RIPPLE, rows=1200).parts

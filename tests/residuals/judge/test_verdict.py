@@ -1,6 +1,7 @@
 """The verdict: nothing missing, explained, explained in part, or not explained."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -40,6 +41,13 @@ def verdict(truth, found=(), noise=0.01, rows=2000):
     return reach_verdict(SIMULATION, mended, measured, found, error, TwoSample(None, 0.5))
 
 
+@cache
+def right_gravity():
+    """The effect that is missing, the data, and the errors with and without it."""
+    found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 2000, noise=0.01)
+    return found, measured, error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_nothing_is_missing_from_an_equal_simulator(noise):
     assert verdict((), noise=noise) == Verdict(NOTHING_MISSING)
@@ -74,8 +82,7 @@ def test_half_an_explanation_is_called_that():
 @pytest.mark.parametrize(("left", "kind"), [(0.1, EXPLAINED_IN_PART), (0.001, EXPLAINED)])
 def test_a_classifier_that_sees_a_difference_counts_unless_all_errors_nearly_vanish(left, kind):
     """The sentence's quantity alone may be right by chance, such as the pitch of a robot with a larger wheel."""
-    found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
-    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
+    found, measured, error = right_gravity()
     head = replace(error.headline, after=0.001 * error.headline.before)
     error = replace(error, headline=head, after=left * error.before)
     reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.94))
@@ -84,8 +91,7 @@ def test_a_classifier_that_sees_a_difference_counts_unless_all_errors_nearly_van
 
 def test_a_small_share_of_an_absurd_error_is_no_small_error():
     """A simulator without the rotor of a light link is wrong by turns; what is left may still exceed the motion."""
-    found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
-    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
+    found, measured, error = right_gravity()
     error = replace(error, headline=replace(error.headline, before=1e3), before=1e3 * error.before)
     reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.8))
     assert reached.kind == EXPLAINED_IN_PART
@@ -109,8 +115,7 @@ def test_effects_that_make_a_quantity_worse_are_said_to_be_wrong():
 @pytest.mark.parametrize(("factor", "recommended"), [(1.05, True), (1.2, False)])
 def test_effects_that_raise_the_error_of_the_sentence_are_not_recommended(factor, recommended):
     """No other test sees a fault here: the effect is right."""
-    found, measured = (Gravity(1.3),), recorded(SIMULATION.with_effects(Gravity(1.3)), 3000, noise=0.01)
-    error = error_summary(SIMULATION, SIMULATION.with_effects(*found), measured)
+    found, measured, error = right_gravity()
     error = replace(error, headline=replace(error.headline, after=factor * error.headline.before))
     reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.9, 0.5))
     assert reached.recommended == recommended

@@ -13,6 +13,7 @@ from torchrl_h2o.residuals.measured.missing_force import MissingForces, measured
 
 SIMULATION = double_pendulum()
 FRICTION = (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"))
+DAMPING = (JointDamping(0.5),)
 MEASURED = recorded(SIMULATION.with_effects(*FRICTION), 3000, noise=0.002)
 
 
@@ -21,7 +22,10 @@ def forces(truth, found, **options):
     return missing_forces(SIMULATION, SIMULATION.with_effects(*found), measured, Split.REPORT)
 
 
-@pytest.mark.parametrize("truth", [FRICTION, (JointDamping(0.5),), (JointDamping(0.5), ActionDelay(0.02))])
+@pytest.mark.parametrize(
+    "truth",
+    [FRICTION, *(pytest.param(t, marks=pytest.mark.slow) for t in [DAMPING, (*DAMPING, ActionDelay(0.02))])],
+)
 def test_right_effects_leave_little_force_missing(truth):
     found = forces(truth, truth, noise=0.002)
     assert found.fall_by(0.2)

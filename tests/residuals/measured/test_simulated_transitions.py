@@ -11,7 +11,7 @@ from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controll
 from torchrl_h2o.residuals import Simulation, simulate_transitions
 from torchrl_h2o.residuals.measured.transitions import SETTLING_STEPS
 
-ROWS, SETTLING = 250, SETTLING_STEPS
+ROWS, SETTLING = 300, SETTLING_STEPS
 
 
 def robot(*effects):

@@ -54,6 +54,7 @@ def test_every_addition_is_reported():
     assert len(seen[-1]) == 2
 
 
+@pytest.mark.slow
 def test_a_known_effect_that_is_not_needed_or_not_in_the_catalogue_does_not_stay():
     found, _ = traced([JointDamping(0.1), JointFrictionLoss(0.01)])
     assert found.keys() == {Gravity, JointFrictionLoss}

@@ -1,5 +1,7 @@
 """Growing lists of effects: which of several lists is kept."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
 FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
 
 
+@cache
 def lists(friction):
     """Searches in data with gravity × 1.3 and dry friction, in N·m: that found gravity alone, and that found both."""
     measured = recorded(SIMULATION.with_effects(Gravity(1.3), JointFrictionLoss(friction)), 600)

@@ -56,6 +56,7 @@ def test_friction_of_each_joint_is_proposed():
         assert getattr(proposed[type(true), true.joints], name) == pytest.approx(getattr(true, name), rel=0.02)
 
 
+@pytest.mark.slow
 def test_friction_is_proposed_as_it_acts_in_the_simulator():
     """There it is softer where torques jump, so a regression that takes it for dry finds 0.11 N·m."""
     measured = recorded(SIMULATION.with_effects(JointFrictionLoss(0.15, "elbow")), 2000, noise=0.001, smooth=0.0)
@@ -118,10 +119,12 @@ def test_a_search_begins_again_with_the_effects_that_the_forces_need_together():
         assert other.rivals.keys() == {entry.name for entry in other.entries}
 
 
+@pytest.mark.slow
 def test_a_search_that_has_found_what_the_forces_need_goes_on():
     assert begun_anew(MEASURED, FRICTION, begin_with_forces) is None
 
 
+@pytest.mark.slow
 def test_a_search_that_explains_the_motion_goes_on():
     assert begun_anew(MEASURED, FRICTION) is None
     assert begun_anew(MEASURED, ()) is None
@@ -141,6 +144,7 @@ def test_a_search_for_effects_begins_anew_after_its_first_growth():
     assert Armature not in map(type, trace.fit.effects)
 
 
+@pytest.mark.slow
 def test_friction_that_the_model_has_can_be_reduced_and_a_rotor_that_it_lacks_cannot():
     """Without these bounds, the missing gravity and the light link would make the rotor's inertia negative."""
     rough, smooth = (SIMULATION.with_effects(JointDamping(damping, "*")) for damping in (0.8, 0.5))
@@ -221,6 +225,7 @@ def test_friction_of_which_the_forces_need_far_less_at_one_joint_gives_way():
     assert model.dof_frictionloss == pytest.approx([0.15, 0.08], rel=0.1)
 
 
+@pytest.mark.slow
 def test_effects_that_stand_the_test_are_kept():
     assert by_forces(MEASURED, FRICTION) is None
     assert by_forces(with_noisy_torques(MEASURED, 0.02), FRICTION) is None
@@ -234,6 +239,7 @@ def test_effects_that_leave_only_the_error_of_means_over_windows_are_kept():
     assert by_forces(measured, truth) is None
 
 
+@pytest.mark.slow
 def test_friction_that_the_data_do_not_have_is_taken_away():
     """Less than none is impossible, so a step that shows how the force changes must lead back from there."""
     rough = SIMULATION.with_effects(JointFrictionLoss(0.05, "shoulder"))
@@ -250,6 +256,7 @@ def test_nothing_replaces_a_wrong_effect_if_no_force_is_missing():
     assert by_forces(with_noisy_torques(recorded(SIMULATION, 2000, noise=0.002)), (Armature(0.5, "*"),)) is None
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_true_friction():
     strong = DOUBLE.replace("0.6 0.6", "2 2").replace("0.3 0.3", "2 2")  # noise beyond a motor's limit would be cut
     simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(strong))
@@ -304,6 +311,7 @@ def without_motor(joint: str):
     return simulation
 
 
+@pytest.mark.slow
 def test_noise_does_not_make_a_link_light_that_no_actuator_moves():
     """Without a mass, no force is missing at the elbow, whatever the noise; earlier, × 0.01 was proposed."""
     simulation = without_motor("elbow")
@@ -314,11 +322,12 @@ def test_noise_does_not_make_a_link_light_that_no_actuator_moves():
     assert (found.joints, found.damping) == ("shoulder", pytest.approx(0.3, rel=0.02))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("without", "moved", "body", "scale"),
     [
         ("shoulder", "elbow", "upper", 1.6),
-        pytest.param("elbow", "shoulder", "lower", 1.6, marks=pytest.mark.slow),
+        ("elbow", "shoulder", "lower", 1.6),
     ],
 )
 def test_masses_are_found_with_one_motor(without, moved, body, scale):

@@ -64,6 +64,7 @@ def names(entries):
     return [entry.name for entry in entries]
 
 
+@pytest.mark.slow
 def test_the_effect_that_explains_most_comes_first():
     trace = traced(Gravity(1.02), JointFrictionLoss(0.1), catalogue=[GRAVITY, FRICTION])
     assert names(trace.entries) == [FRICTION.name, GRAVITY.name]

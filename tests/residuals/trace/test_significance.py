@@ -65,8 +65,7 @@ def robust(residual):
     return np.sqrt(1.0 + residual**2).mean(1) - 1.0
 
 
-@pytest.mark.parametrize("dimensions", [1, 3])
-@pytest.mark.parametrize("change", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize(("dimensions", "change"), [(1, 0.1), (1, 10.0), (3, 1.0)])
 def test_losses_that_change_by_chance_are_as_seldom_significant_as_they_should_be(dimensions, change):
     """Residuals of very different sizes, changed by independent noise."""
     significant = 0
@@ -91,8 +90,7 @@ def rare(rng, dimensions):
 
 
 @pytest.mark.parametrize("residuals", [concentrated, rare])
-@pytest.mark.parametrize("dimensions", [1, 3])
-@pytest.mark.parametrize("change", [0.1, 1.0])
+@pytest.mark.parametrize(("dimensions", "change"), [(1, 0.1), (3, 1.0)])
 def test_rare_residuals_that_change_by_chance_are_no_evidence(residuals, dimensions, change):
     """Where residuals are large, the change that an effect makes is large too, but it points anywhere."""
     significant = 0

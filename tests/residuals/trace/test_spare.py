@@ -34,7 +34,7 @@ def found(*truth, noise, alternative):
     return replace(state, groups=((attempt,), ()), rivals={GAIN.name: (), DAMPING.name: ()})
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
 def test_a_lighter_arm_needs_no_damping_beside_it(noise):
     """u = m l² q̈ + m g l sin q + d q̇: with 0.6 m, motors × 1.67 and more damping look the same."""
     state = spare(found(BodyMass(0.6), noise=noise, alternative=MASS))
@@ -43,7 +43,7 @@ def test_a_lighter_arm_needs_no_damping_beside_it(noise):
     assert state.groups == ()
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.01])
 def test_effects_stay_that_the_alternative_needs_as_well(noise):
     state = found(BodyMass(0.6), JointDamping(0.2), noise=noise, alternative=MASS)
     assert spare(state) is state
