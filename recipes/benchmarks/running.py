@@ -9,6 +9,7 @@ from types import MappingProxyType
 import joblib
 import torch
 from cases import Family, draw_case
+from dense_cases import DENSE
 from drawn_cases import DECOY, JOINT_BY_JOINT, NOISY_TORQUES, NOTHING, SEVERAL, SLOW, UNDECLARED_FORCE
 from machine_cases import MACHINE
 from paper_cases import PAPER, PAPER_WITH_NOISE
@@ -32,6 +33,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "torques": NOISY_TORQUES,
         "robot": ROBOT,
         "machines": MACHINE,
+        "dense": DENSE,
     }
 )
 

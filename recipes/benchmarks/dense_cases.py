@@ -1,0 +1,130 @@
+"""Cases of machines with many joints, each of which has friction, damping and a rotor, and whose drives are late."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from cases import Case, Family
+from chains import MODEL_STEPS, Chain
+from systems import with_sensor_noise
+from tensordict import TensorDict
+
+from torchrl_h2o.data.readers.ted import to_ted
+from torchrl_h2o.effects import (
+    ActionDelay,
+    Armature,
+    JointDamping,
+    JointFrictionLoss,
+    ObservationDelay,
+    selection,
+)
+from torchrl_h2o.residuals import Report, Simulation, StateMap
+from torchrl_h2o.residuals.report.contents import FoundEffect
+
+NOISE = (0.001, 0.003)  # of the encoders, shares of the signals' standard deviations
+KINDS = {JointFrictionLoss: "torque", JointDamping: "damping", Armature: "inertia"}  # and their parameters
+WITHIN, WITHIN_DELAY = 0.25, 0.001  # relative error of a joint's values; error of the delay in s
+
+
+@dataclass(frozen=True, kw_only=True)
+class DenseCase(Case):
+    """A case with the log of a chain.
+
+    Args:
+        chain: the chain.
+        velocities: whether the log has velocities.
+    """
+
+    chain: Chain
+    velocities: bool
+
+    def simulation(self) -> Simulation:
+        names, count, xml = self.chain.names, len(self.chain.joints), self.chain.xml()
+        observed, units = names, ["rad"] * count
+        if self.velocities:
+            observed, units = [*names, *(f"{name}_velocity" for name in names)], [*units, *["rad/s"] * count]
+        state_map = StateMap.of_coordinates(observed, units, range(len(observed)), 2 * count)
+        if not self.velocities:
+            state_map = replace(state_map, hidden=tuple(range(count, 2 * count)))
+        return Simulation(lambda: mujoco.MjSpec.from_string(xml), MODEL_STEPS, state_map, name="chain")
+
+    def measure(self) -> TensorDict:
+        states, commands = self.chain.record(self.transitions, self.seed)
+        seen = states if self.velocities else states[:, : len(self.chain.joints)]
+        ends = np.zeros(len(commands), bool)
+        data = to_ted(
+            observation=seen[:-1], action=commands, next_observation=seen[1:], terminated=ends, truncated=ends
+        )
+        return with_sensor_noise(data, self.noise, self.seed)
+
+
+def dense(number: int, rng: np.random.Generator) -> DenseCase:
+    """Torque motors and position servos in turn; every other log of servos has positions alone."""
+    chain = Chain.draw(rng, servos=number % 2 == 1)
+    truth = tuple(
+        effect
+        for name, joint in zip(chain.names, chain.joints, strict=True)
+        for effect in (
+            JointFrictionLoss(joint.friction, name),
+            JointDamping(joint.damping, name),
+            Armature(joint.rotor, name),
+        )
+    )
+    return DenseCase(
+        name=f"{len(chain.joints)} {'servos' if chain.servos else 'motors'} {number}",
+        system="chain",
+        judge=judge_dense,
+        truth=(*truth, ActionDelay(chain.delay)),
+        noise=float(rng.uniform(*NOISE)),
+        seed=int(rng.integers(2**31)),
+        chain=chain,
+        velocities=number % 4 != 1,
+    )
+
+
+def judge_dense(report: Report, case: Case) -> dict:
+    """Passed if each joint's values are right within 25 % or in their 95 % interval, and the delay within 1 ms."""
+    model = case.simulation().model
+    wrong, errors = 0, []
+    for kind, name in KINDS.items():
+        true = np.array([e.parameters[name].value for e in case.truth if isinstance(e, kind)])
+        value, low, high = _on_joints([f for f in report.found if isinstance(f.effect, kind)], name, model)
+        error = np.abs(value / true - 1.0)
+        wrong += int(((error > WITHIN) & ((true < low) | (high < true))).sum())
+        errors.append(float(error.max()))
+    late = float(np.abs(_delay_errors(report, case, model.nu)).max())
+    return {"ok": not wrong and late <= WITHIN_DELAY, "parameter_error": max(errors), "wrong": wrong, "late": late}
+
+
+def _on_joints(found: Iterable[FoundEffect], name: str, model: mujoco.MjModel) -> np.ndarray:
+    """A parameter, and the ends of its interval, summed over the effects on each joint, (3, nv)."""
+    sums = np.zeros((3, model.nv))
+    for one in found:
+        value = one.effect.parameters[name].value
+        ends = one.ci95.get(name, (value, value))
+        sums[:, selection.joint_dofs(model, one.effect.joints)] += np.array([[value], [ends[0]], [ends[1]]])
+    return sums
+
+
+def _delay_errors(report: Report, case: Case, count: int) -> np.ndarray:
+    """Errors of each actuator's delay in s; late sensors and late motors are the same in such a log."""
+    found = np.zeros(count)
+    for effect in report.effects:
+        if isinstance(effect, ActionDelay):
+            found[slice(None) if effect.actuators is None else list(effect.actuators)] += effect.delay
+        elif isinstance(effect, ObservationDelay) and effect.entries is None:
+            found += effect.delay
+    (true,) = (effect.delay for effect in case.truth if isinstance(effect, ActionDelay))
+    return found - true
+
+
+DENSE = Family(
+    dense,
+    20,
+    18,
+    "each joint's friction, damping and rotor within 25 % or its interval, the delay within 1 ms",
+    stream=11,
+)
