@@ -14,6 +14,7 @@ from drawn_cases import DECOY, JOINT_BY_JOINT, NOISY_TORQUES, NOTHING, SEVERAL, 
 from machine_cases import MACHINE
 from paper_cases import PAPER, PAPER_WITH_NOISE
 from robot_cases import ROBOT
+from version_cases import VERSIONS
 
 from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.provenance import cpu_seconds
@@ -34,6 +35,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "robot": ROBOT,
         "machines": MACHINE,
         "dense": DENSE,
+        "versions": VERSIONS,
     }
 )
 

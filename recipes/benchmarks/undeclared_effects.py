@@ -1,15 +1,16 @@
-"""Effects outside the catalogue: forces that the code under test does not define."""
+"""Effects outside the catalogue: forces that the code under test does not define, and another version's inertias."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 from typing import ClassVar
 
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects import ForceEffect, Names, parameter, selection
+from torchrl_h2o.effects import ForceEffect, ModelEffect, Names, parameter, selection
 from torchrl_h2o.effects.effect import BatchedForce, Force
+from torchrl_h2o.effects.model.inertial import edit_inertials
 
 _TORQUE = {"unit": "N·m", "bounds": (-1000.0, 1000.0), "neutral": 0.0}
 _SLOW = 0.05  # rad/s; below it dry friction fades to avoid chattering
@@ -108,3 +109,29 @@ class PlaceFriction(_TorqueOnJoint):
 
     def torque_at(self, q: np.ndarray, v: np.ndarray, time: np.ndarray) -> np.ndarray:
         return -0.5 * self.torque * (1.0 + np.sin(self.waves * q)) * np.tanh(v / _SLOW)
+
+
+@dataclass(frozen=True)
+class OtherVersion(ModelEffect):
+    """Another version of the simulator: the inertias of all bodies and the dampings of all joints differ a little.
+
+    MuJoCo has changed how it computes the inertia of capsules. The differences, larger or smaller, are drawn at random.
+    """
+
+    wording: ClassVar[str] = "inertias and damping as in version {version}"
+    version: float = parameter(unit="1", bounds=(0.0, 1e9), neutral=0.0)
+
+    inertia: ClassVar[tuple[float, float]] = (0.02, 0.06)  # smallest and largest relative difference
+    damping: ClassVar[tuple[float, float]] = (0.01, 0.03)
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        rng = np.random.default_rng(int(self.version))
+        for body in selection.bodies(spec, "*"):
+            factor = self._factor(self.inertia, rng)
+            edit_inertials(spec, [body], lambda old, factor=factor: replace(old, inertia=factor * old.inertia))
+        for joint in selection.joints(spec, "*"):
+            joint.damping[0] *= self._factor(self.damping, rng)
+
+    @staticmethod
+    def _factor(differences: tuple[float, float], rng: np.random.Generator) -> float:
+        return 1.0 + float(rng.choice([-1, 1]) * rng.uniform(*differences))
