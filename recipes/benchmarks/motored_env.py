@@ -1,4 +1,4 @@
-"""Mechanisms with a motor at each joint as Gymnasium tasks, observed by their joints' angles and velocities."""
+"""Mechanisms with motors as Gymnasium tasks, observed by the positions and velocities of all joints."""
 
 import math
 from pathlib import Path
@@ -15,14 +15,14 @@ PENDULUM_STEP = 0.01  # s
 
 
 class MotoredEnv(MujocoEnv):
-    """Observes angles (rad) and angular velocities (rad/s) of all joints; the actions are torques, in N·m.
+    """Observes positions and velocities of all joints, hinges or slides; the actions are torques or forces.
 
     Args:
-        model: name of the MJCF file, of hinge joints, beside this file.
+        model: path of the MJCF file from the folder of this file.
         frame_skip: physics steps per control step.
         control_step: control step, in s.
-        start_angle: largest angle of a joint at the start of an episode, in rad; angles are uniform, as are velocities
-            up to 1 rad/s.
+        start_angle: largest position of a joint at the start of an episode, in rad or m; positions are uniform, as are
+            velocities up to 1 rad/s or m/s.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own attribute)
@@ -33,7 +33,7 @@ class MotoredEnv(MujocoEnv):
         # MujocoEnv compares the frames per second with the model
         self.metadata = {**self.metadata, "render_fps": round(1.0 / control_step)}
         self._start_angle = start_angle
-        super().__init__(str(Path(__file__).with_name(model)), frame_skip, None)
+        super().__init__(str(Path(__file__).parent / model), frame_skip, None)
         self.observation_space = Box(-np.inf, np.inf, (self.model.nq + self.model.nv,), np.float64)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -69,3 +69,17 @@ class LegEnv(MotoredEnv):
 
     def __init__(self) -> None:
         super().__init__("leg.xml", 2, 0.005, start_angle=0.3)
+
+
+class CartPoleEnv(MotoredEnv):
+    """A pole that hangs from a driven cart."""
+
+    def __init__(self) -> None:
+        super().__init__("machines/cart_pole.xml", 4, 0.01, start_angle=0.3)
+
+
+class TwoLinksEnv(MotoredEnv):
+    """Two hanging links with a motor at each joint."""
+
+    def __init__(self) -> None:
+        super().__init__("machines/two_links.xml", 4, 0.005, start_angle=0.3)

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import torch
 from gymnasium.wrappers import TimeLimit
-from motored_env import LegEnv, PendulumEnv
+from motored_env import CartPoleEnv, LegEnv, PendulumEnv, TwoLinksEnv
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
 
@@ -185,6 +185,15 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
         "leg": System(
             lambda episode: GymWrapper(TimeLimit(LegEnv(), episode)),
             lambda: Excitation(torch.full((3,), 12.0), strongest=0.25, brake=_held_joints(6.0, 0.6)),
+        ),
+        # the cart is held near its place, as a controller does
+        "cart-pole": System(
+            lambda episode: GymWrapper(TimeLimit(CartPoleEnv(), episode)),
+            lambda: Excitation(torch.tensor([5.0]), strongest=0.3, brake=torch.tensor([[8.0, 0.0, 1.0, 0.0]])),
+        ),
+        "two links": System(
+            lambda episode: GymWrapper(TimeLimit(TwoLinksEnv(), episode)),
+            lambda: Excitation(torch.tensor([6.0, 2.0]), strongest=0.5),
         ),
         "wheel_legged": System(
             lambda episode: WheelLeggedEnv(max_episode_steps=episode), lambda: noisy_balance_controller()
