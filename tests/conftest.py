@@ -4,6 +4,8 @@ import os
 
 os.environ["OMP_NUM_THREADS"] = "1"  # read when torch and NumPy load, here and in the processes that tests start
 
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import settings
@@ -27,3 +29,13 @@ def saved_figures(monkeypatch):
 
     monkeypatch.setattr(Figure, "savefig", saved)
     return figures
+
+
+@pytest.fixture
+def shared_data():
+    """Returns the folder of published recordings, which are not part of the repository."""
+    beside = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("TORCHRL_H2O_TEST_DATA", beside))
+    if not folder.is_dir():
+        pytest.skip(f"no recordings at {folder}: set TORCHRL_H2O_TEST_DATA")
+    return folder
