@@ -1,9 +1,11 @@
 """Compiled losses: same values, used where they are faster and available."""
 
 import shutil
+import signal
 
 import pytest
 import torch
+from torch._dynamo.exc import TorchDynamoException
 from torch._inductor.utils import fresh_cache
 from torchrl.data import Bounded
 
@@ -151,3 +153,25 @@ def test_losses_are_compiled_where_it_pays_or_is_asked_for(chosen, updates, pays
         return batch
 
     assert (maybe_compiled(losses_of, chosen, updates, pays=pays) is not losses_of) == compiles
+
+
+@torch.compiler.set_stance("force_eager")  # without a compiler
+@pytest.mark.parametrize("error", [RuntimeError("g++ failed"), TorchDynamoException("g++ failed"), None], ids=repr)
+def test_ctrl_c_during_compilation_ends_the_training(error):
+    calls = []
+
+    def losses_of(batch):
+        calls.append(batch)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if error is not None:
+                raise error from None
+        return {"loss": batch}
+
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt) as raised:
+        maybe_compiled(losses_of, "auto", PAYS_FROM)(torch.ones(1))
+    assert raised.value.__cause__ is error
+    assert len(calls) == 1  # no second try without the compiler
+    assert signal.getsignal(signal.SIGINT) is handler

@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from torchrl_h2o.comparison.results_file import append_run
 from torchrl_h2o.options import TrainOptions, check_options
 from torchrl_h2o.training.divergence import DivergenceError
+from torchrl_h2o.training.interrupts import interruptible
 from torchrl_h2o.training.job import run_job
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.run_folder import claimed, open_run
@@ -49,5 +50,5 @@ def train_grid_run(cfg: DictConfig) -> None:
     results = cfg.results
     cfg, directory = open_run(cfg, go_on=True)
     cfg.results = results  # an interrupted run may have been started for another results file
-    with claimed(directory):
+    with claimed(directory), interruptible():  # otherwise the grid could go on with its next run after Ctrl-C
         train_and_record(cfg, directory)

@@ -18,7 +18,7 @@ from torchrl_h2o.comparison.records import shorten_paths
 from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.options.nearest import did_you_mean
-from torchrl_h2o.training.run_folder import uninterrupted
+from torchrl_h2o.training.interrupts import uninterrupted
 from torchrl_h2o.whole_file import whole_file
 
 RESULTS = Path("outputs/results")  # folder of the results files, unless an option names another

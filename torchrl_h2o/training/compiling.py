@@ -20,6 +20,7 @@ from torch._dynamo.exc import TorchDynamoException
 from tqdm import tqdm
 
 from torchrl_h2o.objectives import total_loss
+from torchrl_h2o.training.interrupts import interruptible
 
 PAYS_FROM = 10_000  # updates; in shorter trainings compilation takes longer than it saves
 
@@ -79,7 +80,8 @@ class _CompiledAtFirstCall:
             torch.compiler.reset()
             self._chosen = compiled(self._plain, self._parameters)
             try:
-                return self._chosen(*batches)
+                with interruptible():  # otherwise Ctrl-C could be taken for a compiler that does not work
+                    return self._chosen(*batches)
             except TorchDynamoException as error:  # for example without a C++ compiler or Python's header files
                 if self._needed:
                     raise

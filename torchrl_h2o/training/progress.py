@@ -22,7 +22,7 @@ from tqdm import tqdm
 from torchrl_h2o.training.checkpoint import checkpoint_file, load_checkpoint, save_checkpoint
 from torchrl_h2o.training.divergence import DivergenceError, are_finite, not_finite_losses
 from torchrl_h2o.training.evaluators import Evaluator
-from torchrl_h2o.training.run_folder import uninterrupted
+from torchrl_h2o.training.interrupts import raise_lost_interrupt, uninterrupted
 from torchrl_h2o.whole_file import whole_file
 
 
@@ -134,6 +134,7 @@ class Training:
         for update in range(self.budget.updates_per_epoch):
             self._update = update
             yield update
+            raise_lost_interrupt()
             self._bar.update()
         self._check_parameters()
         self.progress["update_seconds"] += time.perf_counter() - start

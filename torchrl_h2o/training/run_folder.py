@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +18,7 @@ from tqdm import tqdm
 from torchrl_h2o.options.types import why_unavailable
 from torchrl_h2o.training.checkpoint import require_widths
 from torchrl_h2o.training.config_file import load_config, require_plain_files, save_config
+from torchrl_h2o.training.interrupts import interruptible
 from torchrl_h2o.training.mending import prepare_mending
 from torchrl_h2o.training.targets import foreign_names
 from torchrl_h2o.whole_file import remove_partial
@@ -136,27 +135,12 @@ def claimed(directory: Path) -> Iterator[None]:
 def resumable(directory: Path) -> Iterator[None]:
     """Handles Ctrl-C: exits with the command that continues the run."""
     try:
-        yield
+        with interruptible():
+            yield
     except KeyboardInterrupt:
         names = foreign_names(load_config(directory, trust=True)) if (directory / "config.yaml").exists() else []
         trust = f" 'trust=[{','.join(names)}]'" if names else ""
         sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}{trust}")
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delays Ctrl-C to the end of the block, because inside file operations it could appear as an OSError."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread receives signals
-        yield
-        return
-    came = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if came:
-            signal.raise_signal(signal.SIGINT)
 
 
 def keeps_best(cfg: DictConfig) -> bool:

@@ -24,11 +24,11 @@ from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.cuda_graph import fit_to_device
 from torchrl_h2o.training.divergence import are_finite
 from torchrl_h2o.training.environments import as_observed, sim_capacity_of
+from torchrl_h2o.training.interrupts import uninterrupted
 from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed, write_metrics
-from torchrl_h2o.training.run_folder import uninterrupted
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
