@@ -3,11 +3,11 @@
 import pytest
 import torch
 from torch import nn
-from torch.overrides import TorchFunctionMode
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from tests.objectives.conftest import ACTION_DIM, OBSERVATION_DIM, Parts, make_batch
+from tests.training.fixed_numbers import FixedNumbers
 from torchrl_h2o.objectives import (
     DynamicsRatioLoss,
     ExpectileValueLoss,
@@ -20,15 +20,6 @@ from torchrl_h2o.objectives import (
 from torchrl_h2o.training.populations import Population
 
 LR, TAU = 3e-3, 0.05
-
-
-class Zeros(TorchFunctionMode):
-    """Replaces normal numbers by zeros."""
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        if func in (torch.Tensor.normal_, torch.randn_like):
-            return torch.zeros_like(args[0])
-        return func(*args, **(kwargs or {}))
 
 
 class Randomly(nn.Module):
@@ -102,7 +93,7 @@ def numbers(run):
 @pytest.mark.parametrize("value_loss", [ExpectileValueLoss, SparseValueLoss, ExponentialValueLoss])
 def test_without_random_numbers_members_learn_what_single_runs_learn(value_loss):
     alone, together = ([Run(seed, value_loss) for seed in range(3)] for _ in range(2))
-    with Zeros():
+    with FixedNumbers():
         for update in range(10):
             for member, run in enumerate(alone):
                 run.update(*batches(member, update))
@@ -204,7 +195,7 @@ def test_members_may_be_any_loss_of_any_network(make):
     alone, together = ([make(seed) for seed in range(3)] for _ in range(2))
     population = Population(together)
     batch = torch.stack([make_batch(4, 4, member, torch.float32) for member in range(3)])
-    with Zeros():
+    with FixedNumbers():
         terms = population(batch.copy())
         total_loss(terms).sum().backward()
         stacks = {name.removeprefix("stacked."): p.grad for name, p in population.named_parameters()}
