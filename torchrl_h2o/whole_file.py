@@ -10,13 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
 
-DAY = 86_400.0  # s; a temporary file that nobody has written to for so long is what a killed process has left
+DAY = 86_400.0  # s; a temporary file that was last written longer ago was left by a killed process
 
 
 def partial_name(path: Path) -> Path:
-    """An unused temporary name beside a file or folder, with its suffix, by which some writers choose the format.
+    """Returns an unused temporary name beside a file or folder.
 
-    What killed processes have left beside it is removed after a day.
+    The suffix stays the same, because some writers choose the format by it. Temporary files in that folder that killed
+    processes left more than a day ago are removed.
     """
     remove_partial(path.parent, unchanged_for=DAY, below="")
     return path.with_name(f".{path.stem}.{uuid4().hex}.partial{path.suffix}")
@@ -76,10 +77,13 @@ def whole_files(folder: str | Path) -> Iterator[Path]:
     try:
         partial.mkdir()
         yield partial
-        written = sorted(partial.rglob("*"), key=Path.is_file)  # folders first: a full disk may have no room for them
-        for path in written:
-            into = folder / path.relative_to(partial)
-            into.mkdir(parents=True, exist_ok=True) if path.is_dir() else os.replace(path, into)
+        # Folders first: on a full disk a folder may fail to be created, and then no file has replaced an earlier one
+        for path in sorted(partial.rglob("*"), key=Path.is_file):
+            target = folder / path.relative_to(partial)
+            if path.is_dir():
+                target.mkdir(parents=True, exist_ok=True)
+            else:
+                os.replace(path, target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

@@ -1,29 +1,14 @@
 """The tables of stored runs: they come from one commit, and each run is stored without folders of the machine."""
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
+import make
 import pytest
 from running import FAMILIES
 
 from torchrl_h2o.comparison.records import Record, read_records
 
-HERE = Path(__file__).parents[3] / "recipes" / "results"
 MADE_BY = {"commit": "abc1234", "dirty": False, "cpu_s": 120.0, "versions": {}, "threads": 1, "instruction_set": "AVX2"}
-
-
-@pytest.fixture(scope="module")
-def make():
-    sys.path.insert(0, str(HERE))
-    try:
-        spec = importlib.util.spec_from_file_location("make_results", HERE / "make.py")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        yield module
-    finally:
-        sys.path.remove(str(HERE))
 
 
 def drawn(family, number, ok, seed=0, **made_by):
@@ -42,7 +27,7 @@ def saved(folder, *records):
         record.save(folder / "runs")
 
 
-def test_draws_that_chose_something_are_counted_apart_with_their_intervals(make, folder):
+def test_draws_that_chose_something_are_counted_apart_with_their_intervals(folder):
     held = [drawn("slow", number, ok=number != 4) for number in (4, 6, 8, 9)]
     saved(folder, *held, drawn("slow", 0, ok=True), drawn("slow", 0, ok=False, seed=1))
     assert make.make(folder) == ["page.md"]
@@ -58,7 +43,7 @@ def test_draws_that_chose_something_are_counted_apart_with_their_intervals(make,
 
 
 @pytest.mark.parametrize("other", [{"commit": "def5678"}, {"dirty": True}, {"dirty": None}])
-def test_rows_of_different_code_make_no_table(make, folder, other):
+def test_rows_of_different_code_make_no_table(folder, other):
     saved(folder, drawn("slow", 4, ok=True), drawn("slow", 6, ok=True, **other))
     before = (folder / "page.md").read_text()
     with pytest.raises(ValueError, match=r"(?s)drawn: its rows must come from one commit.*slow_6_0"):
@@ -66,7 +51,7 @@ def test_rows_of_different_code_make_no_table(make, folder, other):
     assert (folder / "page.md").read_text() == before
 
 
-def test_a_marker_of_no_table_is_refused(make, folder):
+def test_a_marker_of_no_table_is_refused(folder):
     (folder / "page.md").write_text("<!-- table: drwan -->\n<!-- end -->\n")
     with pytest.raises(ValueError, match=r"page.md: there is no table drwan; choose from"):
         make.make(folder)
@@ -84,7 +69,7 @@ def friction(value, joint, interval=None):
     return {"effect": effect, "parameters": parameters, "words": f"dry friction of {joint}"}
 
 
-def test_found_values_stand_beside_the_known_ones(make, tmp_path):
+def test_found_values_stand_beside_the_known_ones(tmp_path):
     run = tmp_path / "double_pendulum"
     run.mkdir()
     found = [friction(0.1, "*", [0.09, 0.11]), friction(0.05, "shoulder"), friction(0.02, "ankle")]
@@ -99,7 +84,7 @@ def test_found_values_stand_beside_the_known_ones(make, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["unknown_machine", "double_pendulum"])
-def test_reports_that_cannot_be_placed_are_refused(make, tmp_path, name):
+def test_reports_that_cannot_be_placed_are_refused(tmp_path, name):
     (tmp_path / name).mkdir()
     (tmp_path / name / "report.json").write_text(json.dumps(report_of(unfinished="search")))
     with pytest.raises(ValueError, match="not finished" if name == "double_pendulum" else "machines.yaml"):
@@ -116,11 +101,11 @@ def test_records_have_no_folder_of_the_machine(tmp_path):
     assert record.values == told | {"found": "failed: no file logs/a.txt"}
 
 
-def test_the_pages_that_ship_are_those_that_the_stored_runs_make(make):
-    assert make.make(HERE, check=True) == []
+def test_the_pages_that_ship_are_those_that_the_stored_runs_make():
+    assert make.make(make.HERE, check=True) == []
 
 
-def test_the_families_of_the_page_are_those_of_the_benchmark(make):
+def test_the_families_of_the_page_are_those_of_the_benchmark():
     told = {name: family["draws"] for name, family in make.pages.drawn_families().items()}
     assert told == {name: family.size for name, family in FAMILIES.items()}
     assert all(draw < told[name] for name, family in make.pages.drawn_families().items() for draw in family["chose"])

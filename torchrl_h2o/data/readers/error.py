@@ -59,18 +59,20 @@ class DataError(ValueError):
 
 @contextmanager
 def unreadable(
-    problem: str, remedy: str = "copy or write it again", *, source: str | Path, column: str | None = None
+    problem: str, remedy: str = "copy or export the file again", *, source: str | Path, column: str | None = None
 ) -> Iterator[None]:
-    """Turn any error of the block into a DataError: the packages of file formats raise all kinds for damaged files.
+    """Raise DataError in place of any other exception of the block.
+
+    The packages that read a file format raise exceptions of many types for a damaged file, so all types are replaced.
 
     Args:
-        problem: what cannot be done; the error follows.
+        problem: what failed, such as "the file cannot be read"; the message adds the text of the exception.
         remedy: how to correct it.
         source: the file.
         column: the part of the file that is read.
 
     Raises:
-        DataError: for any error of the block; its own DataErrors pass.
+        DataError: for any exception of the block; one that is a DataError already is passed on.
 
     Example:
         >>> from torchrl_h2o.data.readers.error import unreadable

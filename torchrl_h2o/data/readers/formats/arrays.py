@@ -93,7 +93,7 @@ def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str
     if stated != stored:
         raise DataError(
             f"it states {stated} bytes {list(shape)}, but the file stores {stored}",
-            "the file is damaged: copy or write it again",
+            "the file is damaged: copy or export it again",
             source=path,
             column=name,
         )
