@@ -4,9 +4,9 @@ import os
 import subprocess
 import sys
 
-import hydra
 import pytest
 
+from tests.composed import composed
 from tests.small_runs import ROBOT, ROOT, SMALL
 from torchrl_h2o.training.environments import measure_observation_norm, task_of
 
@@ -38,8 +38,7 @@ def compose(cache, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
 
     def build(*overrides, config="train"):
-        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            cfg = hydra.compose(config, [*SMALL, *ROBOT, *overrides])
+        cfg = composed(config, *SMALL, *ROBOT, *overrides)
         real = task_of(cfg).read_real_data(cfg.data, cfg.columns)
         measure_observation_norm(cfg, real)
         return cfg, real

@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import hydra
 import mujoco
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ import torch
 from hydra.core.plugins import Plugins
 from hydra.core.singleton import Singleton
 
+from tests.composed import composed
 from tests.full_disk import full_disk
 from torchrl_h2o.commands.close_the_loop import (
     chosen_entries,
@@ -100,8 +100,7 @@ def command(folder, *overrides, script="close_the_loop.py"):
 def compose():
     def build(*overrides, config="close_the_loop"):
         folder = ROOT / ("torchrl_h2o" if config == "close_the_loop" else "recipes") / "config"
-        with hydra.initialize_config_dir(str(folder), version_base=None):
-            return hydra.compose(config, [full for override in overrides for full in expanded(override)])
+        return composed(config, *(full for override in overrides for full in expanded(override)), folder=folder)
 
     return build
 
@@ -308,15 +307,21 @@ def test_a_full_disk_does_not_lose_the_result(robot, monkeypatch, capsys):
     (robot / "out" / "mended.xml").write_text("with gravity × 0.5")
     before = {path: path.read_bytes() for path in (robot / "out").iterdir()}
     chosen = ["simulator=robot.xml", "data=log.csv", "columns=log.yaml", "simulator.coordinates={angle: pivot}"]
-    chosen += ["catalogue=[JointDamping]", "audit=false", "hydra.run.dir=out"]
+    chosen += ["audit=false", "hydra.run.dir=out"]
     monkeypatch.setattr(sys, "argv", ["close-the-loop", *chosen])
+
+    def search(*args, so_far, **kwargs):
+        so_far(report(Gravity(0.7)))
+        return report(Gravity(0.8))
+
+    monkeypatch.setattr("torchrl_h2o.commands.close_the_loop.close_the_loop", search)
     Plugins.instance()  # registered once, at their import
     state = Singleton.get_state()
     with full_disk(), pytest.raises(SystemExit, match="1"):
         run()
     Singleton.set_state(state)
     printed = capsys.readouterr()
-    assert "Your simulator lacks: damping of joints pivot + 0.1 N·m·s/rad" in printed.out
+    assert "Your simulator lacks: gravity × 0.8" in printed.out
     *_, line = printed.err.splitlines()
     assert line.startswith("OSError: ")
     assert "File too large" in line

@@ -1,10 +1,10 @@
 """Wrong options end a command with one line, before any work and without files; right ones pass."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
 from hydra.core.plugins import Plugins
@@ -12,7 +12,7 @@ from hydra.core.singleton import Singleton
 from omegaconf import OmegaConf, open_dict
 from pydantic import ValidationError
 
-from tests.run_fixtures import ROOT
+from tests.composed import COMMANDS, RECIPES, ROOT, composed
 from torchrl_h2o.comparison.options import PaperOptions, ReportOptions
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.options import (
@@ -32,7 +32,7 @@ NOWHERE = "there is no such file or folder"
 SHARED = "because all worlds share the steps equally"
 NOT_A_RUN = "it is not the folder of a run, which has a config.yaml"
 
-TRAIN = {
+VALUES = {
     "updates=0": f"updates=0: {COUNT}",
     "updates_per_epoch=0": f"updates_per_epoch=0: {COUNT}",
     "eval_every=0": f"eval_every=0: {COUNT}",
@@ -43,20 +43,13 @@ TRAIN = {
     "gamma=1.5": "gamma=1.5: must be a number from 0 to 1",
     "num_cells=[]": "num_cells=[]: must be the sizes, up to 4096, of 1 to 20 layers, such as [256,256]",
     "device=gpu": "device=gpu: must be cpu or cuda",
-    "update=100": "no option update; did you mean updates?",
     "method=h2oplus": "method=h2oplus: must be sac, cql, iql, darc, h2o, h2o_plus, rlpd or td3; did you mean h2o_plus?",
     "gap=gravty": f"gap=gravty: must be {GAPS} or null; did you mean gravity?",
-    "env=halfcheeta": "env=halfcheeta: must be halfcheetah, walker2d, wheel_legged, wheel_legged_forward or "
-    "wheel_legged_poor; did you mean halfcheetah?",
     "data=halfcheetah/medium-repaly-v0": "data=halfcheetah/medium-repaly-v0: there is no such data set on this "
     "machine; did you mean halfcheetah/medium-replay-v0?",
-    "data=standing_stil.txt": f"data=standing_stil.txt: {NOWHERE}; did you mean standing_still.txt?",
-    "preset=papr": "preset=papr: must be paper; did you mean paper?",
-    "collector=multisync": "collector=multisync: must be multi_sync, ray or sync; did you mean multi_sync?",
     "backbone=expectil": "backbone=expectil: must be expectile, sparse or exponential; did you mean expectile?",
     "ratio_estimator=pair": "ratio_estimator=pair: must be paper, change or pairs; did you mean pairs?",
     "keep=best": "keep=best: must be last or best_in_simulator",
-    # further ones
     "lr=nan": "lr=nan: must be a number above 0",
     "layer_norm=2": "layer_norm=2: must be true or false",
     "change_noise=-1": "change_noise=-1: must be auto or a number of at least 0",
@@ -84,15 +77,22 @@ TRAIN = {
     "gap_fix=report.jsn": f"gap_fix=report.jsn: {NOWHERE}",
     "resume=nowhere": f"resume=nowhere: {NOT_A_RUN}",
     "env.make.max_episode_steps=0": f"env.make.max_episode_steps=0: {COUNT} or null",
-    "env.make.tsk=moving": "no option env.make.tsk; did you mean env.make.task?",
     "env=halfcheetah env.make.env_name=HalfCheeta-v5": "env.make.env_name=HalfCheeta-v5: Environment HalfCheeta "
     "doesn't exist. Did you mean: HalfCheetah?",
-    "presets=paper": "no option presets; did you mean preset?",
-    "+foo=1": "no option foo; --help lists the options",
-    "num_cells=[": "num_cells=[: cannot be read; write name=value, and quote a value that has special characters",
-    "gamma=2 lr=0": "gamma=2: must be a number from 0 to 1; lr=0: must be a number above 0",
 }
 OTHERS = {
+    ("train", "update=100"): "no option update; did you mean updates?",
+    ("train", "env=halfcheeta"): "env=halfcheeta: must be halfcheetah, walker2d, wheel_legged, wheel_legged_forward or "
+    "wheel_legged_poor; did you mean halfcheetah?",
+    ("train", "data=standing_stil.txt"): f"data=standing_stil.txt: {NOWHERE}; did you mean standing_still.txt?",
+    ("train", "preset=papr"): "preset=papr: must be paper; did you mean paper?",
+    ("train", "collector=multisync"): "collector=multisync: must be multi_sync, ray or sync; did you mean multi_sync?",
+    ("train", "env.make.tsk=moving"): "no option env.make.tsk; did you mean env.make.task?",
+    ("train", "presets=paper"): "no option presets; did you mean preset?",
+    ("train", "+foo=1"): "no option foo; --help lists the options",
+    ("train", "num_cells=["): "num_cells=[: cannot be read; write name=value, and quote a value that has special "
+    "characters",
+    ("train", "gamma=2 lr=0"): "gamma=2: must be a number from 0 to 1; lr=0: must be a number above 0",
     ("h2o_plus", "tau=0"): "tau=0: must be a number above 0 and at most 1",
     ("h2o_plus", "num_worlds=3 steps_per_epoch=1000"): "num_worlds=3: steps_per_epoch=1000 must be a multiple of 3, "
     f"{SHARED}",
@@ -128,28 +128,34 @@ OTHERS = {
 
 
 @pytest.fixture
-def refused(tmp_path, monkeypatch, capsys):
-    """Call a command in a folder with a few files; return its line, having checked status, output and files."""
+def folder(tmp_path, monkeypatch):
+    """The current folder, with a few files."""
     for name in ("standing_still.txt", "robot.xml", "runs/first/config.yaml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "minari" / "halfcheetah" / "medium-replay-v0" / "data").mkdir(parents=True)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def refused(folder, monkeypatch, capsys):
+    """Call a command; return its line, having checked status, output and files."""
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     Plugins.instance()  # whose configurations are registered once, at their import, and would be lost with the state
-    before, state = sorted(tmp_path.rglob("*")), Singleton.get_state()
+    before, state = sorted(folder.rglob("*")), Singleton.get_state()
 
     def call(module, *overrides):
         command = importlib.import_module(module)
         # Hydra looks for the configuration of an imported module in a package, which recipes/config is not
-        folder = [] if module.startswith("torchrl_h2o") else ["--config-path", str(ROOT / "recipes" / "config")]
-        monkeypatch.setattr(sys, "argv", [module, *folder, *overrides])
+        config = [] if module.startswith("torchrl_h2o") else ["--config-path", str(RECIPES)]
+        monkeypatch.setattr(sys, "argv", [module, *config, *overrides])
         with pytest.raises(SystemExit) as ended:
             getattr(command, "run", command.main)()
         printed = capsys.readouterr()
         assert (ended.value.code, printed.out) == (1, "")
-        assert sorted(tmp_path.rglob("*")) == before
+        assert sorted(folder.rglob("*")) == before
         (line,) = printed.err.splitlines()
         return line
 
@@ -157,9 +163,11 @@ def refused(tmp_path, monkeypatch, capsys):
     Singleton.set_state(state)
 
 
-@pytest.mark.parametrize("typed", TRAIN)
-def test_a_wrong_option_of_a_run_is_one_line_with_what_is_allowed(refused, typed):
-    assert refused("train", *typed.split()) == f"ValueError: {TRAIN[typed]}"
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("typed", VALUES)
+def test_a_wrong_value_is_named_with_what_is_allowed(typed):
+    with pytest.raises(ValueError, match=f"^{re.escape(VALUES[typed])}$"):
+        check_options(composed("train", *typed.split()), TrainOptions)
 
 
 @pytest.mark.parametrize(("module", "typed"), OTHERS)
@@ -169,12 +177,7 @@ def test_a_wrong_option_of_any_command_is_one_line_with_what_is_allowed(refused,
 
 def test_a_wrong_option_of_a_job_of_a_multirun_is_one_line(refused, tmp_path):
     sweep = f"hydra.sweep.dir={tmp_path.parent / 'sweep'}"
-    assert refused("train", "-m", "gamma=1.5,2", sweep) == f"ValueError: {TRAIN['gamma=1.5']}"
-
-
-def composed(config, *overrides, folder=ROOT / "recipes" / "config"):
-    with hydra.initialize_config_dir(str(folder), version_base=None):
-        return hydra.compose(config, list(overrides))
+    assert refused("train", "-m", "gamma=1.5,2", sweep) == f"ValueError: {VALUES['gamma=1.5']}"
 
 
 ENVS = [path.stem for path in (ROOT / "torchrl_h2o" / "config" / "env").glob("*.yaml")]
@@ -198,10 +201,9 @@ def test_the_options_that_ship_with_the_other_recipes_pass(config, model):
     [[], ["simulator=gymnasium", "simulator.task=Hopper-v5"], ["simulator=mjcf", f"simulator.path={__file__}"]],
 )
 def test_the_options_that_ship_with_the_commands_pass(chosen, tmp_path):
-    folder = ROOT / "torchrl_h2o" / "config"
-    check_options(composed("close_the_loop", *chosen, folder=folder), CloseTheLoopOptions)
+    check_options(composed("close_the_loop", *chosen, folder=COMMANDS), CloseTheLoopOptions)
     (tmp_path / "config.yaml").touch()
-    check_options(composed("evaluate", f"checkpoint={tmp_path}", folder=folder), EvaluateOptions)
+    check_options(composed("evaluate", f"checkpoint={tmp_path}", folder=COMMANDS), EvaluateOptions)
 
 
 @pytest.mark.parametrize("config", ["h2o_plus", "train"])
@@ -238,9 +240,8 @@ def test_an_environment_of_the_user_may_have_entries_of_its_own_but_no_misspelt_
 
 @pytest.mark.parametrize("name", ["Hopper-v5", "Hopper", "gymnasium.envs.mujoco:Hopper-v5"])
 def test_every_name_that_gymnasium_completes_is_a_task(name):
-    folder = ROOT / "torchrl_h2o" / "config"
     check_options(
-        composed("close_the_loop", "simulator=gymnasium", f"simulator.task='{name}'", folder=folder),
+        composed("close_the_loop", "simulator=gymnasium", f"simulator.task='{name}'", folder=COMMANDS),
         CloseTheLoopOptions,
     )
 

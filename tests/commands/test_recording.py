@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 
-import hydra
 import mujoco
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.composed import COMMANDS, composed
 from torchrl_h2o.commands.close_the_loop import make_simulation
 from torchrl_h2o.commands.recording import Recording, read_recording, split_by_name
 from torchrl_h2o.data import write_ted
@@ -52,11 +52,10 @@ def logs(tmp_path, monkeypatch):
 
 
 def read(*overrides):
-    with hydra.initialize_config_module("torchrl_h2o.config", version_base=None):
-        mjcf = ["simulator=mjcf", "simulator.path=robot.xml", "columns=log.yaml"]
-        cfg = hydra.compose("close_the_loop", [*mjcf, *overrides])
-        recording = read_recording(cfg)
-        return recording, make_simulation(cfg, recording)
+    mjcf = ["simulator=mjcf", "simulator.path=robot.xml", "columns=log.yaml"]
+    cfg = composed("close_the_loop", *mjcf, *overrides, folder=COMMANDS)
+    recording = read_recording(cfg)
+    return recording, make_simulation(cfg, recording)
 
 
 @pytest.mark.parametrize(
@@ -143,8 +142,7 @@ def test_logs_that_are_not_there_are_named(logs, data, held_out, message):
 
 
 def test_a_recording_of_one_run_cannot_be_split_by_name():
-    with hydra.initialize_config_module("torchrl_h2o.config", version_base=None):
-        cfg = hydra.compose("close_the_loop", ["held_out=[c.csv]"])
+    cfg = composed("close_the_loop", "held_out=[c.csv]", folder=COMMANDS)
     with pytest.raises(ValueError, match="data=recorded is one run; give a share"):
         read_recording(cfg)
 

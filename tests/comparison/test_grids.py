@@ -1,14 +1,13 @@
 """The paper's grids, and those of our own: which runs they have."""
 
 from collections import Counter
-from functools import cache
+from functools import partial
 
-import hydra
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 
-from tests.small_runs import ROOT
+from tests.composed import composed
 from torchrl_h2o.comparison.grids import FIGURES, TABLES, check_overrides, chosen_grid
 from torchrl_h2o.comparison.options import PaperOptions
 from torchrl_h2o.comparison.results_file import identity
@@ -19,23 +18,12 @@ IDENTIFYING = ["method", "env", "data", "data_seconds", "mend", "mended", "gap",
 IDENTIFYING += ["backbone", "mixing", "ratio", "overrides"]
 
 
+paper = partial(composed, "paper")
+
+
 def chosen(runs, key):
     values = [override.partition("=")[2] for run in runs for override in run if override.startswith(f"{key}=")]
     return Counter(values)
-
-
-@cache
-def composed(*overrides):
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        return hydra.compose("paper", list(overrides))
-
-
-def paper(*overrides):
-    """The grid's configuration with options, composed once."""
-    cfg = composed().copy()
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        cfg[override.key_or_group] = override.value()
-    return cfg
 
 
 def test_the_main_table_has_every_cell_once_and_methods_without_simulator_once_a_data_set():
@@ -129,7 +117,7 @@ def test_runs_that_differ_have_different_identities(grid):
     found = {}
     for run in grid.runs((0,)):
         env = next(override for override in run if override.startswith("env="))
-        cfg = OmegaConf.masked_copy(composed(env), IDENTIFYING)
+        cfg = OmegaConf.masked_copy(paper(env), IDENTIFYING)
         with open_dict(cfg):
             cfg.overrides = run
             for override in OverridesParser.create().parse_overrides(run):

@@ -26,7 +26,14 @@ from torchrl_h2o.envs import DynamicsGap, dynamics_gap, mujoco_model
 TASKS = [("cheetah", "run"), ("walker", "walk")]
 MISSING = [("walker", "long_torso"), ("walker", "soft_feet")]
 # those of walker differ from cheetah's in the names of the geoms, which one gap shows
-CASES = [*((("cheetah", "run"), name) for name in PAPER_GAPS), (("walker", "walk"), "big_thigh")]
+FAST = {"gravity", "joint_noise", "big_thigh", "soft_feet"}  # of options, actions, geometry and joints
+CASES = [
+    *(
+        pytest.param(("cheetah", "run"), name, marks=() if name in FAST else pytest.mark.slow, id=f"cheetah-{name}")
+        for name in PAPER_GAPS
+    ),
+    pytest.param(("walker", "walk"), "big_thigh", id="walker-big_thigh"),
+]
 
 
 def rollout(env, steps=4, seed=0):
@@ -132,7 +139,11 @@ def test_two_envs_do_not_touch_each_other():
     assert (rollout(untouched) == rollout(DMControlEnv("cheetah", "run"))).all()
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))])
+@pytest.mark.parametrize(
+    "duplicate",
+    [pytest.param(copy.deepcopy, marks=pytest.mark.slow), lambda e: pickle.loads(pickle.dumps(e))],
+    ids=["deepcopy", "pickle"],
+)
 def test_a_copied_env_keeps_its_gaps(duplicate):
     env = TransformedEnv(DMControlEnv("walker", "walk"), DynamicsGap(paper_gap("gravity"), JointForce(5.0)))
     env.append_transform(dynamics_gap("friction"))
@@ -149,7 +160,14 @@ def test_a_model_changed_by_hand_is_not_silently_replaced():
         TransformedEnv(env, DynamicsGap(BodyMass(2.0)))
 
 
-@pytest.mark.parametrize("task", [("reacher", "easy"), ("finger", "turn_hard"), ("point_mass", "hard")])
+@pytest.mark.parametrize(
+    "task",
+    [
+        ("reacher", "easy"),
+        *(pytest.param(task, marks=pytest.mark.slow) for task in [("finger", "turn_hard"), ("point_mass", "hard")]),
+    ],
+    ids="-".join,
+)
 def test_what_a_task_writes_at_its_reset_is_no_change_by_hand(task):
     env = DMControlEnv(*task)
     env.reset()

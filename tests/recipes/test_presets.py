@@ -1,22 +1,26 @@
 """Options of the algorithm: the recommended ones, those of the paper, and their order of precedence."""
 
-import hydra
 import pytest
 
-from tests.small_runs import ROOT
+from tests.composed import composed
 
 OPTIONS = ("n_steps", "layer_norm", "num_qvalue_nets", "mixing", "ratio_estimator")
 PAPER = (1, False, 2, 0.1, "paper")
 
 
 def chosen(config, *overrides):
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        cfg = hydra.compose(config, list(overrides))
+    cfg = composed(config, *overrides)
     return tuple(cfg[option] for option in OPTIONS)
 
 
-@pytest.mark.parametrize("env", ["wheel_legged", "wheel_legged_forward", "halfcheetah", "walker2d"])
-@pytest.mark.parametrize("config", ["h2o_plus", "train", "paper"])
+CASES = [
+    pytest.param(config, env, marks=() if config == "train" or env == "halfcheetah" else pytest.mark.slow)
+    for config in ("h2o_plus", "train", "paper")  # which read the same files of tasks
+    for env in ("wheel_legged", "wheel_legged_forward", "halfcheetah", "walker2d")
+]
+
+
+@pytest.mark.parametrize(("config", "env"), CASES)
 def test_the_paper_s_algorithm_has_a_name_for_every_task_and_recipe(config, env):
     overrides = [f"env={env}"]
     assert chosen(config, *overrides, "preset=paper") == PAPER

@@ -1,15 +1,14 @@
 """Observations for the learner: real data and environments are transformed in the same way."""
 
 from functools import partial
-from pathlib import Path
 
-import hydra
 import pytest
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
+from tests.composed import composed
 from torchrl_h2o.data import episodes
 from torchrl_h2o.objectives import make_actor
 from torchrl_h2o.training.environments import (
@@ -22,13 +21,10 @@ from torchrl_h2o.training.environments import (
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import SEED, evaluate
 
-CONFIG = Path(__file__).parents[2] / "recipes" / "config"
-
 
 @pytest.fixture
 def cfg():
-    with hydra.initialize_config_dir(str(CONFIG), version_base=None):
-        return hydra.compose("h2o_plus", ["env.make.max_episode_steps=7", "frames=3"])
+    return composed("h2o_plus", "env.make.max_episode_steps=7", "frames=3")
 
 
 def rollout(env):
@@ -145,10 +141,12 @@ def test_an_evaluation_measures_observations_in_physical_units(cfg, worlds, past
 
 
 def test_an_evaluation_leaves_the_state_of_torch_s_cpu_generator(cfg, actor):
+    cfg.env.make.max_episode_steps = 7
     before = torch.get_rng_state()
     evaluate(make_reality(cfg), actor, episodes=1)
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_an_evaluation_that_measures_nothing_has_no_statistics(cfg, actor):
+    cfg.env.make.max_episode_steps = 7
     assert evaluate(make_reality(cfg), actor, episodes=1).observed(["theta"]) == {}

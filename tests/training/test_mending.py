@@ -4,14 +4,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 from torchrl.envs import GymEnv
 
-from tests.small_runs import ROBOT, ROOT, SMALL, run
+from tests.composed import composed
+from tests.small_runs import ROBOT, SMALL, run
 from torchrl_h2o.effects import ActionDelay, Gravity
 from torchrl_h2o.envs import mujoco_model
 from torchrl_h2o.options import RunOptions, check_options
@@ -305,8 +305,7 @@ def test_each_world_of_the_collection_has_a_draw_and_evaluations_the_best_values
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(overrides, said):
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        cfg = hydra.compose("h2o_plus", overrides)
+    cfg = composed("h2o_plus", *overrides)
     with pytest.raises(ValueError, match=said):
         check_options(cfg, RunOptions)
 

@@ -71,8 +71,9 @@ def test_the_discount_of_each_method_is_that_of_the_steps_of_a_row(compose, name
         torch.manual_seed(2)
         return learner.terms_of(*batches)["loss_qvalue"].item()
 
-    assert loss_qvalue(0.8, steps=3) == pytest.approx(loss_qvalue(0.8**3, steps=1), rel=1e-5)
-    assert loss_qvalue(0.8, steps=3) != pytest.approx(loss_qvalue(0.8, steps=1), rel=1e-3)
+    three_steps = loss_qvalue(0.8, steps=3)
+    assert three_steps == pytest.approx(loss_qvalue(0.8**3, steps=1), rel=1e-5)
+    assert three_steps != pytest.approx(loss_qvalue(0.8, steps=1), rel=1e-3)
 
 
 def method_policy(method, cfg, real, directory):

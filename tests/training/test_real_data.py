@@ -1,12 +1,11 @@
 """Part of the real data: the same first rows for every run, with an end; poor data, in which the robot falls."""
 
-import hydra
 import pytest
 import torch
 from hydra.utils import instantiate
 from torchrl.data import MultiStep
 
-from tests.small_runs import ROOT
+from tests.composed import composed
 from torchrl_h2o.data import episodes
 from torchrl_h2o.envs import record
 from torchrl_h2o.training.environments import sim_capacity_of, task_of
@@ -71,8 +70,7 @@ def test_the_simulated_buffer_does_not_shrink_with_little_real_data(compose):
 
 @pytest.mark.slow
 def test_the_poor_controller_falls_within_five_seconds():
-    with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-        poor, good = (hydra.compose("train", [f"env={env}"]) for env in ("wheel_legged_poor", "wheel_legged"))
+    poor, good = (composed("train", f"env={env}") for env in ("wheel_legged_poor", "wheel_legged"))
     assert poor.env.reality == good.env.reality
     assert poor.updates == good.updates == 16_000
     assert poor.env.name == "wheel_legged_poor"
@@ -86,8 +84,7 @@ def test_several_logs_are_read_as_runs_of_their_own_and_kept_by_absolute_names(t
     for name, rows in (("a.txt", 5), ("b.txt", 8)):
         (tmp_path / name).write_text("0.1 0.2 0.0 0.4 1 0\n" * rows)
     for data in ("data=[a.txt,b.txt]", "data='*.txt'"):
-        with hydra.initialize_config_dir(str(ROOT / "recipes" / "config"), version_base=None):
-            cfg = hydra.compose("h2o_plus", [data])
+        cfg = composed("h2o_plus", data)
         resolve_paths(cfg)
         real = task_of(cfg).read_real_data(cfg.data, cfg.columns)
         assert real["log"].bincount().tolist() == [4, 7]

@@ -9,7 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from tests.full_disk import full_disk
-from tests.residuals.report.made_up_reports import full_report
+from tests.residuals.report.made_up_reports import few_pictures, full_report
 from tests.small_runs import ROBOT, SMALL, run
 from torchrl_h2o.data import DataError
 from torchrl_h2o.effects import Gravity
@@ -182,10 +182,14 @@ def test_a_cluster_or_a_program_that_the_folder_names_is_refused(tmp_path, place
     load_config(saved(tmp_path, {"collector.init": {"address": None, "logging_level": "error"}}))
 
 
+@pytest.fixture(scope="module")
+def report_file(tmp_path_factory):
+    return few_pictures(full_report()).save(tmp_path_factory.mktemp("report"))
+
+
 @pytest.mark.parametrize("effect", [{"effect": "os.system"}, {"_target_": "os.system"}, {"effect": "Effect"}, {}])
-def test_a_report_names_effects_only(tmp_path, effect):
-    full_report().save(tmp_path)
-    entries = json.loads((tmp_path / "report.json").read_text())
+def test_a_report_names_effects_only(report_file, tmp_path, effect):
+    entries = json.loads(report_file.read_text())
     entries["effects"][0]["effect"] = effect
     (tmp_path / "report.json").write_text(json.dumps(entries))
     with pytest.raises(DataError, match="there is no effect named"):

@@ -94,10 +94,10 @@ def numbers(run):
 def test_without_random_numbers_members_learn_what_single_runs_learn(value_loss):
     alone, together = ([Run(seed, value_loss) for seed in range(3)] for _ in range(2))
     with FixedNumbers():
-        for update in range(10):
+        for update in range(5):
             for member, run in enumerate(alone):
                 run.update(*batches(member, update))
-        train_together(together, 10)
+        train_together(together, 5)
     for member in range(3):
         before = Run(member, value_loss).state_dict()
         for name, tensor in numbers(alone[member]).items():
