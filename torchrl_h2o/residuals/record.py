@@ -1,0 +1,128 @@
+"""A log as the states of a simulation: readings without the sensors' effects, and unobserved coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from scipy.signal import savgol_filter
+
+from torchrl_h2o.effects import ObservationEffect
+from torchrl_h2o.residuals.measured.residual import executed_actions
+from torchrl_h2o.residuals.measured.settling import activations, settle
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+DERIVATIVE_ROWS = 7  # rows from which an unobserved velocity is computed: a parabola through the positions
+STILL = 1e-12  # standard deviation below which a coordinate counts as constant
+
+_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A log as states of a simulation.
+
+    The coordinates of a record are the n readings, followed by the unobserved coordinates that affect later readings.
+
+    Args:
+        simulation: the simulator with its effects.
+        measured: the log.
+    """
+
+    simulation: Simulation
+    measured: Measured
+
+    @property
+    def num_readings(self) -> int:
+        """n, the number of readings."""
+        return len(self.simulation.state_map.names)
+
+    @cached_property
+    def executed(self) -> np.ndarray:
+        """Actions after the action effects, (T, nu)."""
+        return executed_actions(self.simulation, self.measured)
+
+    @cached_property
+    def activations(self) -> np.ndarray:
+        """Activations of the actuators, (T, na)."""
+        return activations(self.simulation, self.measured, self.executed)
+
+    @cached_property
+    def readings(self) -> tuple[np.ndarray, np.ndarray]:
+        """Readings before and after each step without the effects of the sensors, each (T, n)."""
+        return true_readings(self.simulation, self.measured)
+
+    @cached_property
+    def into_state(self) -> np.ndarray:
+        """(nq + nv, m): the change of the state by each coordinate."""
+        state_map = self.simulation.state_map
+        hidden = np.eye(len(state_map.offset))[:, list(state_map.hidden)]
+        return np.hstack([state_map.restore_observed, hidden])
+
+    @cached_property
+    def from_state(self) -> np.ndarray:
+        """(m, nq + nv): the coordinates of a state."""
+        state_map = self.simulation.state_map
+        return np.vstack([state_map.observe, np.eye(len(state_map.offset))[list(state_map.hidden)]])
+
+    @cached_property
+    def positions_of_velocities(self) -> dict[int, int]:
+        """Index of the observed position of each unobserved velocity."""
+        model, state_map = self.simulation.model, self.simulation.state_map
+        observed = np.asarray(state_map.observe.any(0))
+        pairs = {
+            int(model.nq + model.jnt_dofadr[joint]): int(model.jnt_qposadr[joint])
+            for joint in range(model.njnt)
+            if model.jnt_type[joint] in _SINGLE
+        }
+        return {index: pairs[index] for index in state_map.hidden if index in pairs and observed[pairs[index]]}
+
+    @cached_property
+    def states(self) -> tuple[np.ndarray, np.ndarray]:
+        """States before and after each step, each (T, nq + nv).
+
+        An unobserved velocity is the derivative of its position, if that is observed. Other unobserved coordinates are
+        those that a simulation along the data reaches.
+        """
+        simulation, measured = self.simulation, self.measured
+        before, after = (simulation.state_map.states(readings) for readings in self.readings)
+        derived = self.positions_of_velocities
+        for run in measured.runs:
+            for velocity, position in derived.items():
+                path = np.append(before[run, position], after[run.stop - 1, position])
+                rate = _derivative(path, simulation.control_step)
+                before[run, velocity], after[run, velocity] = rate[:-1], rate[1:]
+        if others := [index for index in simulation.state_map.hidden if index not in derived]:
+            reached = settle(simulation, measured, before.copy(), self.executed, np.arange(len(measured)))
+            before[:, others] = after[:, others] = reached[:, others]
+            goes_on = measured.run[1:] == measured.run[:-1]
+            after[:-1][np.ix_(goes_on, others)] = before[1:][np.ix_(goes_on, others)]
+        return before, after
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """Standard deviation of each coordinate, (m), in its unit; those of the readings are those of the log."""
+        spread = np.nanstd(self.states[0] @ self.from_state.T, axis=0)
+        spread[: self.num_readings] = self.measured.observation.std(0)
+        return np.where(spread > STILL, spread, 1.0)
+
+
+def true_readings(simulation: Simulation, measured: Measured) -> tuple[np.ndarray, np.ndarray]:
+    """Readings before and after each step without the effects of a simulation's sensors, each (T, n)."""
+    if not any(isinstance(effect, ObservationEffect) for effect in simulation.effects):
+        return measured.observation, measured.following
+    before, after = np.empty_like(measured.observation), np.empty_like(measured.following)
+    for run in measured.runs:
+        whole = np.vstack([measured.observation[run], measured.following[run][-1:]])
+        true = simulation.true_observations(whole)
+        before[run], after[run] = true[:-1], true[1:]
+    return before, after
+
+
+def _derivative(path: np.ndarray, step: float) -> np.ndarray:
+    if len(path) < DERIVATIVE_ROWS:
+        return np.gradient(path, step)
+    return np.asarray(savgol_filter(path, DERIVATIVE_ROWS, 2, deriv=1, delta=step))

@@ -1,0 +1,270 @@
+"""Fits the values of a set of effects by the score, with the simulator itself: robust Gauss-Newton steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.residuals.score import Predictions, fitted_scales, scores
+from torchrl_h2o.residuals.start_states import TAIL, log_density
+from torchrl_h2o.residuals.trace.model_bounds import lowest_value
+
+STEP = 0.02  # step of the finite differences, in typical sizes of a parameter
+SMALLEST_GAIN = 1e-3  # gain of the score, in nats a row, below which a fit has converged
+FARTHEST = 3.0  # largest move of a parameter in one step of the fit, in typical sizes
+RIDGE = 1e-6  # share of a parameter's curvature that is added, so that what the data do not show stays where it is
+LEVERAGE = 9.0  # squared derivative, in squared medians, at which a row has half its weight
+REWEIGHTED = 8  # solutions of the weighted equations in one step
+CONFIDENCE = 1.96  # standard errors from a value to the end of its 95 % interval
+
+Whitened = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A parameter of one of several effects as a variable of a fit, 0 at the start and in units of its typical size.
+
+    Args:
+        effect: index of the effect.
+        name: name of the parameter.
+        value: value at the start.
+        size: typical change, in the parameter's unit; in powers of two for a factor.
+        low: lowest value.
+        high: highest value.
+        is_factor: whether the variable is the logarithm of the parameter.
+    """
+
+    effect: int
+    name: str
+    value: float
+    size: float
+    low: float
+    high: float
+    is_factor: bool
+
+    def at(self, x: float) -> float:
+        """The parameter's value at x."""
+        value = self.value * 2.0 ** (self.size * x) if self.is_factor else self.value + self.size * x
+        return float(np.clip(value, self.low, self.high))
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lowest and highest x."""
+        ends = np.array([self.low, self.high])
+        if self.is_factor:
+            return tuple(np.log2(np.maximum(ends, 1e-300) / self.value) / self.size)
+        return tuple((ends - self.value) / self.size)
+
+    def slope(self, x: float) -> float:
+        """Derivative of the value by x."""
+        return self.at(x) * math.log(2.0) * self.size if self.is_factor else self.size
+
+
+@dataclass(frozen=True, eq=False)
+class SetFit:
+    """Fitted values of a set of effects.
+
+    Args:
+        effects: the effects with their fitted values.
+        by_block: score of each fitted block, (B), in nats a row.
+        half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
+    """
+
+    effects: tuple[Effect, ...]
+    by_block: np.ndarray
+    half_widths: tuple[dict[str, float], ...]
+
+
+def variables_of(
+    predictions: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]
+) -> list[Variable]:
+    """The variables of a fit of effects, from their present values, with bounds that the model sets."""
+    model, found = predictions.record.simulation.model, []
+    for index, (entry, effect) in enumerate(zip(entries, effects, strict=True)):
+        others = [other for i, other in enumerate(effects) if i != index]
+        least = lowest_value(effect, model, others)
+        for name in entry.fitted:
+            parameter = effect.parameters[name]
+            low, high = max(parameter.bounds[0], least), parameter.bounds[1]
+            is_factor = parameter.neutral == 1.0 and low > 0.0 and parameter.value > 0.0
+            found.append(
+                Variable(index, name, parameter.value, 1.0 if is_factor else size_of(entry, name), low, high, is_factor)
+            )
+    return found
+
+
+def size_of(entry: CatalogueEntry, name: str) -> float:
+    """Typical change of an entry's parameter: the largest move of its trials."""
+    neutral = entry.effect.parameters[name].neutral
+    trials = [trial[name] for trial in entry.trials]
+    moves = [abs(trial - neutral) for trial in trials] if math.isfinite(neutral) else [abs(trial) for trial in trials]
+    others = max((abs(v - entry.effect.parameters[k].neutral) for t in entry.trials for k, v in t.items()), default=0.1)
+    return max(moves) or (others if math.isfinite(others) else 0.1)
+
+
+def with_values(effects: Sequence[Effect], variables: Sequence[Variable], x: np.ndarray) -> tuple[Effect, ...]:
+    """The effects with the values at x."""
+    values: list[dict[str, float]] = [{} for _ in effects]
+    for variable, place in zip(variables, x, strict=True):
+        values[variable.effect][variable.name] = variable.at(place)
+    return tuple(e.with_parameters(new) if new else e for e, new in zip(effects, values, strict=True))
+
+
+def fit_set(
+    parts: Sequence[Predictions],
+    entries: Sequence[CatalogueEntry],
+    effects: Sequence[Effect],
+    *,
+    most_steps: int = 8,
+    intervals: bool = False,
+) -> SetFit:
+    """Maximises the score over the values of effects, from their present values.
+
+    Args:
+        parts: predictions of the rows to fit.
+        entries: the effects' entries of the catalogue, which name the fitted parameters.
+        effects: the effects, in the order of their composition.
+        most_steps: largest number of Gauss-Newton steps.
+        intervals: whether to compute the intervals.
+
+    Raises:
+        ValueError: if the model rejects the effects at the start.
+    """
+    effects = tuple(effects)
+    errors = [part.errors(effects) for part in parts]
+    scales, by_block = _profiled(parts, errors)
+    slopes, variables, step_size = None, [], 1.0
+    for _ in range(most_steps):
+        variables = variables_of(parts[0], entries, effects)
+        if not variables:
+            break
+        slopes = slopes_of(parts, effects, variables, errors)
+        weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
+        move, gained = _step(weighted, slopes, variables), False
+        for _ in range(3):
+            x = step_size * move
+            try:
+                tried = with_values(effects, variables, x)
+                new_errors = [part.errors(tried) for part in parts]
+            except ValueError:
+                step_size *= 0.3
+                continue
+            new_scales, new_by_block = _profiled(parts, new_errors)
+            gain = float(new_by_block.mean() - by_block.mean())
+            if gain > 0.0:
+                effects, errors, scales, by_block = tried, new_errors, new_scales, new_by_block
+                gained, step_size = True, min(1.0, 2.0 * step_size)
+                break
+            step_size *= 0.3
+        if not gained or gain < SMALLEST_GAIN:
+            break
+    widths: tuple[dict[str, float], ...] = tuple({} for _ in effects)
+    if intervals and variables:
+        variables = variables_of(parts[0], entries, effects)
+        slopes = slopes_of(parts, effects, variables, errors)
+        weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
+        for variable, half in zip(variables, _half_widths(parts, weighted, slopes), strict=True):
+            widths[variable.effect][variable.name] = half * abs(variable.slope(0.0))
+    return SetFit(effects, by_block, widths)
+
+
+def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:
+    """Scales fitted to the errors of each part, and the scores of all blocks with them."""
+    scales = [fitted_scales(part, error) for part, error in zip(parts, errors, strict=True)]
+    found = [scores(*each) for each in zip(parts, errors, scales, strict=True)]
+    return scales, np.concatenate(found)
+
+
+def flat(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Errors of all windows in one vector."""
+    return np.concatenate([one.ravel() for one in arrays])
+
+
+def whitened(part: Predictions, errors: Sequence[np.ndarray], scales: Sequence[np.ndarray]) -> Whitened:
+    """Whitened errors, the inverse of their scale, and their shares in the score, each (N)."""
+    roots = [1.0 / np.sqrt(variance + scale) for variance, scale in zip(part.variances, scales, strict=True)]
+    shares = [np.broadcast_to(share[:, None], one.shape) for share, one in zip(part.shares, errors, strict=True)]
+    inverse = flat(roots)
+    return flat(errors) * inverse, inverse, flat(shares)
+
+
+def weights(white: np.ndarray) -> np.ndarray:
+    """Weights with which half the sum of squares of whitened errors has the gradient of the log density."""
+    return (TAIL + 1.0) / (TAIL - 2.0 + white**2)
+
+
+def block_of(part: Predictions) -> np.ndarray:
+    """Index of the block of each error of :func:`flat`, (N)."""
+    n = part.record.num_readings
+    return np.concatenate([np.repeat(w.block, len(w.horizons) * n) for w in part.blocks.windows])
+
+
+def slopes_of(
+    parts: Sequence[Predictions], effects: Sequence[Effect], variables: Sequence[Variable], errors
+) -> list[np.ndarray]:
+    """Derivatives of the errors by the variables, (N, p) for each part."""
+    columns: list[list[np.ndarray]] = [[] for _ in parts]
+    zero = np.zeros(len(variables))
+    for index, variable in enumerate(variables):
+        low, high = variable.bounds
+        step = STEP if high > STEP else -STEP
+        if low > step:
+            step = 0.0
+        moved = zero.copy()
+        moved[index] = step
+        for part, error, found in zip(parts, errors, columns, strict=True):
+            before = flat(error)
+            try:
+                after = flat(part.errors(with_values(effects, variables, moved))) if step else before
+            except ValueError:
+                after = before
+            found.append((after - before) / (step or 1.0))
+    return [np.stack(found, axis=1) for found in columns]
+
+
+def _step(parts: Sequence[Whitened], slopes: Sequence[np.ndarray], variables: Sequence[Variable]) -> np.ndarray:
+    """The move of the variables, within their bounds, that raises the score most if the errors are linear.
+
+    Near a contact a derivative may be arbitrarily large. The move is therefore also computed with less weight for rows
+    of unusual derivatives, and the better of the two is taken.
+    """
+    white, inverse, share = (np.concatenate(each) for each in zip(*parts, strict=True))
+    scaled = np.concatenate(slopes) * inverse[:, None]
+    low, high = np.transpose([variable.bounds for variable in variables])
+    low, high = np.maximum(low, -FARTHEST), np.minimum(high, FARTHEST)
+    high = np.maximum(high, low + 1e-9)
+    usual = np.array([np.median(np.abs(one[one != 0.0])) if one.any() else 1.0 for one in scaled.T])
+    leverage = ((scaled / usual) ** 2).mean(1)
+    best, most = np.zeros(len(variables)), log_density(white) @ share
+    for first in (1.0, 1.0 / (1.0 + leverage / LEVERAGE)):
+        x, weight = np.zeros(len(variables)), share * weights(white) * first
+        for _ in range(REWEIGHTED):
+            curvature = scaled.T @ (weight[:, None] * scaled)
+            curvature = curvature + np.diag(RIDGE * np.diag(curvature) + 1e-12)
+            root = np.linalg.cholesky(curvature).T
+            pull = -scaled.T @ (weight * white)
+            x = lsq_linear(root, np.linalg.solve(root.T, pull), bounds=(low, high)).x
+            moved = white + scaled @ x
+            weight = share * weights(moved)
+        if (score := log_density(moved) @ share) > most:
+            best, most = x, score
+    return best
+
+
+def _half_widths(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Sequence[np.ndarray]) -> np.ndarray:
+    """Half-widths of the variables' 95 % intervals: a sandwich estimate with each block as one observation."""
+    curvature, scatter, blocks = 0.0, 0.0, 0
+    for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
+        scaled, weight = slope * inverse[:, None], share * weights(white)
+        curvature = curvature + scaled.T @ (weight[:, None] * scaled)
+        pulls = np.zeros((len(part.blocks), slope.shape[1]))
+        np.add.at(pulls, block_of(part), scaled * (weight * white)[:, None])
+        scatter, blocks = scatter + pulls.T @ pulls, blocks + len(pulls)
+    bread = np.linalg.pinv(np.atleast_2d(curvature))
+    spare = blocks / max(1, blocks - len(bread))
+    return CONFIDENCE * np.sqrt(np.maximum(np.diag(bread @ np.atleast_2d(scatter) @ bread) * spare, 0.0))

@@ -1,0 +1,280 @@
+"""One score for every comparison: how probable the measured motion is, as predicted from earlier rows.
+
+A simulation starts from the filtered state of a row and is compared with the readings 1, 2, 4, 8, ... control steps
+later. The log density of an error is that of Student's t; its variance is the sum of the sensor's noise, of what the
+uncertain start state makes of it, and of a variance for each horizon and reading that is fitted to rows for fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from torchrl_h2o.effects import Effect, ObservationEffect
+from torchrl_h2o.residuals.blocks import Blocks, block_steps
+from torchrl_h2o.residuals.measured.residual import executed_actions
+from torchrl_h2o.residuals.measured.settling import activations
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
+from torchrl_h2o.residuals.record import Record, true_readings
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates, log_density
+
+FIT_ROWS, SELECTION_ROWS = 1536, 1024  # rows that are predicted for fits, and for comparisons
+DRAWS = 6  # draws of the start states, which tell how their uncertainty grows
+NOISELESS = 3.0 * ROUNDING  # sensor noise, in spreads, up to which start states count as exact
+DIVERGED = 1e3  # error in spreads where a simulation diverges
+ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
+MOST_NATS = 20.0  # difference of a block beyond which it says no more
+FEWEST = 4  # blocks that must differ
+SCALED = 200  # windows from which these variances are fitted
+SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
+
+
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Predictions of windows by a simulation, with effects added.
+
+    Args:
+        starts: start states of the simulation without the added effects.
+        counts: effective share of a window for each kind of windows and horizon, (h): neighbouring windows with
+            similar errors count less; see :meth:`counted`.
+        seed: of the draws of start states.
+    """
+
+    starts: StartStates
+    counts: tuple[np.ndarray, ...] = ()
+    seed: int = 0
+
+    @cached_property
+    def shares(self) -> tuple[np.ndarray, ...]:
+        """Weight of each window in the score, by kind and horizon; by default, the windows of a block count as one."""
+        blocks = self.blocks
+        counts = self.counts or tuple(np.zeros(len(windows.horizons)) for windows in blocks.windows)
+        return tuple(
+            np.maximum(count, windows.steps / blocks.steps) / blocks.num_horizons
+            for count, windows in zip(counts, blocks.windows, strict=True)
+        )
+
+    def correlations(self, errors: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+        """Share of a window by which it counts beside its neighbours, (h) for each kind of windows.
+
+        With the correlation r of the errors of neighbouring windows, that is (1 - r) / (1 + r).
+        """
+        found = []
+        for windows, error in zip(self.blocks.windows, errors, strict=True):
+            size = np.median(np.abs(error), axis=0) + ROUNDING
+            z = np.clip(error / size, -4.0, 4.0)
+            pairs = np.flatnonzero(windows.block[1:] == windows.block[:-1])
+            if not len(pairs):
+                found.append(np.ones(len(windows.horizons)))
+                continue
+            r = ((z[pairs] * z[pairs + 1]).mean((0, 2)) / (z**2).mean((0, 2))).clip(0.0, 1.0)
+            found.append((1.0 - r) / (1.0 + r))
+        return tuple(found)
+
+    def of_simulation(self, simulation: Simulation) -> Predictions:
+        """The same windows from the same start states, predicted by another simulation."""
+        record = Record(simulation, self.record.measured)
+        record.__dict__["spread"] = self.record.spread
+        return replace(self, starts=replace(self.starts, record=record))
+
+    @property
+    def record(self) -> Record:
+        """The log and the simulation."""
+        return self.starts.record
+
+    @property
+    def blocks(self) -> Blocks:
+        """The blocks that the windows are in."""
+        return self.starts.blocks
+
+    @cached_property
+    def _states(self) -> list[np.ndarray]:
+        return [self.starts.at(windows)[0] for windows in self.blocks.windows]
+
+    @cached_property
+    def _base(self) -> list[np.ndarray]:
+        return self._predicted(self.record.simulation, self._states)
+
+    def errors(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
+        """Measured minus predicted readings in spreads, (W, h, n) for each kind of windows.
+
+        Raises:
+            ValueError: if the model rejects an effect.
+        """
+        record, (before, after) = self.record, self.record.readings
+        predicted = self._base
+        if effects:
+            simulation, states = record.simulation.with_effects(*effects), self._states
+            if any(isinstance(effect, ObservationEffect) for effect in effects):
+                other, after = true_readings(simulation, record.measured)
+                shift = np.nan_to_num(other - before) @ record.simulation.state_map.restore_observed.T
+                states = [s + shift[windows.rows] for windows, s in zip(self.blocks.windows, states, strict=True)]
+            predicted = self._predicted(simulation, states)
+        spread = record.spread[: record.num_readings]
+        return [
+            np.nan_to_num(after[windows.rows[:, None] + windows.horizons - 1] / spread - one, nan=DIVERGED)
+            for windows, one in zip(self.blocks.windows, predicted, strict=True)
+        ]
+
+    @cached_property
+    def variances(self) -> list[np.ndarray]:
+        """Variance of the errors by sensor noise and uncertain start states, (W, h, n) for each kind of windows."""
+        record, noise = self.record, self.starts.noise
+        total = [np.zeros_like(one) for one in self._base]
+        if (noise.sensor > NOISELESS).any() or record.simulation.state_map.hidden:
+            rng = np.random.default_rng(self.seed)
+            at = [self.starts.at(windows) for windows in self.blocks.windows]
+            roots = [_root(covariance) for _, covariance in at]
+            for _ in range(DRAWS):
+                drawn = [(root @ rng.standard_normal((*root.shape[:2], 1)))[..., 0] for root in roots]
+                moved = [
+                    states + (draw * record.spread) @ record.into_state.T
+                    for (states, _), draw in zip(at, drawn, strict=True)
+                ]
+                for sum_, one, base in zip(total, self._predicted(record.simulation, moved), self._base, strict=True):
+                    sum_ += np.nan_to_num((one - base) ** 2, nan=DIVERGED**2) / DRAWS
+        return [one + noise.sensor**2 + ROUNDING**2 for one in total]
+
+    def _predicted(self, simulation: Simulation, states: Sequence[np.ndarray]) -> list[np.ndarray]:
+        record, measured = self.record, self.record.measured
+        same = simulation is record.simulation
+        executed = record.executed if same else executed_actions(simulation, measured)
+        active = record.activations if same else activations(simulation, measured, executed)
+        n, found = record.num_readings, []
+        for windows, start in zip(self.blocks.windows, states, strict=True):
+            reached = simulation.rollout(
+                start,
+                executed[windows.all_rows],
+                time=measured.time[windows.rows],
+                activations=active[windows.rows],
+            )
+            found.append(reached[:, windows.horizons - 1] @ record.from_state[:n].T / record.spread[:n])
+        return found
+
+
+def fitted_scales(predictions: Predictions, errors: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Variances by which errors exceed the noise, (h, n) for each kind of windows: those of the largest likelihood."""
+    found = []
+    for error, variance in zip(errors, predictions.variances, strict=True):
+        some = slice(None, None, 1 + len(error) // SCALED)
+        error, variance = error[some], variance[some]
+        size = np.median(np.abs(error), axis=0) ** 2 + ROUNDING**2
+        best, scale = np.full(size.shape, -np.inf), np.zeros_like(size)
+        for factor in SCALES:
+            density = _density(error, variance + factor * size).mean(0)
+            scale = np.where(density > best, factor * size, scale)
+            best = np.maximum(best, density)
+        found.append(scale)
+    return found
+
+
+def scores(predictions: Predictions, errors: Sequence[np.ndarray], scales: Sequence[np.ndarray]) -> np.ndarray:
+    """Log density of the readings in each block, (B), in nats: the mean over horizons, summed over readings."""
+    blocks, total = predictions.blocks, np.zeros(len(predictions.blocks))
+    for windows, share, error, variance, scale in zip(
+        blocks.windows, predictions.shares, errors, predictions.variances, scales, strict=True
+    ):
+        density = _density(error, variance + scale).sum(2) @ share
+        total += np.bincount(windows.block, density, len(blocks))
+    return total
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+
+
+def _density(error: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    return log_density(error / np.sqrt(variance)) - 0.5 * np.log(variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """By how much one explanation predicts better than another, paired over blocks.
+
+    Args:
+        by_block: (B), in nats.
+    """
+
+    by_block: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        """Mean over the blocks, in nats a block."""
+        return float(self.by_block.mean())
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean."""
+        return float(self.by_block.std(ddof=1) / np.sqrt(max(1, len(self.by_block))))
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the likelihood ratio of a positive mean and none, in nats; negative for a negative mean.
+
+        The differences are taken as normal, with the scatter that they have. An effect that acts rarely, such as the
+        end of a joint's range, leaves most blocks as they are, so only those count that differ.
+        """
+        acting = np.clip(self.by_block[np.abs(self.by_block) > ACTS], -MOST_NATS, MOST_NATS)
+        if len(acting) < FEWEST:
+            return 0.0
+        n = len(acting)
+        square = acting.mean() ** 2 / max(acting.var(ddof=1) / n, 1e-24)
+        return float(np.sign(acting.mean()) * 0.5 * n * np.log1p(square / (n - 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A simulation and its score: predictions on the rows for fits and on those for selection.
+
+    Args:
+        fit: predictions on the rows for fits.
+        selection: predictions on the rows for selection.
+    """
+
+    fit: Predictions
+    selection: Predictions
+    _found: dict[tuple[Effect, ...], np.ndarray] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(
+        cls,
+        simulation: Simulation,
+        measured: Measured,
+        noise: Noise | None = None,
+        rows: tuple[int, int] = (FIT_ROWS, SELECTION_ROWS),
+    ) -> Model:
+        """Builds the model of a simulation.
+
+        Args:
+            simulation: the simulator with its effects.
+            measured: the data.
+            noise: the noise; estimated from the rows for fits by default.
+            rows: most rows for fits and for selection.
+        """
+        record, steps = Record(simulation, measured), block_steps(measured, simulation.control_step)
+        fit = StartStates.of(record, Blocks.of(measured, Split.FIT, steps, rows[0]), noise)
+        selection = StartStates.of(record, Blocks.of(measured, Split.SELECTION, steps, rows[1]), fit.noise)
+        return cls(Predictions(fit), Predictions(selection))
+
+    def scores(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """Scores with effects added: of the blocks for fits, then of those for selection, (F + S); see :func:`scores`.
+
+        Raises:
+            ValueError: if the model rejects an effect.
+        """
+        key = tuple(effects)
+        if key not in self._found:
+            errors = self.fit.errors(key)
+            scales = fitted_scales(self.fit, errors)
+            others = scores(self.selection, self.selection.errors(key), scales)
+            self._found[key] = np.append(scores(self.fit, errors, scales), others)
+        return self._found[key]
+
+    def on_selection(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """Scores of the blocks for selection, (S), with effects added."""
+        return self.scores(effects)[len(self.fit.blocks) :]

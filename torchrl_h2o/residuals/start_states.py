@@ -1,0 +1,206 @@
+"""The state in which each window starts, and how uncertain it is: a Kalman filter along the log.
+
+Sensor noise and the simulator's error one step ahead are estimated from the data.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from torchrl_h2o.residuals.blocks import LENGTHS, Blocks, Windows
+from torchrl_h2o.residuals.record import Record
+
+BEFORE = 16  # largest number of rows before each block on which the filter settles
+NUDGE = 1e-3  # step of the finite differences, in spreads
+ROUNDING = 1e-6  # rounding of a reading, in spreads: that of single precision, with a margin
+TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
+CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
+SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
+NOISE_BLOCKS = 8  # blocks from which the noise is estimated
+NOISE_EVALUATIONS = 14
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations of the noise, in spreads.
+
+    Args:
+        sensor: (n), of each reading.
+        step: (m), of the simulator's error in one control step, for each coordinate.
+    """
+
+    sensor: np.ndarray
+    step: np.ndarray
+
+    def scaled(self, sensor: float, step: float) -> Noise:
+        """Both multiplied by a factor, and at least rounding."""
+        return Noise(np.maximum(sensor * self.sensor, ROUNDING), np.maximum(step * self.step, 0.1 * ROUNDING))
+
+
+@dataclass(frozen=True, eq=False)
+class StartStates:
+    """Filtered states of the rows of blocks, in spreads about the measured ones.
+
+    Args:
+        record: the log and the simulation.
+        blocks: the blocks.
+        noise: the noise.
+        mean: (B, rows, m).
+        covariance: (B, rows, m, m).
+    """
+
+    record: Record
+    blocks: Blocks
+    noise: Noise
+    mean: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, record: Record, blocks: Blocks, noise: Noise | None = None) -> StartStates:
+        """Filters the log from some rows before each block to the start of its last window.
+
+        Args:
+            record: the log and the simulation.
+            blocks: the blocks.
+            noise: the noise; estimated from these blocks by default.
+        """
+        steps = _Steps.of(record, blocks)
+        noise = steps.fitted_noise() if noise is None else noise
+        mean, covariance, _ = steps.filtered(noise)
+        before = _rows_before(blocks)
+        return cls(record, blocks, noise, mean[:, before:], covariance[:, before:])
+
+    def rough(self, most: int) -> StartStates:
+        """Those of at most so many blocks, with fewer short windows."""
+        some = slice(None, None, -(-len(self.blocks) // most))
+        blocks = Blocks(self.blocks.first[some], self.blocks.steps, LENGTHS[-1:])
+        return StartStates(self.record, blocks, self.noise, self.mean[some], self.covariance[some])
+
+    def at(self, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+        """States, (W, nq + nv), and covariances of the coordinates in spreads, (W, m, m), at the starts of windows."""
+        record, place = self.record, (windows.block, windows.offset)
+        moved = (self.mean[place] * record.spread) @ record.into_state.T
+        return record.states[0][windows.rows] + moved, self.covariance[place]
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """One control step linearised about each row of the blocks: ``next = slope @ deviation + miss``, in spreads.
+
+    Args:
+        record: the log and the simulation.
+        slope: (B, L, m, m).
+        miss: (B, L, m), simulated minus measured coordinates after the step.
+        live: (B, L), False before the beginning of a run.
+        known: (B, L), False where the simulation diverges.
+        jerk: (n), size of the third differences of the readings over that of white noise.
+    """
+
+    record: Record
+    slope: np.ndarray
+    miss: np.ndarray
+    live: np.ndarray
+    known: np.ndarray
+    jerk: np.ndarray
+
+    @classmethod
+    def of(cls, record: Record, blocks: Blocks) -> _Steps:
+        measured, spread, m = record.measured, record.spread, len(record.spread)
+        begins = np.empty(len(measured), int)
+        for run in measured.runs:
+            begins[run] = run.start
+        rows = blocks.first[:, None] + np.arange(-_rows_before(blocks), max(1, blocks.steps - LENGTHS[0] + 1))
+        live = rows >= begins[blocks.first][:, None]
+        rows = np.maximum(rows, begins[blocks.first][:, None])
+        flat, size = rows.ravel(), rows.shape
+        states, actions = record.states[0][flat], record.executed[flat][:, None]
+        at = {"time": measured.time[flat], "activations": record.activations[flat]}
+
+        def reached(start: np.ndarray) -> np.ndarray:
+            return record.simulation.rollout(start, actions, **at)[:, 0] @ record.from_state.T / spread
+
+        base, slope = reached(states), np.empty((*size, m, m))
+        for index in range(m):
+            moved = states + NUDGE * spread[index] * record.into_state[:, index]
+            slope[..., index] = ((reached(moved) - base) / NUDGE).reshape(*size, m)
+        miss = (base - record.states[1][flat] @ record.from_state.T / spread).reshape(*size, m)
+        known = np.asarray(np.isfinite(slope).all((2, 3)) & np.isfinite(miss).all(2))
+        slope[~known], miss[~known] = np.eye(m), 0.0
+        third = np.abs(np.diff(record.readings[0][rows], 3, axis=1) / spread[: record.num_readings])
+        jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
+        return cls(record, slope, miss, live, known, jerk)
+
+    def fitted_noise(self) -> Noise:
+        """The noise under which the next readings are most likely, as factors on :meth:`_typical_noise`."""
+        typical = self._typical_noise()
+        some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
+
+        def loss(x: np.ndarray) -> float:
+            return -self.filtered(typical.scaled(*np.exp(np.clip(x, -12.0, 6.0))), some)[2]
+
+        simplex = np.array([[0.0, -0.7], [-1.0, -0.7], [0.0, -2.0]])
+        options = {"maxfev": NOISE_EVALUATIONS, "initial_simplex": simplex}
+        best = minimize(loss, simplex[0], method="Nelder-Mead", options=options)
+        return typical.scaled(*np.exp(np.clip(best.x, -12.0, 6.0)))
+
+    def _typical_noise(self) -> Noise:
+        """Noise of the sensors by the products of successive misses, and the size of the misses.
+
+        Noise of a row enters the step that ends at this row and the step that starts there, with opposite signs. Where
+        velocities are not measured, the third differences of the positions tell the noise.
+        """
+        n = self.record.num_readings
+        miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
+        size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
+        if self.record.positions_of_velocities:
+            return Noise(self.jerk, size)
+        clipped = np.clip(miss / size, -CLIP, CLIP)[..., :n]
+        slope = self.slope[:, 1:, :n, :n] * size[:n] / size[:n, None]
+        products = clipped[:, 1:, :, None] * clipped[:, :-1, None, :]
+        weight = np.isfinite(products) / (1.0 + (slope**2).sum(2, keepdims=True))
+        shared = -(weight * slope * np.nan_to_num(products)).sum((0, 1, 2))
+        share = np.maximum(shared / np.maximum((weight * slope**2).sum((0, 1, 2)), 1e-12), 0.0)
+        return Noise(np.sqrt(share) * size[:n], size)
+
+    def filtered(self, noise: Noise, some: slice = slice(None)) -> tuple[np.ndarray, np.ndarray, float]:
+        """Means (B, L, m), covariances (B, L, m, m) and the mean log density of the next readings."""
+        n, m = self.record.num_readings, self.miss.shape[-1]
+        slope, miss, live, known = (values[some] for values in (self.slope, self.miss, self.live, self.known))
+        sensor, step = np.diag(noise.sensor**2), np.diag(noise.step**2)
+        begin = np.diag(np.append(noise.sensor**2, np.ones(m - n)))
+        mean, covariance = np.zeros((*live.shape, m)), np.zeros((*live.shape, m, m))
+        x, doubt = np.zeros((len(live), m)), np.tile(begin, (len(live), 1, 1))
+        density, count = 0.0, 0
+        for row in range(live.shape[1]):
+            mean[:, row], covariance[:, row] = x, doubt
+            guess = (slope[:, row] @ x[..., None])[..., 0] + miss[:, row]
+            doubt = slope[:, row] @ doubt @ slope[:, row].transpose(0, 2, 1) + step
+            factor = np.linalg.cholesky(doubt[:, :n, :n] + sensor)
+            white = np.linalg.solve(factor, -guess[:, :n, None])[..., 0]
+            square, valid = (white**2).mean(1), live[:, row] & known[:, row]
+            log_det = np.log(np.einsum("bii->bi", factor)).sum(1)
+            density += float((log_density(white).sum(1) - log_det)[valid].sum())
+            count += int(valid.sum())
+            # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
+            trust = np.where(square > SURPRISE, square, 1.0)
+            doubt = doubt * np.where(known[:, row], trust, 1.0 / ROUNDING**2)[:, None, None]
+            gain = np.linalg.solve(doubt[:, :n, :n] + sensor, doubt[:, :n]).transpose(0, 2, 1)
+            x = guess - (gain @ guess[:, :n, None])[..., 0]
+            left = np.eye(m) - np.pad(gain, ((0, 0), (0, 0), (0, m - n)))
+            doubt = left @ doubt @ left.transpose(0, 2, 1) + gain @ sensor @ gain.transpose(0, 2, 1)
+            x[~live[:, row]], doubt[~live[:, row]] = 0.0, begin
+        return mean, covariance, density / max(1, count)
+
+
+def _rows_before(blocks: Blocks) -> int:
+    return min(BEFORE, blocks.steps // 2)
+
+
+def log_density(z: np.ndarray) -> np.ndarray:
+    """Log density of Student's t with ``TAIL`` degrees of freedom and variance 1."""
+    constant = math.lgamma((TAIL + 1.0) / 2.0) - math.lgamma(TAIL / 2.0) - 0.5 * math.log((TAIL - 2.0) * math.pi)
+    return constant - (TAIL + 1.0) / 2.0 * np.log1p(z**2 / (TAIL - 2.0))

@@ -1,0 +1,234 @@
+"""One sweep over a catalogue: how the errors change with each candidate, and what it could gain, by linear algebra."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchrl_h2o.effects import (
+    ActionBacklash,
+    ActionDeadBand,
+    ActionDelay,
+    ActionLag,
+    ActionSaturation,
+    CatalogueEntry,
+    Effect,
+    JointRange,
+    ObservationDelay,
+)
+from torchrl_h2o.residuals.refit import flat, weights, whitened
+from torchrl_h2o.residuals.score import Predictions, fitted_scales
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.start_states import log_density
+from torchrl_h2o.residuals.trace.families import elements
+from torchrl_h2o.residuals.trace.model_bounds import lowest_value
+
+#: effects that act otherwise at each size, so that every trial is simulated
+NOT_LINEAR = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay)
+SHARES = (-4.0, -2.0, -1.0, -0.5, -0.2, 0.2, 0.5, 1.0, 2.0, 4.0)  # tried shares of a trial
+MOST_SHARE = 4.0  # largest move along a candidate's direction, in moves of its trial
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """A candidate: an entry of the catalogue and one of its trials, along which the errors were simulated.
+
+    Args:
+        entry: the entry.
+        trial: values of the trial.
+        change: change of the errors at the trial, (N), in spreads.
+        shares: least and largest share of the trial that may be tried.
+    """
+
+    entry: CatalogueEntry
+    trial: Mapping[str, float]
+    change: np.ndarray = field(repr=False)
+    shares: tuple[float, float] = (-MOST_SHARE, MOST_SHARE)
+
+    def effect(self, share: float) -> Effect:
+        """The effect at a share of the trial; powers of a factor. A limit that is never reached has only its trial."""
+        values = {}
+        for name, value in self.trial.items():
+            parameter = self.entry.effect.parameters[name]
+            neutral, (low, high) = parameter.neutral, parameter.bounds
+            if not math.isfinite(neutral):
+                values[name] = value
+            elif neutral == 1.0 and value > 0.0:
+                values[name] = float(np.clip(value**share, low, high))
+            else:
+                values[name] = float(np.clip(neutral + share * (value - neutral), low, high))
+        return self.entry.effect.with_parameters(values)
+
+
+@dataclass(frozen=True)
+class Lead:
+    """A candidate with its estimated gain.
+
+    Args:
+        direction: the candidate.
+        share: estimated share of its trial.
+        gain: estimated gain of the score in nats a row, if the errors are linear in the effect.
+    """
+
+    direction: Direction
+    share: float
+    gain: float
+
+    @property
+    def entry(self) -> CatalogueEntry:
+        """The entry of the catalogue."""
+        return self.direction.entry
+
+
+def sweep(
+    predictions: Predictions,
+    entries: Sequence[CatalogueEntry],
+    advance: Callable[[], object] = lambda: None,
+) -> list[Direction]:
+    """Simulates each candidate once, or once for each trial where its errors are not linear in its size.
+
+    An effect on several joints or motors is the sum of those on each, so it is not simulated.
+
+    Args:
+        predictions: predictions of the simulator.
+        entries: the catalogue.
+        advance: called after each entry.
+    """
+    before, simulation = flat(predictions.errors()), predictions.record.simulation
+    alone = _alone(entries, simulation)
+    found: dict[str, list[Direction]] = {}
+    shared: list[tuple[CatalogueEntry, list[CatalogueEntry]]] = []
+    for entry in entries:
+        advance()
+        own = elements(entry.effect, simulation)
+        parts = [alone.get((type(entry.effect), one)) for one in own]
+        if entry.effect.random:
+            continue
+        if len(own) > 1 and all(parts) and not isinstance(entry.effect, JointRange):
+            shared.append((entry, [part for part in parts if part is not None]))
+            continue
+        for trial in _simulated_trials(entry):
+            try:
+                change = flat(predictions.errors([entry.effect.with_parameters(trial)])) - before
+            except ValueError:
+                continue
+            if np.abs(change).max() > 0.0:
+                shares = _shares(entry, trial, simulation)
+                found.setdefault(entry.name, []).append(Direction(entry, trial, change.astype(np.float32), shares))
+    for entry, parts in shared:
+        if directions := _together(entry, [found.get(part.name, []) for part in parts]):
+            found[entry.name] = directions
+    return [direction for directions in found.values() for direction in directions]
+
+
+def _alone(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tuple[type, int], CatalogueEntry]:
+    """The entries that act on a single joint or motor, by kind and index."""
+    found = {}
+    for entry in entries:
+        own = elements(entry.effect, simulation)
+        if len(own) == 1:
+            found[type(entry.effect), own[0]] = entry
+    return found
+
+
+def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
+    if isinstance(entry.effect, NOT_LINEAR):
+        return list(entry.trials)
+    parameters, chosen = entry.effect.parameters, {}
+    for trial in entry.trials:
+        if len(trial) == 1 and parameters[entry.fitted[0]].neutral == 1.0:
+            # the factors next to 1, on either side
+            (value,) = trial.values()
+            side = (value > 1.0,)
+            if side in chosen and abs(math.log(chosen[side][entry.fitted[0]])) < abs(math.log(value)):
+                continue
+        else:
+            # one of each pair of opposite directions, the last of those along one line
+            moves = np.array([value - parameters[name].neutral for name, value in trial.items()])
+            unit = moves / max(np.abs(moves).max(), 1e-300)
+            side = tuple(np.round(unit * (1.0 if unit[np.abs(unit).argmax()] > 0.0 else -1.0), 6))
+            if side in chosen and unit[np.abs(unit).argmax()] < 0.0:
+                continue
+        chosen[side] = trial
+    return list(chosen.values())
+
+
+def _together(entry: CatalogueEntry, parts: Sequence[Sequence[Direction]]) -> list[Direction]:
+    """Directions of an effect on several elements from those on each of them."""
+    if not all(parts) or len(entry.fitted) != 1:
+        return []
+    (name,), found = entry.fitted, []
+    neutral = entry.effect.parameters[name].neutral
+
+    def moved(value: float) -> float:
+        return math.log(value) if neutral == 1.0 and value > 0.0 else value - (neutral if math.isfinite(neutral) else 0)
+
+    for index in range(min(map(len, parts))):
+        ones = [part[index] for part in parts]
+        trial = {name: float(np.median([one.trial[name] for one in ones]))}
+        size = moved(trial[name])
+        if size == 0.0 or any(moved(one.trial[name]) == 0.0 for one in ones):
+            continue
+        change = np.sum([one.change * np.float32(size / moved(one.trial[name])) for one in ones], axis=0)
+        least = max(one.shares[0] * moved(one.trial[name]) / size for one in ones)
+        found.append(Direction(entry, trial, change, (max(least, -MOST_SHARE), MOST_SHARE)))
+    return found
+
+
+def _shares(entry: CatalogueEntry, trial: Mapping[str, float], simulation: Simulation) -> tuple[float, float]:
+    """Shares of a trial at which the errors are about linear and the model accepts the effect."""
+    if isinstance(entry.effect, NOT_LINEAR):
+        return 0.0, 1.5
+    least = lowest_value(entry.effect, simulation.model)
+    if not math.isfinite(least):
+        return -MOST_SHARE, MOST_SHARE
+    (value,) = trial.values()  # friction, damping, rotor and stiffness have one parameter, whose neutral value is zero
+    ends = sorted((least / value, math.copysign(MOST_SHARE, value) if value < 0.0 else MOST_SHARE))
+    return max(ends[0], -MOST_SHARE), min(ends[1], MOST_SHARE)
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Gains of candidates beside effects that are readjusted, for the errors at hand.
+
+    Args:
+        white: whitened errors, (N).
+        inverse: inverse scales of the errors, (N).
+        share: shares of the errors in the score, (N).
+        beside: changes by the values of the present effects, whitened, (N, p).
+        blocks: number of blocks.
+    """
+
+    white: np.ndarray
+    inverse: np.ndarray
+    share: np.ndarray
+    beside: np.ndarray
+    blocks: int
+
+    @classmethod
+    def of(cls, predictions: Predictions, errors: Sequence[np.ndarray], beside: Sequence[np.ndarray]) -> Gains:
+        """Prepares the gains for errors (as :meth:`Predictions.errors`), beside changes (N) of present effects."""
+        white, inverse, share = whitened(predictions, errors, fitted_scales(predictions, errors))
+        columns = np.stack([change * inverse for change in beside], 1) if beside else np.zeros((len(white), 0))
+        return cls(white, inverse, share, columns, len(predictions.blocks))
+
+    def leads(self, directions: Sequence[Direction]) -> list[Lead]:
+        """The candidates in descending order of their gain, each at the best of a few shares of its trial."""
+        weight = self.share * weights(self.white)
+        gram = self.beside.T @ (weight[:, None] * self.beside)
+        solve = np.linalg.pinv(gram + 1e-9 * np.diag(np.diag(gram))) if len(gram) else gram
+        before, found = log_density(self.white) @ self.share, []
+        for direction in directions:
+            column = direction.change * self.inverse
+            if len(gram):
+                column = column - self.beside @ (solve @ (self.beside.T @ (weight * column)))
+            shares = [share for share in SHARES if direction.shares[0] <= share <= direction.shares[1]]
+            shares += [end for end in direction.shares if abs(end) < MOST_SHARE and end != 0.0]
+            gains = [log_density(self.white + share * column) @ self.share - before for share in shares]
+            best = int(np.argmax(gains))
+            if gains[best] > 0.0:
+                found.append(Lead(direction, shares[best], float(gains[best]) / self.blocks))
+        return sorted(found, key=lambda lead: -lead.gain)
