@@ -71,7 +71,7 @@ class Predictions:
             if not len(pairs):
                 found.append(np.ones(len(windows.horizons)))
                 continue
-            r = ((z[pairs] * z[pairs + 1]).mean((0, 2)) / (z**2).mean((0, 2))).clip(0.0, 1.0)
+            r = ((z[pairs] * z[pairs + 1]).mean((0, 2)) / ((z**2).mean((0, 2)) + 1e-12)).clip(0.0, 1.0)
             found.append((1.0 - r) / (1.0 + r))
         return tuple(found)
 
