@@ -71,8 +71,11 @@ def rank(pair: Pair) -> dict:
 
 
 def _cost(effects: tuple[Effect, ...]) -> float:
-    """Evidence that effects need before they are believed, in nats."""
-    return sum(NATS_OF_EFFECT + NATS_OF_SURPRISE * surprise(effect) for effect in effects)
+    """Evidence that effects need before they are believed, in nats; one kind on several joints counts as one."""
+    surprises: dict[type, int] = {}
+    for effect in effects:
+        surprises[type(effect)] = max(surprise(effect), surprises.get(type(effect), 0))
+    return sum(NATS_OF_EFFECT + NATS_OF_SURPRISE * one for one in surprises.values())
 
 
 if __name__ == "__main__":
