@@ -1,7 +1,5 @@
 """D4RL files, with and without next_observations."""
 
-import shutil
-
 import h5py
 import numpy as np
 import pytest
@@ -127,64 +125,6 @@ def test_without_timeouts_runs_end_where_the_next_observation_is_not_the_followi
     assert_same(found, make_recording(LENGTHS, ENDINGS))
     with pytest.raises(DataError, match="has no timeouts or next_observations; it has "):
         read_d4rl(write(tmp_path / "b.hdf5", timeouts=None, next_observations=None))
-
-
-def swings(path, lengths=(200, 150, 250), terminated=(1,), **changes):
-    """Writes episodes that begin near rest, each ``next_observations`` being the following row, also across a reset."""
-    rng = np.random.default_rng(0)
-    time = 0.05 * np.arange(max(lengths) + 1)[:, None]
-    swing = 3.0 * (1.0 - np.cos(time * [1.0, 1.3, 0.7])) * [1.0, 2.0, 0.5]  # returns to its start, but slowly
-    starts = 0.01 * rng.normal(size=(len(lengths), 3))
-    states = [start + swing[:length] for start, length in zip(starts, lengths, strict=True)]
-    rows = np.concatenate([*states, starts[-1:] + swing[lengths[-1], None]])
-    terminals = np.zeros(len(rows) - 1)
-    terminals[[sum(lengths[: episode + 1]) - 1 for episode in terminated]] = 1.0
-    arrays = {"observations": rows[:-1], "next_observations": rows[1:], "terminals": terminals, "timeouts": None}
-    arrays |= {"actions": np.zeros((len(terminals), 1)), "rewards": np.arange(len(terminals))}
-    return write(path, **{**arrays, **changes})
-
-
-def test_rows_that_lead_to_the_start_of_another_episode_are_dropped_and_counted(tmp_path, log_messages):
-    found = read_d4rl(swings(tmp_path / "a.hdf5"))
-    assert found["next", "reward"].flatten().tolist() == np.delete(np.arange(600), [199, 349]).tolist()
-    assert found["next", "truncated"].flatten().nonzero().flatten().tolist() == [198, 347, 597]
-    assert not found["next", "terminated"].any()
-    (message,) = log_messages
-    assert message.endswith(
-        "a.hdf5: 2 of 600 rows are dropped, 1 of them terminal, because their next observation is the start of "
-        "another episode"
-    )
-
-
-def test_rows_of_a_file_with_timeouts_are_kept(tmp_path, log_messages):
-    assert len(read_d4rl(swings(tmp_path / "a.hdf5", timeouts=np.zeros(600)))) == 600
-    assert not log_messages
-
-
-def test_a_large_step_to_elsewhere_is_kept(tmp_path):
-    path = swings(tmp_path / "a.hdf5", lengths=(600,), terminated=())
-    with h5py.File(path, "a") as file:
-        file["observations"][300:] += 20.0
-        file["next_observations"][299:] += 20.0
-    assert len(read_d4rl(path)) == 600
-
-
-@pytest.mark.parametrize(
-    ("task", "resets"), [("halfcheetah", (999, 2998, 3998)), ("walker2d", (885, 1784, 2784, 3784))]
-)
-def test_resets_of_a_published_set_are_found(shared_data, tmp_path, task, resets):
-    folder = shared_data / "off_dynamics"
-    path = shutil.copy(folder / f"{task}_gravity_0.5_medium_expert.hdf5", tmp_path)
-    with h5py.File(path, "a") as file:
-        steps = np.arange(len(file["rewards"]))
-        file["rewards"][...] = steps
-    assert read_d4rl(path)["next", "reward"].flatten().tolist() == np.delete(steps, resets).tolist()
-
-
-@pytest.mark.parametrize("quality", ["medium", "expert"])
-@pytest.mark.parametrize("task", ["halfcheetah_kinematic", "walker2d_gravity_0.5", "walker2d_morph"])
-def test_no_row_of_a_published_set_without_such_resets_is_dropped(shared_data, task, quality):
-    assert len(read_d4rl(shared_data / "off_dynamics" / f"{task}_{quality}.hdf5")) == 5000
 
 
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards", "terminals"])

@@ -12,7 +12,6 @@ from torchrl_h2o.data.readers.error import DataError, require_finite, require_fl
 from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.own_data import own_arrays
 from torchrl_h2o.data.readers.ted import to_ted
-from torchrl_h2o.data.readers.unmarked_resets import unmarked_resets
 
 _DIMENSIONS = {"observations": 2, "actions": 2, "rewards": 1, "terminals": 1, "timeouts": 1, "next_observations": 2}
 _FLAGS = ("terminals", "timeouts")
@@ -23,10 +22,7 @@ def read_d4rl(path: str | Path) -> TensorDict:
 
     In a file with ``next_observations`` every row is a transition. A row whose next observation differs from the
     following row, although neither flag is set, is marked truncated; the number of these rows is logged. Such a file
-    needs no ``timeouts``. In a file without them, rows whose next observation is the start of another episode are
-    dropped, with their rewards and terminal flags, see
-    :func:`~torchrl_h2o.data.readers.unmarked_resets.unmarked_resets`; the row before becomes the end of the episode,
-    marked truncated. The number of dropped rows is logged.
+    needs no ``timeouts``.
 
     In a file without ``next_observations`` the next observation is the observation of the following row. The last row
     of an episode then has no next observation and is dropped; the row before it becomes the end of the episode, marked
@@ -61,8 +57,6 @@ def read_d4rl(path: str | Path) -> TensorDict:
     """
     path = require_file(path)
     arrays = _read_arrays(path)
-    marks_timeouts = "timeouts" in arrays
-    arrays.setdefault("timeouts", np.zeros(len(arrays["terminals"]), bool))
     steps = len(arrays["observations"])
     for name, values in arrays.items():
         if len(values) != steps or not steps:
@@ -89,9 +83,6 @@ def read_d4rl(path: str | Path) -> TensorDict:
                 column="next_observations",
             )
         terminated, truncated = arrays["terminals"], _truncated_at_jumps(arrays, path)
-        if not marks_timeouts:
-            rows, truncated = _without_unmarked_resets(arrays, truncated, path)
-            following, terminated = following[rows], terminated[rows]
     else:
         rows, following, terminated, truncated = _link_rows(arrays, path)
     return to_ted(
@@ -123,6 +114,7 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
                 column=missing[0],
             )
         arrays = {name: np.asarray(array) for name, array in own_arrays(file, names, source=path).items()}
+    arrays.setdefault("timeouts", np.zeros(len(arrays["terminals"]), bool))
     for name, values in arrays.items():
         if _DIMENSIONS[name] == 1 and values.ndim == 2 and values.shape[1] == 1:
             arrays[name] = values = values[:, 0]
@@ -150,22 +142,6 @@ def _truncated_at_jumps(arrays: dict[str, np.ndarray], path: Path) -> np.ndarray
             "differs from the following row"
         )
     return arrays["timeouts"] | jumps
-
-
-def _without_unmarked_resets(
-    arrays: dict[str, np.ndarray], truncated: np.ndarray, path: Path
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows whose next observation is of their own episode, and which of them are truncated."""
-    terminated = arrays["terminals"]
-    resets = unmarked_resets(arrays["observations"], arrays["next_observations"], terminated | truncated)
-    if resets.any():
-        torchrl_logger.warning(
-            f"{path}: {resets.sum()} of {len(resets)} rows are dropped, {(resets & terminated).sum()} of them "
-            "terminal, because their next observation is the start of another episode"
-        )
-    # the row before a dropped one becomes the last one of its episode
-    truncated = truncated | (np.append(resets[1:], False) & ~terminated)
-    return np.flatnonzero(~resets), truncated[~resets]
 
 
 def _link_rows(arrays: dict[str, np.ndarray], path: Path) -> tuple:
