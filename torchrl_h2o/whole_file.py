@@ -99,8 +99,9 @@ def remove_partial(folder: str | Path, unchanged_for: float = 0.0, below: str = 
     """Removes temporary files and folders that killed processes have left in a folder and, by default, below it.
 
     Args:
-        folder: the folder, in which no other process writes, unless ``unchanged_for`` is longer than it takes.
-        unchanged_for: time since they were last written, in s.
+        folder: the folder. Temporary files that another process is still writing must be younger than
+            ``unchanged_for``, or they are removed too.
+        unchanged_for: least time since a file was last written, in s.
         below: pattern of the folders below.
     """
     for path in sorted(Path(folder).glob(f"{below}.*.{'[0-9a-f]' * 32}.partial*")):  # all names first: folders change
