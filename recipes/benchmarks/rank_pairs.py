@@ -17,10 +17,10 @@ from pairs import Pair, read_pairs
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.effects import Effect
-from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals import Measured
 from torchrl_h2o.residuals.score import Difference
-from torchrl_h2o.residuals.search import NATS_OF_EFFECT, NATS_OF_SURPRISE, Ground
+from torchrl_h2o.residuals.search import NATS_OF_SURPRISE, Ground, surprise_of
+from torchrl_h2o.residuals.settings import DEFAULTS
 
 
 def main() -> None:
@@ -48,15 +48,17 @@ def _row(index: int, logs: str | None) -> dict:
 
 def rank(pair: Pair) -> dict:
     """Compares both sets from start states that are filtered with the one and with the other."""
-    simulation = pair.simulation
+    simulation, by_block, seconds = pair.simulation, [], {"start states": 0.0, "scores": 0.0}
     measured = Measured.from_ted(pair.data, simulation)
-    begin, by_block = time.process_time(), []
     for effects in (pair.right, pair.wrong):
+        begin = time.process_time()
         model = Ground.of(simulation, measured, effects).model
+        filtered = time.process_time()
         by_block.append(model.scores(pair.right) - model.scores(pair.wrong))
-    seconds = time.process_time() - begin
+        seconds["start states"] += filtered - begin
+        seconds["scores"] += time.process_time() - filtered
     difference = Difference(np.mean(by_block, axis=0))
-    prior = _cost(pair.wrong) - _cost(pair.right)
+    prior = _prior(pair.right) - _prior(pair.wrong)
     return {
         "pair": pair.name,
         "kind": pair.kind,
@@ -64,18 +66,16 @@ def rank(pair: Pair) -> dict:
         "nats a block": round(difference.mean, 3),
         "standard error": round(difference.error, 3),
         "evidence": round(difference.evidence, 1),
-        "prior": prior,
+        "prior": round(prior, 1),
         "blocks": len(difference.by_block),
-        "CPU s an evaluation": round(seconds / 4.0, 2),
+        "CPU s of start states": round(seconds["start states"] / 2.0, 2),
+        "CPU s of a score": round(seconds["scores"] / 4.0, 2),
     }
 
 
-def _cost(effects: tuple[Effect, ...]) -> float:
-    """Evidence that effects need before they are believed, in nats; one kind on several joints counts as one."""
-    surprises: dict[type, int] = {}
-    for effect in effects:
-        surprises[type(effect)] = max(surprise(effect), surprises.get(type(effect), 0))
-    return sum(NATS_OF_EFFECT + NATS_OF_SURPRISE * one for one in surprises.values())
+def _prior(effects: tuple[Effect, ...]) -> float:
+    """Logarithm of the prior probability of effects, in nats: the level for each kind, and less for unusual ones."""
+    return len({type(effect) for effect in effects}) * np.log(DEFAULTS.level) - NATS_OF_SURPRISE * surprise_of(effects)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import Armature, CatalogueEntry, Gravity, JointDamping, JointFrictionLoss
+from torchrl_h2o.effects import Armature, CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, ObservationBias
+from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
+from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.score import Difference
-from torchrl_h2o.residuals.search import Ground, trace_effects
+from torchrl_h2o.residuals.score import Difference, Model
+from torchrl_h2o.residuals.search import Ground, search
 
 TRUTH = JointFrictionLoss(0.1)
 CATALOGUE = (
@@ -37,15 +39,44 @@ def test_the_true_effect_predicts_better_than_a_wrong_one(measured, wrong):
 
 def test_an_effect_too_many_predicts_no_better(measured):
     more = difference(measured, (TRUTH, Gravity(1.02)), (TRUTH,))
+    assert np.isfinite(more.by_block).all()
     assert more.evidence < 4.6
 
 
-def test_a_search_finds_the_true_effect_alone(measured):
+def test_a_search_finds_the_true_effect_alone_with_an_interval_that_holds_it(measured):
+    found = []
     with LoopBar(disable=True) as bar:
-        trace = trace_effects(pendulum(), measured, CATALOGUE, rng=np.random.default_rng(0), progress=bar)
-    (effect,) = trace.fit.effects
+        explained = search(pendulum(), measured, CATALOGUE, progress=bar, so_far=found.append)
+    (effect,), (half,) = explained.fit.effects, explained.fit.half_widths
     assert isinstance(effect, JointFrictionLoss)
     assert effect.torque == pytest.approx(TRUTH.torque, rel=0.1)
+    assert abs(effect.torque - TRUTH.torque) < 1.5 * half["torque"] + 1e-4
+    assert found[-1].entries == explained.found.entries
+
+
+def test_a_search_adds_nothing_where_nothing_is_missing():
+    data = recorded(pendulum(), 2000, 0.01)
+    with LoopBar(disable=True) as bar:
+        assert search(pendulum(), data, CATALOGUE, progress=bar).fit.effects == ()
+
+
+def test_a_score_that_is_no_number_is_no_evidence_of_likeness():
+    assert np.isnan(Difference(np.full(10, np.nan)).evidence)
+
+
+@pytest.mark.parametrize("effect", [ObservationBias(0.1, (0,)), Gravity(1.2)], ids=["sensor", "gravity"])
+@pytest.mark.parametrize("system", ["pendulum", "robot"])
+def test_effects_that_are_added_predict_as_the_simulator_with_them(system, effect):
+    if system == "pendulum":
+        simulation, data = pendulum(), recorded(pendulum(), 1000, 0.01)
+    else:  # it sinks into the floor, which is not observed
+        simulation = Simulation.from_env(WheelLeggedEnv())
+        ted = record(WheelLeggedEnv(), noisy_balance_controller(), 1000, seed=0, progress=False)
+        data = Measured.from_ted(ted, simulation)
+    added = Ground.of(simulation, data, (effect,)).model.fit.errors((effect,))
+    in_simulator = Model.of(simulation.with_effects(effect), data).fit.errors()
+    for one, other in zip(added, in_simulator, strict=True):
+        assert one == pytest.approx(other, abs=1e-9)
 
 
 def test_rare_differences_count_as_evidence_but_common_noise_does_not():

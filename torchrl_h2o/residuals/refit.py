@@ -120,7 +120,7 @@ def fit_set(
     entries: Sequence[CatalogueEntry],
     effects: Sequence[Effect],
     *,
-    most_steps: int = 8,
+    most_steps: int,
     intervals: bool = False,
 ) -> SetFit:
     """Maximises the score over the values of effects, from their present values.

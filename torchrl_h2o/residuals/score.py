@@ -40,13 +40,11 @@ class Predictions:
     Args:
         starts: start states of the simulation without the added effects.
         counts: effective share of a window for each kind of windows and horizon, (h): neighbouring windows with
-            similar errors count less; see :meth:`counted`.
-        seed: of the draws of start states.
+            similar errors count less; see :meth:`effective_counts`.
     """
 
     starts: StartStates
     counts: tuple[np.ndarray, ...] = ()
-    seed: int = 0
 
     @cached_property
     def shares(self) -> tuple[np.ndarray, ...]:
@@ -58,7 +56,7 @@ class Predictions:
             for count, windows in zip(counts, blocks.windows, strict=True)
         )
 
-    def correlations(self, errors: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+    def effective_counts(self, errors: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
         """Share of a window by which it counts beside its neighbours, (h) for each kind of windows.
 
         With the correlation r of the errors of neighbouring windows, that is (1 - r) / (1 + r).
@@ -77,8 +75,14 @@ class Predictions:
 
     def of_simulation(self, simulation: Simulation) -> Predictions:
         """The same windows from the same start states, predicted by another simulation."""
-        record = Record(simulation, self.record.measured)
-        record.__dict__["spread"] = self.record.spread
+        own, record = self.record, Record(simulation, self.record.measured)
+        shifts = [np.nan_to_num(new - old) for new, old in zip(record.readings, own.readings, strict=True)]
+        restore = simulation.state_map.restore_observed.T
+        # unobserved coordinates stay those that the present simulation has reached
+        record.__dict__["states"] = tuple(
+            states + shift @ restore for states, shift in zip(own.states, shifts, strict=True)
+        )
+        record.__dict__["spread"] = own.spread
         return replace(self, starts=replace(self.starts, record=record))
 
     @property
@@ -126,7 +130,7 @@ class Predictions:
         record, noise = self.record, self.starts.noise
         total = [np.zeros_like(one) for one in self._base]
         if (noise.sensor > NOISELESS).any() or record.simulation.state_map.hidden:
-            rng = np.random.default_rng(self.seed)
+            rng = np.random.default_rng(0)
             at = [self.starts.at(windows) for windows in self.blocks.windows]
             roots = [_root(covariance) for _, covariance in at]
             for _ in range(DRAWS):
@@ -219,7 +223,8 @@ class Difference:
         The differences are taken as normal, with the scatter that they have. An effect that acts rarely, such as the
         end of a joint's range, leaves most blocks as they are, so only those count that differ.
         """
-        acting = np.clip(self.by_block[np.abs(self.by_block) > ACTS], -MOST_NATS, MOST_NATS)
+        alike = np.abs(self.by_block) <= ACTS  # False for NaN, which must not pass for no evidence
+        acting = np.clip(self.by_block[~alike], -MOST_NATS, MOST_NATS)
         if len(acting) < FEWEST:
             return 0.0
         n = len(acting)

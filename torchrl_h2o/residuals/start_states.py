@@ -75,7 +75,7 @@ class StartStates:
         return cls(record, blocks, noise, mean[:, before:], covariance[:, before:])
 
     def rough(self, most: int) -> StartStates:
-        """Those of at most so many blocks, with fewer short windows."""
+        """Returns the start states of at most ``most`` blocks, evenly spread, without the shortest windows."""
         some = slice(None, None, -(-len(self.blocks) // most))
         blocks = Blocks(self.blocks.first[some], self.blocks.steps, LENGTHS[-1:])
         return StartStates(self.record, blocks, self.noise, self.mean[some], self.covariance[some])

@@ -70,7 +70,7 @@ class Lead:
     Args:
         direction: the candidate.
         share: estimated share of its trial.
-        gain: estimated gain of the score in nats a row, if the errors are linear in the effect.
+        gain: estimated gain of the score in nats a block, if the errors are linear in the effect.
     """
 
     direction: Direction
@@ -135,25 +135,23 @@ def _alone(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tu
 
 
 def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
+    """The trials to simulate: all if the errors are not linear; otherwise the least factor on either side of 1, or the
+    last trial along each line through the neutral values."""
     if isinstance(entry.effect, NOT_LINEAR):
         return list(entry.trials)
-    parameters, chosen = entry.effect.parameters, {}
+    neutral = {name: parameter.neutral for name, parameter in entry.effect.parameters.items()}
+    if len(entry.fitted) == 1 and neutral[entry.fitted[0]] == 1.0:
+        (name,) = entry.fitted
+        by_size = sorted(entry.trials, key=lambda trial: -abs(math.log(trial[name])))
+        return list({trial[name] > 1.0: trial for trial in by_size}.values())
+    lines = {}
     for trial in entry.trials:
-        if len(trial) == 1 and parameters[entry.fitted[0]].neutral == 1.0:
-            # the factors next to 1, on either side
-            (value,) = trial.values()
-            side = (value > 1.0,)
-            if side in chosen and abs(math.log(chosen[side][entry.fitted[0]])) < abs(math.log(value)):
-                continue
-        else:
-            # one of each pair of opposite directions, the last of those along one line
-            moves = np.array([value - parameters[name].neutral for name, value in trial.items()])
-            unit = moves / max(np.abs(moves).max(), 1e-300)
-            side = tuple(np.round(unit * (1.0 if unit[np.abs(unit).argmax()] > 0.0 else -1.0), 6))
-            if side in chosen and unit[np.abs(unit).argmax()] < 0.0:
-                continue
-        chosen[side] = trial
-    return list(chosen.values())
+        moves = np.array([value - neutral[name] for name, value in trial.items()])
+        largest = moves[np.abs(moves).argmax()]
+        line = tuple(np.round(moves / largest, 6))
+        if largest > 0.0 or line not in lines:  # the opposite direction is the same line
+            lines[line] = trial
+    return list(lines.values())
 
 
 def _together(entry: CatalogueEntry, parts: Sequence[Sequence[Direction]]) -> list[Direction]:

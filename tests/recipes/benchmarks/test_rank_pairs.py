@@ -11,4 +11,4 @@ def test_a_drawn_pair_is_ranked_and_timed():
     row = rank(pair)
     assert row["ranked rightly"]
     assert row["evidence"] > 0.0
-    assert row["CPU s an evaluation"] > 0.0
+    assert row["CPU s of a score"] > 0.0
