@@ -16,7 +16,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.data.readers import test_formats as formats
+from tests.data.readers import log_files as formats
 from tests.data.recordings import assert_same, make_recording
 from tests.data.test_d4rl import write as write_d4rl
 from tests.data.test_log_columns import GOOD
