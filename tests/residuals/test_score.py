@@ -1,10 +1,20 @@
 """The score prefers the right effects, and a search by it finds them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import Armature, CatalogueEntry, Gravity, JointDamping, JointFrictionLoss, ObservationBias
+from torchrl_h2o.effects import (
+    Armature,
+    CatalogueEntry,
+    Gravity,
+    JointDamping,
+    JointFrictionLoss,
+    ObservationBias,
+    ObservationGain,
+)
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.progress import LoopBar
@@ -77,6 +87,15 @@ def test_effects_that_are_added_predict_as_the_simulator_with_them(system, effec
     in_simulator = Model.of(simulation.with_effects(effect), data).fit.errors()
     for one, other in zip(added, in_simulator, strict=True):
         assert one == pytest.approx(other, abs=1e-9)
+
+
+def test_the_score_does_not_depend_on_the_gain_of_a_sensor():
+    """Otherwise a larger gain would make errors smaller, and so raise the score of any data."""
+    plain = recorded(pendulum(), 1500, 0.01)
+    doubled = replace(plain, observation=2.0 * plain.observation, following=2.0 * plain.following)
+    score = Model.of(pendulum(), plain).scores().mean()
+    gains = pendulum().with_effects(ObservationGain(2.0))
+    assert Model.of(gains, doubled).scores().mean() == pytest.approx(score, abs=0.02)
 
 
 def test_rare_differences_count_as_evidence_but_common_noise_does_not():

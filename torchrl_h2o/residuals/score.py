@@ -15,7 +15,7 @@ import numpy as np
 
 from torchrl_h2o.effects import Effect, ObservationEffect
 from torchrl_h2o.residuals.blocks import Blocks, block_steps
-from torchrl_h2o.residuals.measured.residual import executed_actions
+from torchrl_h2o.residuals.measured.residual import executed_actions, undelayed_following
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.record import Record, true_readings
@@ -104,20 +104,20 @@ class Predictions:
         return self._predicted(self.record.simulation, self._states)
 
     def errors(self, effects: Sequence[Effect] = ()) -> list[np.ndarray]:
-        """Measured minus predicted readings in spreads, (W, h, n) for each kind of windows.
+        """Measured minus predicted readings in spreads, (W, h, n) for each kind of windows, as the sensors report them.
 
         Raises:
             ValueError: if the model rejects an effect.
         """
-        record, (before, after) = self.record, self.record.readings
-        predicted = self._base
+        record, simulation, predicted = self.record, self.record.simulation, self._base
         if effects:
             simulation, states = record.simulation.with_effects(*effects), self._states
             if any(isinstance(effect, ObservationEffect) for effect in effects):
-                other, after = true_readings(simulation, record.measured)
-                shift = np.nan_to_num(other - before) @ record.simulation.state_map.restore_observed.T
+                other, _ = true_readings(simulation, record.measured)
+                shift = np.nan_to_num(other - record.readings[0]) @ record.simulation.state_map.restore_observed.T
                 states = [s + shift[windows.rows] for windows, s in zip(self.blocks.windows, states, strict=True)]
             predicted = self._predicted(simulation, states)
+        after = undelayed_following(simulation, record.measured)
         spread = record.spread[: record.num_readings]
         return [
             np.nan_to_num(after[windows.rows[:, None] + windows.horizons - 1] / spread - one, nan=DIVERGED)
@@ -141,7 +141,10 @@ class Predictions:
                 ]
                 for sum_, one, base in zip(total, self._predicted(record.simulation, moved), self._base, strict=True):
                     sum_ += np.nan_to_num((one - base) ** 2, nan=DIVERGED**2) / DRAWS
-        return [one + noise.sensor**2 + ROUNDING**2 for one in total]
+        observed = record.simulation.pipeline.observe_memoryless
+        zeros, step = np.zeros(len(noise.sensor)), record.simulation.control_step
+        gain = observed(zeros + 1.0, step) - observed(zeros, step)
+        return [one + (gain * noise.sensor) ** 2 + ROUNDING**2 for one in total]
 
     def _predicted(self, simulation: Simulation, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         record, measured = self.record, self.record.measured
@@ -156,7 +159,7 @@ class Predictions:
                 time=measured.time[windows.rows],
                 activations=active[windows.rows],
             )
-            found.append(reached[:, windows.horizons - 1] @ record.from_state[:n].T / record.spread[:n])
+            found.append(simulation.observed(reached[:, windows.horizons - 1]) / record.spread[:n])
         return found
 
 
