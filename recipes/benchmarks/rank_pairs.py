@@ -26,7 +26,11 @@ from torchrl_h2o.residuals.settings import DEFAULTS
 
 def main() -> None:
     cfg = read_options(logs=None, names=None, processes=2, folder="outputs/benchmark/rank_pairs")
+    if cfg.logs is not None and not Path(cfg.logs).is_dir():
+        raise SystemExit(f"logs={cfg.logs}: there is no such folder; give the folder of the measured logs")
     pairs = read_pairs(None if cfg.logs is None else Path(cfg.logs))
+    for unknown in set(cfg.names or ()) - {pair.name for pair in pairs}:
+        raise SystemExit(f"names=[{unknown}]: choose names of pairs.yaml; those of measured logs need logs=FOLDER")
     chosen = [index for index, pair in enumerate(pairs) if cfg.names is None or pair.name in cfg.names]
     rows, folder = [], Path(cfg.folder)
     folder.mkdir(parents=True, exist_ok=True)
