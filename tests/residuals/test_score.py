@@ -37,7 +37,7 @@ def measured(request):
 
 def difference(measured, better, worse):
     ground = Ground.of(pendulum(), measured, better)
-    return Difference(ground.model.scores(better) - ground.model.scores(worse))
+    return Difference(ground.model(better).scores() - ground.model(worse).scores())
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_effects_that_are_added_predict_as_the_simulator_with_them(system, effec
         simulation = Simulation.from_env(WheelLeggedEnv())
         ted = record(WheelLeggedEnv(), noisy_balance_controller(), 1000, seed=0, progress=False)
         data = Measured.from_ted(ted, simulation)
-    added = Ground.of(simulation, data, (effect,)).model.fit.errors((effect,))
+    added = Ground.of(simulation, data, (effect,)).fit_part((effect,)).errors((effect,))
     in_simulator = Model.of(simulation.with_effects(effect), data).fit.errors()
     for one, other in zip(added, in_simulator, strict=True):
         assert one == pytest.approx(other, abs=1e-9)

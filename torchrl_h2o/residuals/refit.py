@@ -37,6 +37,7 @@ class Variable:
         low: lowest value.
         high: highest value.
         is_factor: whether the variable is the logarithm of the parameter.
+        neutral: value at which the parameter changes nothing.
     """
 
     effect: int
@@ -46,6 +47,7 @@ class Variable:
     low: float
     high: float
     is_factor: bool
+    neutral: float
 
     def at(self, x: float) -> float:
         """The parameter's value at x."""
@@ -59,6 +61,13 @@ class Variable:
         if self.is_factor:
             return tuple(np.log2(np.maximum(ends, 1e-300) / self.value) / self.size)
         return tuple((ends - self.value) / self.size)
+
+    @property
+    def to_neutral(self) -> float:
+        """The move to the neutral value; not finite for a limit that is never reached."""
+        if self.is_factor:
+            return math.log2(self.neutral / self.value) / self.size
+        return (self.neutral - self.value) / self.size
 
     def slope(self, x: float) -> float:
         """Derivative of the value by x."""
@@ -92,9 +101,8 @@ def variables_of(
             parameter = effect.parameters[name]
             low, high = max(parameter.bounds[0], least), parameter.bounds[1]
             is_factor = parameter.neutral == 1.0 and low > 0.0 and parameter.value > 0.0
-            found.append(
-                Variable(index, name, parameter.value, 1.0 if is_factor else size_of(entry, name), low, high, is_factor)
-            )
+            size = 1.0 if is_factor else size_of(entry, name)
+            found.append(Variable(index, name, parameter.value, size, low, high, is_factor, parameter.neutral))
     return found
 
 
@@ -138,31 +146,31 @@ def fit_set(
     effects = tuple(effects)
     errors = [part.errors(effects) for part in parts]
     scales, by_block = _profiled(parts, errors)
-    slopes, variables, step_size = None, [], 1.0
+    slopes, variables = None, []
     for _ in range(most_steps):
         variables = variables_of(parts[0], entries, effects)
         if not variables:
             break
-        slopes = slopes_of(parts, effects, variables, errors)
+        is_new = slopes is None
+        if slopes is None:
+            slopes = slopes_of(parts, effects, variables, errors)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
-        move, gained = _step(weighted, slopes, variables), False
-        for _ in range(3):
-            x = step_size * move
+        move, gain = _step(weighted, slopes, variables), 0.0
+        for share in (1.0, 0.3, 0.1) if is_new else (1.0,):
             try:
-                tried = with_values(effects, variables, x)
+                tried = with_values(effects, variables, share * move)
                 new_errors = [part.errors(tried) for part in parts]
             except ValueError:
-                step_size *= 0.3
                 continue
             new_scales, new_by_block = _profiled(parts, new_errors)
             gain = float(new_by_block.mean() - by_block.mean())
             if gain > 0.0:
                 effects, errors, scales, by_block = tried, new_errors, new_scales, new_by_block
-                gained, step_size = True, min(1.0, 2.0 * step_size)
                 break
-            step_size *= 0.3
-        if not gained or gain < SMALLEST_GAIN:
-            break
+        if gain < SMALLEST_GAIN:
+            if is_new:
+                break
+            slopes = None  # the derivatives of an earlier step lead no further
     widths: tuple[dict[str, float], ...] = tuple({} for _ in effects)
     if intervals and variables:
         variables = variables_of(parts[0], entries, effects)

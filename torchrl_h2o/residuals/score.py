@@ -23,8 +23,6 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates, log_density
 
 FIT_ROWS, SELECTION_ROWS = 1536, 1024  # rows that are predicted for fits, and for comparisons
-DRAWS = 6  # draws of the start states, which tell how their uncertainty grows
-NOISELESS = 3.0 * ROUNDING  # sensor noise, in spreads, up to which start states count as exact
 DIVERGED = 1e3  # error in spreads where a simulation diverges
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
@@ -128,23 +126,22 @@ class Predictions:
     def variances(self) -> list[np.ndarray]:
         """Variance of the errors by sensor noise and uncertain start states, (W, h, n) for each kind of windows."""
         record, noise = self.record, self.starts.noise
-        total = [np.zeros_like(one) for one in self._base]
-        if (noise.sensor > NOISELESS).any() or record.simulation.state_map.hidden:
-            rng = np.random.default_rng(0)
-            at = [self.starts.at(windows) for windows in self.blocks.windows]
-            roots = [_root(covariance) for _, covariance in at]
-            for _ in range(DRAWS):
-                drawn = [(root @ rng.standard_normal((*root.shape[:2], 1)))[..., 0] for root in roots]
-                moved = [
-                    states + (draw * record.spread) @ record.into_state.T
-                    for (states, _), draw in zip(at, drawn, strict=True)
-                ]
-                for sum_, one, base in zip(total, self._predicted(record.simulation, moved), self._base, strict=True):
-                    sum_ += np.nan_to_num((one - base) ** 2, nan=DIVERGED**2) / DRAWS
         observed = record.simulation.pipeline.observe_memoryless
         zeros, step = np.zeros(len(noise.sensor)), record.simulation.control_step
         gain = observed(zeros + 1.0, step) - observed(zeros, step)
-        return [one + (gain * noise.sensor) ** 2 + ROUNDING**2 for one in total]
+        return [
+            gain**2 * (self.starts.spread_ahead(windows) + noise.sensor**2) + ROUNDING**2
+            for windows in self.blocks.windows
+        ]
+
+    def score(self, effects: Sequence[Effect] = ()) -> float:
+        """Mean score of the blocks with effects added, in nats.
+
+        Raises:
+            ValueError: if the model rejects an effect.
+        """
+        errors = self.errors(effects)
+        return float(scores(self, errors, fitted_scales(self, errors)).mean())
 
     def _predicted(self, simulation: Simulation, states: Sequence[np.ndarray]) -> list[np.ndarray]:
         record, measured = self.record, self.record.measured
@@ -190,11 +187,6 @@ def scores(predictions: Predictions, errors: Sequence[np.ndarray], scales: Seque
     return total
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
-
-
 def _density(error: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return log_density(error / np.sqrt(variance)) - 0.5 * np.log(variance)
 
@@ -218,6 +210,11 @@ class Difference:
     def error(self) -> float:
         """Standard error of the mean."""
         return float(self.by_block.std(ddof=1) / np.sqrt(max(1, len(self.by_block))))
+
+    @property
+    def acting(self) -> int:
+        """Number of blocks that differ."""
+        return int((np.abs(self.by_block) > ACTS).sum())
 
     @property
     def evidence(self) -> float:
@@ -246,7 +243,7 @@ class Model:
 
     fit: Predictions
     selection: Predictions
-    _found: dict[tuple[Effect, ...], np.ndarray] = field(default_factory=dict, repr=False)
+    _found: dict[tuple[Effect, ...], tuple[np.ndarray, np.ndarray | None]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -269,20 +266,41 @@ class Model:
         selection = StartStates.of(record, Blocks.of(measured, Split.SELECTION, steps, rows[1]), fit.noise)
         return cls(Predictions(fit), Predictions(selection))
 
+    def of_simulation(self, simulation: Simulation) -> Model:
+        """The same blocks, predicted by a similar simulation from start states that are filtered with it."""
+        record = Record(simulation, self.fit.record.measured)
+        fit = StartStates.of(record, self.fit.blocks, slope=self.fit.starts.slope)
+        selection = StartStates.of(record, self.selection.blocks, fit.noise, self.selection.starts.slope)
+        return Model(replace(self.fit, starts=fit), replace(self.selection, starts=selection))
+
     def scores(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """Scores with effects added: of the blocks for fits, then of those for selection, (F + S); see :func:`scores`.
 
         Raises:
             ValueError: if the model rejects an effect.
         """
-        key = tuple(effects)
-        if key not in self._found:
-            errors = self.fit.errors(key)
-            scales = fitted_scales(self.fit, errors)
-            others = scores(self.selection, self.selection.errors(key), scales)
-            self._found[key] = np.append(scores(self.fit, errors, scales), others)
-        return self._found[key]
+        return self._scored(tuple(effects))[0]
 
     def on_selection(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """Scores of the blocks for selection, (S), with effects added."""
         return self.scores(effects)[len(self.fit.blocks) :]
+
+    def one_step_ahead(self, effects: Sequence[Effect] = ()) -> np.ndarray | None:
+        """Score of the blocks for selection one step ahead, (S), with effects added.
+
+        None if the noise of the sensors is larger than the rest of these errors, so that one step tells little.
+        """
+        return self._scored(tuple(effects))[1]
+
+    def _scored(self, effects: tuple[Effect, ...]) -> tuple[np.ndarray, np.ndarray | None]:
+        if effects not in self._found:
+            errors, ahead = self.fit.errors(effects), self.selection.errors(effects)
+            scales = fitted_scales(self.fit, errors)
+            by_block = np.append(scores(self.fit, errors, scales), scores(self.selection, ahead, scales))
+            windows, known = self.selection.blocks.windows[0], self.selection.variances[0][:, 0]
+            one_step = None
+            if np.median(scales[0][0] / np.median(known, axis=0)) > 1.0:
+                density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
+                one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
+            self._found[effects] = by_block, one_step
+        return self._found[effects]

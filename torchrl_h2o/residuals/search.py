@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -13,26 +14,32 @@ from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
 from torchrl_h2o.residuals.refit import SetFit, fit_set, slopes_of, variables_of
-from torchrl_h2o.residuals.score import Difference, Model, Predictions, fitted_scales, scores
+from torchrl_h2o.residuals.score import Difference, Model, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, Gains, Lead, sweep
 
 ROUGH_STEPS = 2560  # physics steps that are simulated for each candidate of a sweep and in first fits
 ROUGH_ROWS = 1024  # rows beyond which these are not more
-TRIED = 10  # candidates of the largest estimated gain whose gain is then simulated
-FITTED = 4  # of these, the best whose values are fitted
+RESWEPT = 64  # entries of the largest estimated gain, which are simulated again in later sweeps
+TRIED = 8  # candidates of the largest estimated gain whose gain is then simulated
+FITTED = 3  # of these, the best whose values are fitted
 SKETCH = 3  # steps of such a fit
 GROWN = 5  # steps of the fit of a set after an effect was added
-SWEEPS = 5  # largest number of sweeps
+REFITTED = 3  # fits of a set, each from the start states that the fit before gives
+SWEEPS = 6  # largest number of sweeps
 NATS_OF_SURPRISE = 2.0  # evidence that an effect needs for each degree of surprise
+FAR = 40.0  # evidence, in nats, against a set after a few steps of a fit, beyond which it is not fitted further
 ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
-MOST_REFUSED = 12  # candidates that are refused one after another before none is added
+MANY = 2  # joints or motors with an effect beside which a further one needs no evidence
+SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
+MOST_KEPT = 3  # effects that were needed when they were dropped, after which no more are
+MOST_REFUSED = 9  # candidates that are refused one after another before none is added
 SWAPS = 4  # largest number of effects that are replaced by others
-MOST_EFFECTS = 40  # largest number of entries in a set
+MOST_EFFECTS = 80  # largest number of entries in a set
 
 
-def surprise_of(effects: Sequence[Effect]) -> int:
+def surprise_of(effects: Iterable[Effect]) -> int:
     """How unusual effects are in all: the most unusual of each kind counts, because joints resemble each other."""
     most: dict[type, int] = {}
     for effect in effects:
@@ -48,76 +55,127 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
+        one_step: scores of the blocks for selection one step ahead, (S), if they tell more than the sensors' noise.
     """
 
     entries: tuple[CatalogueEntry, ...]
     effects: tuple[Effect, ...]
     scores: np.ndarray
+    one_step: np.ndarray | None = None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the entries."""
+        return frozenset(entry.name for entry in self.entries)
 
     @property
     def surprise(self) -> int:
         """How unusual the effects are in all; see :func:`surprise_of`."""
         return surprise_of(self.effects)
 
-    def without(self, index: int) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
-        """Entries and effects without one of them."""
-        return (*self.entries[:index], *self.entries[index + 1 :]), (*self.effects[:index], *self.effects[index + 1 :])
+    def without(self, names: Collection[str]) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
+        """Entries and effects without some of them."""
+        kept = [pair for pair in zip(self.entries, self.effects, strict=True) if pair[0].name not in names]
+        return tuple(entry for entry, _ in kept), tuple(effect for _, effect in kept)
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The models on which sets are compared: predictions from start states filtered with the present effects.
+    """Compares sets, each by predictions from start states that are filtered with this set.
 
     Args:
         simulation: the simulator without effects.
-        model: predictions for fits and for selection; effects are added to ``simulation``.
-        rough: predictions in some of the blocks for fits, without the shortest windows.
+        base: predictions of a set near those to compare, whose derivatives the filters of all sets use.
     """
 
     simulation: Simulation
-    model: Model
-    rough: Predictions
+    base: Model
+    _models: dict[tuple[Effect, ...], Model] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, simulation: Simulation, measured: Measured, effects: Sequence[Effect] = ()) -> Ground:
-        """Filters the start states with effects."""
+        """The ground near a set of effects."""
         model = Model.of(simulation.with_effects(*effects), measured)
         counts = model.fit.effective_counts(model.fit.errors())
-        fit, selection = replace(model.fit, counts=counts), replace(model.selection, counts=counts)
-        model = Model(fit, selection)
-        if effects:
-            model = Model(fit.of_simulation(simulation), selection.of_simulation(simulation))
-        rows = min(ROUGH_ROWS, ROUGH_STEPS // simulation.frame_skip)
-        rough = model.fit.starts.rough(max(8, rows // model.fit.blocks.steps))
-        return cls(simulation, model, Predictions(rough))
+        base = Model(replace(model.fit, counts=counts), replace(model.selection, counts=counts))
+        return cls(simulation, base, {tuple(effects): base})
 
     @property
     def num_fit(self) -> int:
         """Number of blocks for fits."""
-        return len(self.model.fit.blocks)
+        return len(self.base.fit.blocks)
+
+    def model(self, effects: Sequence[Effect]) -> Model:
+        """Predictions from start states filtered with effects."""
+        key = tuple(effects)
+        if key not in self._models:
+            while len(self._models) > 2 * FITTED:
+                del self._models[next(iter(self._models))]
+            self._models[key] = self.base.of_simulation(self.simulation.with_effects(*key))
+        return self._models[key]
+
+    def fit_part(self, effects: Sequence[Effect]) -> Predictions:
+        """Predictions of the simulator without effects, on the rows for fits, from start states filtered with some."""
+        return self.model(effects).fit.of_simulation(self.simulation)
+
+    def rough(self, effects: Sequence[Effect]) -> Predictions:
+        """As :meth:`fit_part` in some of the blocks, without the shortest windows."""
+        part = self.model(effects).fit
+        rows = min(ROUGH_ROWS, ROUGH_STEPS // self.simulation.frame_skip)
+        rough = part.starts.rough(max(8, rows // part.blocks.steps))
+        return Predictions(rough).of_simulation(self.simulation)
 
     def found(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its scores."""
-        return Found(tuple(entries), tuple(effects), self.model.scores(effects))
+        model = self.model(effects)
+        return Found(tuple(entries), tuple(effects), model.scores(), model.one_step_ahead())
 
     def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its values fitted from the present ones."""
-        return self.found(entries, fit_set([self.model.fit], entries, effects, most_steps=GROWN).effects)
+        found = self.found(entries, effects)
+        for _ in range(REFITTED if entries else 0):
+            fit = fit_set([self.fit_part(found.effects)], entries, found.effects, most_steps=GROWN)
+            other = self.found(entries, fit.effects)
+            gain = other.scores[: self.num_fit].mean() - found.scores[: self.num_fit].mean()
+            found = other if gain > 0.0 else found
+            if gain < 0.01 * len(self.simulation.state_map.names):
+                break
+        return found
 
-    def sketched(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
-        """A set with its values fitted to the rough predictions, in a few steps."""
-        return self.found(entries, fit_set([self.rough], entries, effects, most_steps=SKETCH).effects)
+    def sketched(self, rough: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+        """A set with its values fitted to rough predictions, in a few steps."""
+        return self.found(entries, fit_set([rough], entries, effects, most_steps=SKETCH).effects if entries else ())
 
-    def rough_score(self, effects: Sequence[Effect]) -> float:
-        """Mean score of the rough predictions."""
-        errors = self.rough.errors(effects)
-        return float(scores(self.rough, errors, fitted_scales(self.rough, errors)).mean())
+    def needed(self, more: Found, less: Found, level: float) -> float:
+        """Evidence that a larger set needs: a significant one, and more for unusual effects.
+
+        What most joints have, such as friction, further ones have too: these need no evidence of their own.
+        """
+        kinds = [type(effect) for effect in less.effects]
+        added = [
+            effect for entry, effect in zip(more.entries, more.effects, strict=True) if entry.name not in less.names
+        ]
+        if all(kinds.count(type(effect)) >= MANY for effect in added):
+            return 0.0
+        return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(level)
+
+    def evidence(self, more: Found, less: Found) -> float:
+        """Evidence of the rows for selection that one set predicts better than another."""
+        return Difference(more.scores[self.num_fit :] - less.scores[self.num_fit :]).evidence
 
     def adds(self, more: Found, less: Found, level: float) -> bool:
-        """Whether a set predicts the rows for selection better than a smaller one, by more than its surprise."""
-        difference = Difference(more.scores[self.num_fit :] - less.scores[self.num_fit :])
-        cost = NATS_OF_SURPRISE * max(0, more.surprise - less.surprise)
-        return difference.evidence > cost - math.log(level)
+        """Whether a set predicts the rows for selection better than a smaller one, by more than its surprise.
+
+        Noise in the commands moves the simulator and not the machine, and over many steps an effect predicts better
+        that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
+        effect must therefore predict the next step better, too.
+        """
+        needed = self.needed(more, less, level)
+        if self.evidence(more, less) <= needed:
+            return False
+        if more.one_step is None or less.one_step is None:
+            return True
+        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(level))
 
 
 def grow(
@@ -128,110 +186,170 @@ def grow(
     advance: Callable[[Found], object],
 ) -> Found:
     """Adds candidates one after another while the rows for selection are predicted better."""
-    refused: set[str] = set()
-    while len(found.entries) < MOST_EFFECTS and len(refused) <= MOST_REFUSED:
-        fitted = _with_one_more(ground, found, directions, refused | _names(found))
+    refused: set[frozenset[str]] = set()
+    while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
+        fitted = _with_one_more(ground, found, directions, refused, -math.log(level))
         if not fitted:
             break
-        better = [one for one in fitted if _is_usable(ground, one) and ground.adds(one, found, level)]
+        better = [one for one in fitted if ground.adds(one, found, level)]
         if better:
             best = _most_usual(better)
+            many = len(best.entries) > len(found.entries) + 2
             found, refused = ground.fitted(best.entries, best.effects), set()
             advance(found)
+            if many:  # the errors now change with the candidates in other ways than at the sweep
+                break
         else:
-            refused |= {one.entries[-1].name for one in fitted}
+            refused |= {one.names - found.names for one in fitted}
     return found
 
 
 def _with_one_more(
-    ground: Ground, found: Found, directions: Sequence[Direction], passed_over: Collection[str]
+    ground: Ground,
+    found: Found,
+    directions: Sequence[Direction],
+    passed_over: Collection[frozenset[str]] = (),
+    least: float = 0.0,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps."""
-    leads = _leads(ground, found, [one for one in directions if one.entry.name not in passed_over])
+    rough = ground.rough(found.effects)
+    gains = _gains(rough, found)
+    leads = [
+        lead
+        for lead in _best_of_each(gains.leads(directions))
+        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > 0.5 * least
+    ]
+    tried = [one[1:] for one in sorted(_simulated(rough, found, leads[:TRIED]), key=lambda one: -one[0])[:FITTED]]
+    joints = gains.of_joints(directions) if leads else None
+    if joints is not None and joints.names not in passed_over and not joints.names <= found.names:
+        tried.append(joints.beside(found.entries, found.effects, 1.0))
     fitted = []
-    for _, entry, effect in sorted(_simulated(ground, found, leads[:TRIED]), key=lambda one: -one[0])[:FITTED]:
+    for entries, effects in tried:
         try:
-            fitted.append(ground.sketched((*found.entries, entry), (*found.effects, effect)))
+            one = ground.sketched(rough, entries, effects)
         except ValueError:  # the model rejects the effects together
             continue
+        if _is_usable(ground, one, found):
+            fitted.append(one)
     return fitted
 
 
-def _leads(ground: Ground, found: Found, directions: Sequence[Direction]) -> list[Lead]:
-    """The best direction of each entry, in descending order of the estimated gain."""
-    errors, beside = ground.rough.errors(found.effects), []
+def _gains(part: Predictions, found: Found) -> Gains:
+    """Gains of candidates beside a set, whose values are readjusted."""
+    errors, beside = part.errors(found.effects), []
     if found.entries:
-        variables = variables_of(ground.rough, found.entries, found.effects)
-        beside = list(slopes_of([ground.rough], found.effects, variables, [errors])[0].T)
-    best: dict[str, Lead] = {}
-    for lead in Gains.of(ground.rough, errors, beside).leads(directions):
-        best.setdefault(lead.entry.name, lead)
+        variables = variables_of(part, found.entries, found.effects)
+        beside = list(slopes_of([part], found.effects, variables, [errors])[0].T)
+    return Gains.of(part, errors, beside)
+
+
+def _best_of_each(leads: Sequence[Lead]) -> list[Lead]:
+    """The best direction of each candidate, in descending order of the estimated gain."""
+    best: dict[frozenset[str], Lead] = {}
+    for lead in leads:
+        best.setdefault(lead.names, lead)
     return list(best.values())
 
 
-def _simulated(ground: Ground, found: Found, leads: Sequence[Lead]) -> list[tuple[float, CatalogueEntry, Effect]]:
-    """Score on the rows for fits, entry and effect of each lead, at the best of a few sizes."""
+def _simulated(
+    rough: Predictions, found: Found, leads: Sequence[Lead]
+) -> list[tuple[float, tuple[CatalogueEntry, ...], tuple[Effect, ...]]]:
+    """Score on the rows for fits, entries and effects of each lead beside the present set, at the best of few sizes."""
     results = []
     for lead in leads:
         best = None
-        for share in dict.fromkeys((lead.share, 0.5 * lead.share, 1.0 if lead.share > 0.0 else -1.0)):
-            effect = lead.direction.effect(share)
-            if effect.is_neutral:
-                continue
+        for factor in dict.fromkeys((1.0, 0.5, 1.0 / max(abs(share) for share in lead.shares))):
+            entries, effects = lead.beside(found.entries, found.effects, factor)
             try:
-                score = ground.rough_score((*found.effects, effect))
+                score = rough.score(effects)
             except ValueError:
                 continue
             if best is None or score > best[0]:
-                best = (score, lead.entry, effect)
+                best = (score, entries, effects)
         if best is not None:
             results.append(best)
     return results
 
 
-def _is_usable(ground: Ground, found: Found) -> bool:
-    entry, effect = found.entries[-1], found.effects[-1]
-    return not (is_negligible(effect, entry.trials) or is_outside(effect, ground.simulation.model))
+def _is_usable(ground: Ground, found: Found, before: Found) -> bool:
+    return not any(
+        is_negligible(effect, entry.trials) or is_outside(effect, ground.simulation.model)
+        for entry, effect in zip(found.entries, found.effects, strict=True)
+        if entry.name not in before.names and len(found.names - before.names) == 1
+    )
 
 
 def _most_usual(sets: Sequence[Found]) -> Found:
-    """The best set, or the most usual one of those that are not significantly worse."""
+    """The best set, or the most usual and smallest one of those that are not significantly worse."""
     best = max(sets, key=lambda one: one.scores.mean())
     alike = [one for one in sets if Difference(best.scores - one.scores).evidence < ALIKE]
-    return min([best, *alike], key=lambda one: (one.surprise, -one.scores.mean()))
+    return min([best, *alike], key=lambda one: (one.surprise, len(one.entries), -one.scores.mean()))
 
 
 def prune(ground: Ground, found: Found, level: float) -> Found:
-    """Drops effects without which the rows for selection are predicted as well, the last ones first."""
-    for index in reversed(range(len(found.entries))):
-        entries, effects = found.without(index)
-        try:
-            fewer = ground.sketched(entries, effects) if entries else ground.found((), ())
-        except ValueError:  # the model rejects the others without this one
-            continue
-        if not ground.adds(found, fewer, level):
-            found = fewer
-    return found
+    """Drops effects without which the rows for selection are predicted as well, the least needed ones first."""
+    before, kept = found, set[str]()
+    while found.names - kept and len(kept) < MOST_KEPT:
+        rough = ground.rough(found.effects)
+        estimates = [one for one in _estimates(ground.fit_part(found.effects), found) if one[0] not in kept]
+        cost = {name: ground.needed(found, Found(*found.without({name}), found.scores), level) for name, _ in estimates}
+        weak = [name for name, estimate in estimates if estimate < 0.5 * cost[name]]
+        if not weak and (open_ := [name for name, estimate in estimates if estimate < SURE * cost[name]]):
+            weak = open_[:1]
+        count = len(weak)
+        while count:
+            fewer = _fewer(ground, rough, found, weak[:count])
+            if fewer is not None and not ground.adds(found, fewer, level):
+                found = fewer
+                break
+            count //= 2
+        else:
+            if not weak:
+                break
+            kept.add(weak[0])
+    return found if found is before else ground.fitted(found.entries, found.effects)
+
+
+def _fewer(ground: Ground, rough: Predictions, found: Found, dropped: Collection[str]) -> Found | None:
+    """The set without some effects; None if the model rejects the others without these."""
+    try:
+        return ground.sketched(rough, *found.without(dropped))
+    except ValueError:
+        return None
+
+
+def _estimates(part: Predictions, found: Found) -> list[tuple[str, float]]:
+    """Effects in the order in which they may be dropped, with the estimated evidence of the rows for fits for each."""
+    variables = variables_of(part, found.entries, found.effects)
+    estimates = _gains(part, found).least_needed(variables)
+    return [(found.entries[index].name, evidence) for index, evidence in estimates]
 
 
 def replaced(
     ground: Ground, found: Found, directions: Sequence[Direction], advance: Callable[[], object]
 ) -> tuple[Found, list[list[Found]]]:
-    """Replaces effects by better or more usual ones, and lists for each effect those that explain the data as well."""
+    """Replaces effects by better or more usual ones, and lists for each effect those that explain the data as well.
+
+    The same effect on each of several joints or motors stays.
+    """
     alike: list[list[Found]] = []
     swaps = 0
     while len(alike) < len(found.entries):
         advance()
-        fewer = Found(*found.without(len(alike)), found.scores)
-        others = [
-            other
-            for other in _with_one_more(ground, fewer, directions, _names(found))
-            if _is_usable(ground, other) and Difference(found.scores - other.scores).evidence < ALIKE
+        entry, effect = found.entries[len(alike)], found.effects[len(alike)]
+        if sum(type(other) is type(effect) for other in found.effects) > 1:
+            alike.append([])
+            continue
+        fewer = ground.found(*found.without({entry.name}))
+        fitted = [
+            ground.fitted(one.entries, one.effects)
+            for one in _with_one_more(ground, fewer, directions, [frozenset({entry.name})])
+            if Difference(found.scores - one.scores).evidence < FAR
         ]
+        others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
         better = [one for one in others if _is_preferred(one, found)]
         if better and swaps < SWAPS:
-            best = _most_usual(better)
-            found, alike, swaps = ground.fitted(best.entries, best.effects), [], swaps + 1
+            found, alike, swaps = _most_usual(better), [], swaps + 1
         else:
             alike.append(sorted(others, key=lambda one: -one.scores.mean()))
     return found, alike
@@ -280,25 +398,29 @@ def search(
     Raises:
         OutOfTimeError: if the time of ``progress`` is up; the last set that ``so_far`` received is the best until then.
     """
-    entries = [entry for entry in catalogue if not entry.effect.random]
-    ground = Ground.of(simulation, measured)
-    found, directions = ground.found((), ()), []
+    every = [entry for entry in catalogue if not entry.effect.random]
+    found, directions, entries, alike = Found((), (), np.zeros(0)), [], every, []
     progress.stage(EFFECTS)
-    for _ in range(SWEEPS):
-        directions = sweep(ground.rough, entries, lambda: progress.closer(0.5 / max(1, len(entries))))
-        before, found = found, prune(ground, grow(ground, found, directions, level, so_far), level)
-        so_far(found)
-        if _names(found) == _names(before):
-            break
+    for number in range(SWEEPS):
         ground = Ground.of(simulation, measured, found.effects)
-        found = ground.fitted(found.entries, found.effects) if found.entries else ground.found((), ())
-        so_far(found)
+        found = ground.fitted(found.entries, found.effects)
+        if number > 1:
+            best = _best_of_each(_gains(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
+            chosen = found.names.union(*(lead.names for lead in best))
+            entries = [entry for entry in every if entry.name in chosen]
+        closer = partial(progress.closer, 0.5 / max(1, len(entries)))
+        directions = sweep(ground.rough(found.effects), entries, found.effects, closer)
+        before = found.names
+        found = grow(ground, found, directions, level, so_far)
+        if found.names == before:
+            found = prune(ground, found, level)
+            so_far(found)
+            found, alike = replaced(ground, found, directions, lambda: progress.closer(0.05))
+            so_far(found)
+            if found.names == before:
+                break
     progress.stage(OTHERS)
-    found, alike = replaced(ground, found, directions, lambda: progress.closer(0.1))
-    parts = [ground.model.fit, ground.model.selection]
+    model = ground.model(found.effects)
+    parts = [part.of_simulation(simulation) for part in (model.fit, model.selection)]
     fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
     return Explained(replace(found, effects=fit.effects), fit, alike)
-
-
-def _names(found: Found) -> set[str]:
-    return {entry.name for entry in found.entries}

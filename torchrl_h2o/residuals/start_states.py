@@ -21,7 +21,8 @@ TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
-NOISE_EVALUATIONS = 14
+NOISE_EVALUATIONS, FEW_EVALUATIONS = 14, 7  # evaluations of a fit of the noise, and of one for a similar simulation
+MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,7 @@ class StartStates:
         noise: the noise.
         mean: (B, rows, m).
         covariance: (B, rows, m, m).
+        slope: (B, rows before the block and in it, m, m), derivative of the coordinates one control step later.
     """
 
     record: Record
@@ -58,27 +60,44 @@ class StartStates:
     noise: Noise
     mean: np.ndarray
     covariance: np.ndarray
+    slope: np.ndarray
 
     @classmethod
-    def of(cls, record: Record, blocks: Blocks, noise: Noise | None = None) -> StartStates:
-        """Filters the log from some rows before each block to the start of its last window.
+    def of(
+        cls, record: Record, blocks: Blocks, noise: Noise | None = None, slope: np.ndarray | None = None
+    ) -> StartStates:
+        """Filters the log from some rows before each block to its end.
 
         Args:
             record: the log and the simulation.
             blocks: the blocks.
             noise: the noise; estimated from these blocks by default.
+            slope: the derivatives of a similar simulation; computed by default.
         """
-        steps = _Steps.of(record, blocks)
-        noise = steps.fitted_noise() if noise is None else noise
+        steps = _Steps.of(record, blocks, slope)
+        if noise is None:
+            noise = steps.fitted_noise(NOISE_EVALUATIONS if slope is None else FEW_EVALUATIONS)
         mean, covariance, _ = steps.filtered(noise)
         before = _rows_before(blocks)
-        return cls(record, blocks, noise, mean[:, before:], covariance[:, before:])
+        return cls(record, blocks, noise, mean[:, before:], covariance[:, before:], steps.slope)
 
     def rough(self, most: int) -> StartStates:
         """Returns the start states of at most ``most`` blocks, evenly spread, without the shortest windows."""
         some = slice(None, None, -(-len(self.blocks) // most))
         blocks = Blocks(self.blocks.first[some], self.blocks.steps, LENGTHS[-1:])
-        return StartStates(self.record, blocks, self.noise, self.mean[some], self.covariance[some])
+        return StartStates(self.record, blocks, self.noise, self.mean[some], self.covariance[some], self.slope[some])
+
+    def spread_ahead(self, windows: Windows) -> np.ndarray:
+        """Variance that the uncertain start states give the readings, (W, h, n), in squared spreads."""
+        n, doubt, found = self.record.num_readings, self.covariance[windows.block, windows.offset], []
+        first = windows.offset + _rows_before(self.blocks)
+        for step in range(windows.steps):
+            slope = self.slope[windows.block, first + step]
+            doubt = slope @ doubt @ slope.transpose(0, 2, 1)
+            doubt = _bounded(doubt, 1.0)  # an unknown coordinate is still known within its spread
+            if step + 1 in windows.horizons:
+                found.append(np.einsum("wii->wi", doubt)[:, :n])
+        return np.stack(found, axis=1)
 
     def at(self, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
         """States, (W, nq + nv), and covariances of the coordinates in spreads, (W, m, m), at the starts of windows."""
@@ -108,12 +127,12 @@ class _Steps:
     jerk: np.ndarray
 
     @classmethod
-    def of(cls, record: Record, blocks: Blocks) -> _Steps:
+    def of(cls, record: Record, blocks: Blocks, slope: np.ndarray | None = None) -> _Steps:
         measured, spread, m = record.measured, record.spread, len(record.spread)
         begins = np.empty(len(measured), int)
         for run in measured.runs:
             begins[run] = run.start
-        rows = blocks.first[:, None] + np.arange(-_rows_before(blocks), max(1, blocks.steps - LENGTHS[0] + 1))
+        rows = blocks.first[:, None] + np.arange(-_rows_before(blocks), blocks.steps)
         live = rows >= begins[blocks.first][:, None]
         rows = np.maximum(rows, begins[blocks.first][:, None])
         flat, size = rows.ravel(), rows.shape
@@ -123,18 +142,20 @@ class _Steps:
         def reached(start: np.ndarray) -> np.ndarray:
             return record.simulation.rollout(start, actions, **at)[:, 0] @ record.from_state.T / spread
 
-        base, slope = reached(states), np.empty((*size, m, m))
-        for index in range(m):
-            moved = states + NUDGE * spread[index] * record.into_state[:, index]
-            slope[..., index] = ((reached(moved) - base) / NUDGE).reshape(*size, m)
+        base = reached(states)
+        if slope is None:
+            slope = np.empty((*size, m, m))
+            for index in range(m):
+                moved = states + NUDGE * spread[index] * record.into_state[:, index]
+                slope[..., index] = ((reached(moved) - base) / NUDGE).reshape(*size, m)
         miss = (base - record.states[1][flat] @ record.from_state.T / spread).reshape(*size, m)
         known = np.asarray(np.isfinite(slope).all((2, 3)) & np.isfinite(miss).all(2))
-        slope[~known], miss[~known] = np.eye(m), 0.0
+        slope, miss = np.where(known[..., None, None], slope, np.eye(m)), np.where(known[..., None], miss, 0.0)
         third = np.abs(np.diff(record.readings[0][rows], 3, axis=1) / spread[: record.num_readings])
         jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
         return cls(record, slope, miss, live, known, jerk)
 
-    def fitted_noise(self) -> Noise:
+    def fitted_noise(self, evaluations: int) -> Noise:
         """The noise under which the next readings are most likely, as factors on :meth:`_typical_noise`."""
         typical = self._typical_noise()
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
@@ -143,7 +164,7 @@ class _Steps:
             return -self.filtered(typical.scaled(*np.exp(np.clip(x, -12.0, 6.0))), some)[2]
 
         simplex = np.array([[0.0, -0.7], [-1.0, -0.7], [0.0, -2.0]])
-        options = {"maxfev": NOISE_EVALUATIONS, "initial_simplex": simplex}
+        options = {"maxfev": evaluations, "initial_simplex": simplex}
         best = minimize(loss, simplex[0], method="Nelder-Mead", options=options)
         return typical.scaled(*np.exp(np.clip(best.x, -12.0, 6.0)))
 
@@ -187,13 +208,19 @@ class _Steps:
             count += int(valid.sum())
             # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
             trust = np.where(square > SURPRISE, square, 1.0)
-            doubt = doubt * np.where(known[:, row], trust, 1.0 / ROUNDING**2)[:, None, None]
+            doubt = _bounded(doubt * np.where(known[:, row], trust, 1.0 / ROUNDING**2)[:, None, None], MOST_DOUBT)
             gain = np.linalg.solve(doubt[:, :n, :n] + sensor, doubt[:, :n]).transpose(0, 2, 1)
             x = guess - (gain @ guess[:, :n, None])[..., 0]
             left = np.eye(m) - np.pad(gain, ((0, 0), (0, 0), (0, m - n)))
             doubt = left @ doubt @ left.transpose(0, 2, 1) + gain @ sensor @ gain.transpose(0, 2, 1)
             x[~live[:, row]], doubt[~live[:, row]] = 0.0, begin
         return mean, covariance, density / max(1, count)
+
+
+def _bounded(doubt: np.ndarray, most: float) -> np.ndarray:
+    """Covariances (B, m, m) with variances of at most ``most`` and the same correlations."""
+    shrink = np.sqrt(np.minimum(1.0, most / np.maximum(np.einsum("bii->bi", doubt), 1e-300)))
+    return doubt * shrink[:, :, None] * shrink[:, None, :]
 
 
 def _rows_before(blocks: Blocks) -> int:
