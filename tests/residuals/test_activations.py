@@ -7,8 +7,9 @@ import pytest
 from torchrl_h2o.data import audit
 from torchrl_h2o.effects import ActionSaturation, JointFrictionLoss, ResidualForce
 from torchrl_h2o.residuals import Measured, Simulation, residuals
+from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.search import search
 from torchrl_h2o.residuals.simulation.activations import activations_along
-from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 ARM = """
 <mujoco>
@@ -110,5 +111,6 @@ def test_the_audit_finds_no_lag_of_the_actions_behind_the_filter_of_a_right_mode
 def test_a_control_times_a_position_may_stand_beside_a_saturation_that_is_never_reached(tmp_path):
     simulation = Simulation.from_mjcf(write(tmp_path, ACTUATORS["none"]), ["hinge", "hinge_velocity"], 0.01)
     truth = ResidualForce(("torque on hinge: 0.1 · a0 · q",))
-    beside = find_undeclared(simulation.with_effects(ActionSaturation(9.0)), recording(simulation.with_effects(truth)))
-    assert "a0 · q" in beside.effect.describe() or "q · a0" in beside.effect.describe()
+    saturated = simulation.with_effects(ActionSaturation(9.0))
+    (force,) = search(saturated, recording(simulation.with_effects(truth)), [], progress=LoopBar(disable=True)).effects
+    assert "a0 · q" in force.describe() or "q · a0" in force.describe()

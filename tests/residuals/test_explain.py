@@ -32,7 +32,7 @@ def explained(*truth, simulation=SIMULATION, catalogue=(GRAVITY, FRICTION), rows
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     with bar or LoopBar(disable=True) as progress:
         evidence = Evidence(simulation, measured, undisturbed=measured, suspected=())
-        return explain(evidence, catalogue, rng=np.random.default_rng(0), progress=progress)
+        return explain(evidence, catalogue, progress=progress)
 
 
 @pytest.mark.slow
@@ -68,22 +68,20 @@ def test_an_error_in_the_search_leaves_what_was_found_before():
     bar = EndsBeforeAlternatives(np.linalg.LinAlgError("Singular matrix"))
     explanation = explained(Gravity(1.3), rows=1000, bar=bar)
     assert explanation.effects[0].scale == pytest.approx(1.3, rel=0.02)
-    assert "further effects of the catalogue failed: Singular matrix" in explanation.failures[0]
+    assert "further effects failed: Singular matrix" in explanation.failures[0]
 
 
 def test_what_was_found_when_the_time_was_up_is_the_explanation():
     bar = EndsBeforeAlternatives(OutOfTimeError(OTHERS))
-    explanation = explained(Gravity(1.3), RIPPLE, rows=800, noise=0.002, bar=bar)
+    explanation = explained(Gravity(1.3), rows=800, noise=0.002, bar=bar)
     assert explanation.ended_in == OTHERS
-    assert all(part.declared for part in explanation.parts)  # no force is looked for
-    assert Gravity in {type(effect) for effect in explanation.effects}
+    assert [type(effect) for effect in explanation.effects] == [Gravity]
     assert not explanation.failures
 
 
 def test_where_the_catalogue_explains_all_no_force_is_made():
     explanation = explained(Gravity(1.3), rows=800)
     assert [part.declared for part in explanation.parts] == [True]
-    assert explanation.trace.exact
 
 
 @pytest.mark.slow

@@ -57,17 +57,18 @@ def test_a_search_finds_the_true_effect_alone_with_an_interval_that_holds_it(mea
     found = []
     with LoopBar(disable=True) as bar:
         explained = search(pendulum(), measured, CATALOGUE, progress=bar, so_far=found.append)
-    (effect,), (half,) = explained.fit.effects, explained.fit.half_widths
-    assert isinstance(effect, JointFrictionLoss)
-    assert effect.torque == pytest.approx(TRUTH.torque, rel=0.1)
-    assert abs(effect.torque - TRUTH.torque) < 1.5 * half["torque"] + 1e-4
-    assert found[-1].entries == explained.found.entries
+    (part,) = explained.parts
+    assert isinstance(part.effect, JointFrictionLoss)
+    assert part.effect.torque == pytest.approx(TRUTH.torque, rel=0.1)
+    low, high = part.ci95["torque"]
+    assert low - 1e-4 < TRUTH.torque < high + 1e-4
+    assert [type(effect) for effect in found[-1].effects] == [JointFrictionLoss]
 
 
 def test_a_search_adds_nothing_where_nothing_is_missing():
     data = recorded(pendulum(), 2000, 0.01)
     with LoopBar(disable=True) as bar:
-        assert search(pendulum(), data, CATALOGUE, progress=bar).fit.effects == ()
+        assert search(pendulum(), data, CATALOGUE, progress=bar).effects == ()
 
 
 def test_a_score_that_is_no_number_is_no_evidence_of_likeness():

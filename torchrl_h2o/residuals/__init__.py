@@ -11,11 +11,10 @@ from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.simulated_transitions import simulate_transitions
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.search import search
 from torchrl_h2o.residuals.settings import LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.simulation.state_map import StateMap
-from torchrl_h2o.residuals.trace.search import trace_effects
-from torchrl_h2o.residuals.undeclared.find_force import find_undeclared
 
 __all__ = [
     "Evidence",
@@ -30,12 +29,11 @@ __all__ = [
     "estimate_states",
     "explain",
     "explainable_floor",
-    "find_undeclared",
     "gather_evidence",
     "outside_intervals",
     "outside_rows",
     "residuals",
+    "search",
     "simulate_transitions",
-    "trace_effects",
     "two_sample_auc",
 ]

@@ -8,8 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 from tensordict import TensorDictBase
@@ -25,13 +23,11 @@ from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
 from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.offered import offered_entries
-from torchrl_h2o.residuals.progress import FORCES, NOISE, REPORT, LoopBar, OutOfTimeError
+from torchrl_h2o.residuals.progress import NOISE, REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.search import search
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.outcome import Trace
-from torchrl_h2o.residuals.trace.search import trace_effects
-from torchrl_h2o.residuals.undeclared.beside_or_instead import add_undeclared_force
 
 FAILURES = (ValueError, np.linalg.LinAlgError)  # a model that rejects an effect, or singular equations
 
@@ -106,7 +102,6 @@ def close_the_loop(
             explanation = explain(
                 evidence,
                 entries,
-                rng=np.random.default_rng(seed),
                 progress=bar,
                 known=known,
                 so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
@@ -161,64 +156,46 @@ def explain(
     evidence: Evidence,
     catalogue: Sequence[CatalogueEntry],
     *,
-    rng: np.random.Generator,
     progress: LoopBar,
     known: Sequence[Effect] = (),
     so_far: Callable[[Explanation, str], object] = lambda explanation, stage: None,
     settings: LoopSettings = DEFAULTS,
 ) -> Explanation:
-    """Explains the residual: effects of the catalogue, then a force outside it, then action noise.
+    """Explains the residual: effects of the catalogue and forces outside it, then action noise.
 
     Args:
         evidence: the simulator and the data.
         catalogue: effects that the simulator may lack.
-        rng: generator for screened windows and synthetic noise.
         progress: bar that shows how far the search is, and its stage.
         known: effects from which the search begins.
         so_far: called with a preliminary explanation, as it grows, and the current stage.
-        settings: thresholds and budgets.
+        settings: significance level.
 
     Returns:
         The explanation, without any parts if nothing is missing; the one so far if the time of ``progress`` is up.
     """
     simulation, measured = evidence.simulation, evidence.undisturbed
-    options: dict[str, Any] = {"rng": rng, "progress": progress, "known": known, "settings": settings}
-
-    def further(before: Explanation, stage: str, what: str, add: Callable[..., Explanation]) -> Explanation:
-        """What a further stage makes of an explanation; the same one if the time is up."""
-        if before.ended_in is not None or progress.time_is_up:
-            return replace(before, ended_in=before.ended_in or stage)
-        so_far(before, f"{what} was looked for")
-        progress.stage(stage)
-        try:
-            return add(simulation, measured, before, settings=settings)
-        except OutOfTimeError:
-            return replace(before, ended_in=stage)
-        except FAILURES as error:  # a constant action or collinear terms make the equations of a search singular
-            return before.with_failure(f"the search for {what} failed: {error}")
-
-    declared = _by_catalogue(
-        lambda found: trace_effects(simulation, measured, catalogue, found=found, **options),
-        lambda explanation: so_far(explanation, "effects of the catalogue were tried"),
-    )
-    add_force = partial(add_undeclared_force, rng=rng, catalogue=catalogue)
-    with_force = further(declared, FORCES, "an undeclared force", add_force)
-    return further(with_force, NOISE, "action noise", add_action_noise)
-
-
-def _by_catalogue(
-    search: Callable[[Callable[[Trace], object]], Trace], so_far: Callable[[Explanation], object]
-) -> Explanation:
-    """The effects of the catalogue that a search finds; those found before it failed, with the failure recorded."""
     explanations: list[Explanation] = []
 
-    def found(trace: Trace) -> None:
-        explanations.append(Explanation.of(trace))
-        so_far(explanations[-1])
+    def better(explanation: Explanation) -> None:
+        explanations.append(explanation)
+        so_far(explanation, "effects were tried")
 
     try:
-        return Explanation.of(search(found))
+        found = search(
+            simulation, measured, catalogue, progress=progress, known=known, so_far=better, level=settings.level
+        )
     except FAILURES as error:
         if not explanations:  # the data cannot be searched at all
             raise
-        return explanations[-1].with_failure(f"the search for further effects of the catalogue failed: {error}")
+        found = explanations[-1].with_failure(f"the search for further effects failed: {error}")
+    if found.ended_in is not None or progress.time_is_up:
+        return replace(found, ended_in=found.ended_in or NOISE)
+    progress.stage(NOISE)
+    so_far(found, "action noise was looked for")
+    try:
+        return add_action_noise(simulation, measured, found, settings)
+    except OutOfTimeError:
+        return replace(found, ended_in=NOISE)
+    except FAILURES as error:  # a constant action makes the equations singular
+        return found.with_failure(f"the search for action noise failed: {error}")

@@ -20,14 +20,13 @@ from torchrl_h2o.residuals.report.contents import (
     FoundEffect,
     IndistinguishableGroup,
     Interval,
-    OtherExplanation,
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.words import UNDECLARED, effect_units, effect_words
+from torchrl_h2o.residuals.search import stop_test
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.significance import stop_test
 
 
 def compose_report(
@@ -47,7 +46,7 @@ def compose_report(
         judgement: held-out errors and tests of these effects.
         wall_s: duration of the whole run, in s.
         made_by: see :func:`~torchrl_h2o.provenance.provenance`.
-        settings: thresholds, for the description of the stop test.
+        settings: significance level, for the description of the stop test.
     """
     simulation, measured = evidence.simulation, judgement.measured
     words, units = partial(effect_words, names=simulation.names), partial(effect_units, names=simulation.names)
@@ -70,7 +69,7 @@ def compose_report(
         ),
         two_sample=judgement.two_sample,
         unexplained_intervals=_intervals(judgement),
-        stop_test=stop_test(settings),
+        stop_test=stop_test(settings.level),
         wall_s=wall_s,
         made_by=made_by or {},
         windows=judgement.windows,
@@ -81,10 +80,6 @@ def compose_report(
         failures=judgement.failures,
         ended_in=explanation.ended_in,
         left_out=judgement.left_out,
-        others=tuple(
-            OtherExplanation(rival.fit.effects, error, where, tuple(map(words, rival.fit.effects)))
-            for rival, error, where in judgement.others
-        ),
     )
 
 
@@ -129,16 +124,8 @@ def _found(explanation: Explanation, errors: Sequence[float], simulation: Simula
 
 
 def _fitted_together(explanation: Explanation) -> dict[Effect, Fitted]:
-    """Maps each alternative to the explanation refitted with it; empty if an undeclared force changed the values."""
-    trace, count = explanation.trace, len(explanation.trace.fit.effects)
-    if explanation.effects[:count] != trace.fit.effects:
-        return {}
-    further = tuple((part.effect, part.ci95) for part in explanation.parts[count:])
-    attempts = [attempt for group in trace.groups for attempt in group]
-    return {
-        attempt.effect: (*((e, attempt.fit.ci95(i)) for i, e in enumerate(attempt.fit.effects)), *further)
-        for attempt in attempts
-    }
+    """Maps each alternative to the explanation refitted with it."""
+    return {other.effect: other.together for part in explanation.parts for other in part.alike}
 
 
 def _data_summary(measured: Measured) -> DataSummary:
@@ -146,22 +133,22 @@ def _data_summary(measured: Measured) -> DataSummary:
 
 
 def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> tuple[RejectedEffect, ...]:
-    """The attempts that are not part of the explanation, each with the reason."""
-    alike = {attempt.entry.name for group in explanation.trace.groups for attempt in group}
+    """The effects that were tried and not put in, each with the reason."""
+    alike = {other.effect for part in explanation.parts for other in part.alike}
     reasons = {
         True: "explains the data as well as an effect that was put in",
         False: "explains less than an effect that was put in, or no more than chance",
     }
     return tuple(
         RejectedEffect(
-            attempt.effect,
+            tried.effect,
             error,
-            attempt.p_value,
-            reasons[attempt.entry.name in alike],
-            words(attempt.effect),
-            units(attempt.effect),
+            min(1.0, math.exp(-tried.evidence)),
+            reasons[tried.effect in alike],
+            words(tried.effect),
+            units(tried.effect),
         )
-        for attempt, error in judgement.rejected
+        for tried, error in judgement.rejected
     )
 
 

@@ -5,8 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from torchrl_h2o.effects import ActionNoise, Effect
-from torchrl_h2o.residuals.trace.outcome import Trace
+from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Effect
+
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """An effect that explains the data as well as one that was found, with the others readjusted.
+
+    Args:
+        effect: the effect.
+        together: all effects with this one in the other's place, each with its intervals.
+    """
+
+    effect: Effect
+    together: tuple[tuple[Effect, Mapping[str, Interval]], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +36,23 @@ class Part:
 
     effect: Effect
     declared: bool
-    ci95: Mapping[str, tuple[float, float]]
-    alike: tuple[Effect, ...] = ()
+    ci95: Mapping[str, Interval]
+    alike: tuple[Alternative, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """An effect that was fitted beside those found, but not put in.
+
+    Args:
+        entry: entry of the catalogue.
+        effect: the effect at its best fit.
+        evidence: evidence of the rows for fits and for selection that it adds to the others, in nats.
+    """
+
+    entry: CatalogueEntry
+    effect: Effect
+    evidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,24 +61,17 @@ class Explanation:
 
     Args:
         parts: the effects in the order of their composition; empty if nothing is missing.
-        trace: the search over the catalogue.
+        tried: effects that were not put in, those of the most evidence first.
+        unseen: effects of a usual size that the data could not have shown; only where nothing was found.
         failures: attempts that failed with an error, and why.
         ended_in: stage in which the time for the search was up, or which did not begin for that; None if all ended.
     """
 
     parts: tuple[Part, ...]
-    trace: Trace
+    tried: tuple[Tried, ...] = ()
+    unseen: tuple[Effect, ...] = ()
     failures: tuple[str, ...] = ()
     ended_in: str | None = None
-
-    @classmethod
-    def of(cls, trace: Trace) -> Explanation:
-        """The explanation by effects of the catalogue alone."""
-        parts = (
-            Part(effect, True, trace.fit.ci95(index), tuple(attempt.effect for attempt in trace.groups[index]))
-            for index, effect in enumerate(trace.fit.effects)
-        )
-        return cls(tuple(parts), trace, ended_in=trace.ended_in)
 
     def with_failure(self, failure: str) -> Explanation:
         """The explanation with a further attempt that failed."""

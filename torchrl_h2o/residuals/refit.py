@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
+from torchrl_h2o.residuals.model_bounds import lowest_value
 from torchrl_h2o.residuals.score import Predictions, fitted_scales, scores
 from torchrl_h2o.residuals.start_states import TAIL, log_density
-from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 
 STEP = 0.02  # step of the finite differences, in typical sizes of a parameter
 SMALLEST_GAIN = 1e-3  # gain of the score, in nats a row, below which a fit has converged
@@ -276,3 +276,9 @@ def _half_widths(parts: Sequence[Predictions], found: Sequence[Whitened], slopes
     bread = np.linalg.pinv(np.atleast_2d(curvature))
     spare = blocks / max(1, blocks - len(bread))
     return CONFIDENCE * np.sqrt(np.maximum(np.diag(bread @ np.atleast_2d(scatter) @ bread) * spare, 0.0))
+
+
+def interval(parameter: Parameter, half_width: float) -> tuple[float, float]:
+    """95 % interval of a fitted parameter, within its bounds."""
+    low, high = parameter.bounds
+    return float(max(low, parameter.value - half_width)), float(min(high, parameter.value + half_width))

@@ -269,8 +269,8 @@ class Model:
     def of_simulation(self, simulation: Simulation) -> Model:
         """The same blocks, predicted by a similar simulation from start states that are filtered with it."""
         record = Record(simulation, self.fit.record.measured)
-        fit = StartStates.of(record, self.fit.blocks, slope=self.fit.starts.slope)
-        selection = StartStates.of(record, self.selection.blocks, fit.noise, self.selection.starts.slope)
+        fit = StartStates.of(record, self.fit.blocks, similar=self.fit.starts)
+        selection = StartStates.of(record, self.selection.blocks, fit.noise, self.selection.starts)
         return Model(replace(self.fit, starts=fit), replace(self.selection, starts=selection))
 
     def scores(self, effects: Sequence[Effect] = ()) -> np.ndarray:

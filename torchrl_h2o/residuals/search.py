@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry, Effect, is_negligible
+from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce, is_negligible
+from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import is_outside, surprise
+from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
+from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.progress import EFFECTS, OTHERS, LoopBar
-from torchrl_h2o.residuals.refit import SetFit, fit_set, slopes_of, variables_of
+from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
+from torchrl_h2o.residuals.refit import fit_set, interval, slopes_of, variables_of
 from torchrl_h2o.residuals.score import Difference, Model, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -29,22 +32,39 @@ GROWN = 5  # steps of the fit of a set after an effect was added
 REFITTED = 3  # fits of a set, each from the start states that the fit before gives
 SWEEPS = 6  # largest number of sweeps
 NATS_OF_SURPRISE = 2.0  # evidence that an effect needs for each degree of surprise
-FAR = 40.0  # evidence, in nats, against a set after a few steps of a fit, beyond which it is not fitted further
 ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
-MANY = 2  # joints or motors with an effect beside which a further one needs no evidence
+MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
+ONE_MORE = 1.0  # that evidence
+SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
 MOST_KEPT = 3  # effects that were needed when they were dropped, after which no more are
 MOST_REFUSED = 9  # candidates that are refused one after another before none is added
 SWAPS = 4  # largest number of effects that are replaced by others
+MOST_TERMS = 6  # largest number of terms of a force outside the catalogue
 MOST_EFFECTS = 80  # largest number of entries in a set
 
 
+def stop_test(level: float) -> str:
+    """Description of the test by which the search for effects stops."""
+    return (
+        "log density of rows that no fit has used, predicted 1, 2, 4, ... rows ahead: a further effect must raise it, "
+        f"paired over blocks of rows, by a likelihood ratio of {1.0 / level:.0f}, and more if it is unusual"
+    )
+
+
 def surprise_of(effects: Iterable[Effect]) -> int:
-    """How unusual effects are in all: the most unusual of each kind counts, because joints resemble each other."""
+    """How unusual effects are in all: the most unusual of each kind counts, because joints resemble each other.
+
+    Each term of a force that no effect of the catalogue describes counts by itself.
+    """
     most: dict[type, int] = {}
+    forces = 0
     for effect in effects:
-        most[type(effect)] = max(surprise(effect), most.get(type(effect), 0))
-    return sum(most.values())
+        if isinstance(effect, ResidualForce):
+            forces += SURPRISE_OF_FORCE * len(effect.terms)
+        else:
+            most[type(effect)] = max(surprise(effect), most.get(type(effect), 0))
+    return sum(most.values()) + forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,40 +162,44 @@ class Ground:
                 break
         return found
 
-    def sketched(self, rough: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
-        """A set with its values fitted to rough predictions, in a few steps."""
-        return self.found(entries, fit_set([rough], entries, effects, most_steps=SKETCH).effects if entries else ())
+    def sketched(self, part: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+        """A set with its values fitted to predictions, such as rough ones, in a few steps."""
+        return self.found(entries, fit_set([part], entries, effects, most_steps=SKETCH).effects if entries else ())
 
     def needed(self, more: Found, less: Found, level: float) -> float:
         """Evidence that a larger set needs: a significant one, and more for unusual effects.
 
-        What most joints have, such as friction, further ones have too: these need no evidence of their own.
+        What several joints have, such as friction, further ones have too: these need hardly any evidence.
         """
         kinds = [type(effect) for effect in less.effects]
         added = [
             effect for entry, effect in zip(more.entries, more.effects, strict=True) if entry.name not in less.names
         ]
         if all(kinds.count(type(effect)) >= MANY for effect in added):
-            return 0.0
+            return ONE_MORE
         return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(level)
 
     def evidence(self, more: Found, less: Found) -> float:
         """Evidence of the rows for selection that one set predicts better than another."""
-        return Difference(more.scores[self.num_fit :] - less.scores[self.num_fit :]).evidence
+        return Difference((more.scores - less.scores)[self.num_fit :]).evidence
 
-    def adds(self, more: Found, less: Found, level: float) -> bool:
-        """Whether a set predicts the rows for selection better than a smaller one, by more than its surprise.
+    def adds(self, more: Found, less: Found, level: float, among: int = 1) -> bool:
+        """Whether a set predicts better than a smaller one, by more than its surprise.
+
+        Rows for selection must show half of the evidence needed, and all rows must show all of it, and more where the
+        set is the best of many.
 
         Noise in the commands moves the simulator and not the machine, and over many steps an effect predicts better
         that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
         effect must therefore predict the next step better, too.
         """
         needed = self.needed(more, less, level)
-        if self.evidence(more, less) <= needed:
+        in_all = Difference(more.scores - less.scores).evidence
+        if self.evidence(more, less) <= 0.5 * needed or in_all <= needed + math.log(among):
             return False
         if more.one_step is None or less.one_step is None:
             return True
-        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(level))
+        return Difference(more.one_step - less.one_step).evidence > 0.5 * min(needed, -math.log(level))
 
 
 def grow(
@@ -184,14 +208,18 @@ def grow(
     directions: Sequence[Direction],
     level: float,
     advance: Callable[[Found], object],
+    tried: dict[str, Tried],
 ) -> Found:
     """Adds candidates one after another while the rows for selection are predicted better."""
     refused: set[frozenset[str]] = set()
+    among = max(1, len({one.entry.name for one in directions}))
     while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
         fitted = _with_one_more(ground, found, directions, refused, -math.log(level))
         if not fitted:
             break
-        better = [one for one in fitted if ground.adds(one, found, level)]
+        for one in fitted:
+            _remember(tried, one, found)
+        better = [one for one in fitted if ground.adds(one, found, level, among)]
         if better:
             best = _most_usual(better)
             many = len(best.entries) > len(found.entries) + 2
@@ -201,6 +229,37 @@ def grow(
                 break
         else:
             refused |= {one.names - found.names for one in fitted}
+    return found
+
+
+def _remember(tried: dict[str, Tried], more: Found, less: Found) -> None:
+    """Keeps an effect that was fitted beside others, with its evidence."""
+    added = [pair for pair in zip(more.entries, more.effects, strict=True) if pair[0].name not in less.names]
+    if len(added) == 1 and not isinstance(added[0][1], ResidualForce):
+        tried[added[0][0].name] = Tried(*added[0], Difference(more.scores - less.scores).evidence)
+
+
+def with_force(
+    ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], level: float, advance: Callable[[Found], object]
+) -> Found:
+    """Adds terms of a force outside the catalogue while the rows for selection are predicted better."""
+    for _ in range(MOST_TERMS):
+        starts = ground.model(found.effects).fit.starts
+        rows, states = starts.of_rows
+        rough = ground.rough(found.effects)
+        simulation = starts.record.simulation
+        scored = []
+        for entry, effect in force_candidates(simulation, starts.record.measured, states, rows, catalogue):
+            if entry.name not in found.names:
+                scored.append((rough.score((*found.effects, effect)), entry, effect))
+        best = sorted(scored, key=lambda one: -one[0])[:FITTED]
+        fitted = [ground.sketched(rough, (*found.entries, e), (*found.effects, effect)) for _, e, effect in best]
+        better = [one for one in fitted if ground.adds(one, found, level, max(1, len(scored)))]
+        if not better:
+            break
+        best_one = _most_usual(better)
+        found = ground.fitted(best_one.entries, best_one.effects)
+        advance(found)
     return found
 
 
@@ -289,8 +348,8 @@ def _most_usual(sets: Sequence[Found]) -> Found:
 def prune(ground: Ground, found: Found, level: float) -> Found:
     """Drops effects without which the rows for selection are predicted as well, the least needed ones first."""
     before, kept = found, set[str]()
+    found = _without_needless_kinds(ground, found, level)
     while found.names - kept and len(kept) < MOST_KEPT:
-        rough = ground.rough(found.effects)
         estimates = [one for one in _estimates(ground.fit_part(found.effects), found) if one[0] not in kept]
         cost = {name: ground.needed(found, Found(*found.without({name}), found.scores), level) for name, _ in estimates}
         weak = [name for name, estimate in estimates if estimate < 0.5 * cost[name]]
@@ -298,7 +357,7 @@ def prune(ground: Ground, found: Found, level: float) -> Found:
             weak = open_[:1]
         count = len(weak)
         while count:
-            fewer = _fewer(ground, rough, found, weak[:count])
+            fewer = _fewer(ground, found, weak[:count])
             if fewer is not None and not ground.adds(found, fewer, level):
                 found = fewer
                 break
@@ -310,10 +369,21 @@ def prune(ground: Ground, found: Found, level: float) -> Found:
     return found if found is before else ground.fitted(found.entries, found.effects)
 
 
-def _fewer(ground: Ground, rough: Predictions, found: Found, dropped: Collection[str]) -> Found | None:
+def _without_needless_kinds(ground: Ground, found: Found, level: float) -> Found:
+    """Drops an effect on all of its joints or motors if the rows for selection are predicted as well without it."""
+    for kind in dict.fromkeys(map(type, found.effects)):
+        same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if type(effect) is kind}
+        if len(same) > 1:
+            fewer = _fewer(ground, found, same)
+            if fewer is not None and not ground.adds(found, fewer, level):
+                found = fewer
+    return found
+
+
+def _fewer(ground: Ground, found: Found, dropped: Collection[str]) -> Found | None:
     """The set without some effects; None if the model rejects the others without these."""
     try:
-        return ground.sketched(rough, *found.without(dropped))
+        return ground.sketched(ground.fit_part(found.effects), *found.without(dropped))
     except ValueError:
         return None
 
@@ -344,7 +414,7 @@ def replaced(
         fitted = [
             ground.fitted(one.entries, one.effects)
             for one in _with_one_more(ground, fewer, directions, [frozenset({entry.name})])
-            if Difference(found.scores - one.scores).evidence < FAR
+            if 2.0 * (one.scores - fewer.scores).mean() > (found.scores - fewer.scores).mean()
         ]
         others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
         better = [one for one in others if _is_preferred(one, found)]
@@ -356,24 +426,10 @@ def replaced(
 
 
 def _is_preferred(other: Found, found: Found) -> bool:
-    """Whether a set explains the data better than another, or as well and by more usual effects."""
+    """Whether a set explains the data better than another, or as well and by fewer or more usual effects."""
     evidence = Difference(other.scores - found.scores).evidence
-    return evidence > ALIKE or (evidence > -ALIKE and other.surprise < found.surprise)
-
-
-@dataclass(frozen=True, eq=False)
-class Explained:
-    """Result of a search.
-
-    Args:
-        found: the set of effects.
-        fit: its values, fitted to the rows for fits and for selection, with intervals.
-        alike: for each effect, the sets that explain the data as well with another effect in its place, at their end.
-    """
-
-    found: Found
-    fit: SetFit
-    alike: Sequence[Sequence[Found]]
+    simpler = (other.surprise, len(other.entries)) < (found.surprise, len(found.entries))
+    return evidence > ALIKE or (evidence > -ALIKE and simpler)
 
 
 def search(
@@ -382,45 +438,165 @@ def search(
     catalogue: Sequence[CatalogueEntry],
     *,
     progress: LoopBar,
-    so_far: Callable[[Found], object] = lambda found: None,
+    known: Sequence[Effect] = (),
+    so_far: Callable[[Explanation], object] = lambda found: None,
     level: float = DEFAULTS.level,
-) -> Explained:
-    """Searches the effects of a catalogue with which a simulator predicts the data best.
+) -> Explanation:
+    """Searches the effects with which a simulator predicts the data best.
 
     Args:
         simulation: the simulator.
         measured: the data.
         catalogue: effects that the simulator may lack; random ones are left out, because noise is part of the score.
+            Forces that are none of them are tried as well, but need more evidence.
         progress: bar that shows how far the search is.
-        so_far: called with each better set.
+        known: effects of the catalogue from which the search begins.
+        so_far: called with each better explanation.
         level: significance level at which an effect is added.
 
+    Returns:
+        The explanation, with the values fitted to the rows for fits and for selection; the one so far if the time of
+        ``progress`` is up.
+
     Raises:
-        OutOfTimeError: if the time of ``progress`` is up; the last set that ``so_far`` received is the best until then.
+        OutOfTimeError: if the time of ``progress`` is up before there is a first result.
     """
-    every = [entry for entry in catalogue if not entry.effect.random]
-    found, directions, entries, alike = Found((), (), np.zeros(0)), [], every, []
+    tried: dict[str, Tried] = {}
+    latest = [_known(catalogue, known)]
+
+    def better(found: Found) -> None:
+        latest.append(found)
+        if found.entries:
+            progress.has_result()
+        progress.show_found(found.entries)
+        so_far(_explanation(found))
+
+    ended_in, unseen, alike = None, (), []
     progress.stage(EFFECTS)
+    ground = Ground.of(simulation, measured, latest[0].effects)
+    try:
+        ground, alike, unseen = _searched(ground, latest[0], catalogue, level, progress, better, tried)
+    except OutOfTimeError as end:
+        ended_in = str(end)
+    found = latest[-1]
+    progress.begin_last_fit(bool(found.entries))
+    try:
+        explanation = _explanation(*_with_intervals(ground, found), alike)
+    except OutOfTimeError as end:
+        explanation, ended_in = _explanation(found), ended_in or str(end)
+    left = [one for name, one in tried.items() if name not in found.names]
+    left.sort(key=lambda one: -one.evidence)
+    return replace(explanation, tried=tuple(left), unseen=unseen, ended_in=ended_in)
+
+
+def _known(catalogue: Sequence[CatalogueEntry], known: Sequence[Effect]) -> Found:
+    pairs = [(entry_of(effect, catalogue), effect) for effect in known if not effect.random]
+    there = [(entry, effect) for entry, effect in pairs if entry is not None]
+    return Found(tuple(entry for entry, _ in there), tuple(effect for _, effect in there), np.zeros(0))
+
+
+def _searched(
+    ground: Ground,
+    found: Found,
+    catalogue: Sequence[CatalogueEntry],
+    level: float,
+    progress: LoopBar,
+    better: Callable[[Found], object],
+    tried: dict[str, Tried],
+) -> tuple[Ground, list[list[Found]], tuple[Effect, ...]]:
+    """Sweeps and grows, then drops and replaces, until nothing changes; hands each better set to ``better``."""
+    every = [entry for entry in catalogue if not entry.effect.random]
+    entries, directions, alike, unseen = every, [], [], ()
+    measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
-        ground = Ground.of(simulation, measured, found.effects)
+        if number:
+            ground = Ground.of(ground.simulation, measured, found.effects)
         found = ground.fitted(found.entries, found.effects)
         if number > 1:
             best = _best_of_each(_gains(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
             chosen = found.names.union(*(lead.names for lead in best))
             entries = [entry for entry in every if entry.name in chosen]
         closer = partial(progress.closer, 0.5 / max(1, len(entries)))
-        directions = sweep(ground.rough(found.effects), entries, found.effects, closer)
+        rough = ground.rough(found.effects)
+        directions = sweep(rough, entries, found.effects, closer)
+        if not number and not found.entries:
+            unseen = _unseen(ground, rough, every, directions, level)
         before = found.names
-        found = grow(ground, found, directions, level, so_far)
+        found = grow(ground, found, directions, level, better, tried)
         if found.names == before:
+            progress.stage(FORCES)
+            found = with_force(ground, found, every, level, better)
+            if before and found.names != before:  # a force alone may explain what effects were found for
+                alone = with_force(ground, ground.found((), ()), every, level, lambda _: None)
+                if alone.entries and _is_preferred(alone, found):
+                    found = alone
+                    better(found)
+        if found.names == before:
+            progress.stage(OTHERS)
             found = prune(ground, found, level)
-            so_far(found)
+            better(found)
             found, alike = replaced(ground, found, directions, lambda: progress.closer(0.05))
-            so_far(found)
+            better(found)
             if found.names == before:
                 break
-    progress.stage(OTHERS)
+    return ground, alike, () if found.entries else unseen
+
+
+def _unseen(
+    ground: Ground,
+    rough: Predictions,
+    entries: Sequence[CatalogueEntry],
+    directions: Sequence[Direction],
+    level: float,
+) -> tuple[Effect, ...]:
+    """Effects at their largest trials that these data would not show, the first of each kind before the others."""
+    gains = _gains(rough, Found((), (), np.zeros(0)))
+    seen: dict[str, float] = {entry.name: 0.0 for entry in entries}
+    largest: dict[str, Effect] = {entry.name: entry.starts[-1] for entry in entries}
+    blocks = len(ground.base.selection.blocks) / len(rough.blocks)
+    for direction in directions:
+        evidence = blocks * gains.evidence_if_there(direction)
+        if evidence > seen[direction.entry.name]:
+            seen[direction.entry.name] = evidence
+            largest[direction.entry.name] = direction.entry.effect.with_parameters(direction.trial)
+    needed = {name: NATS_OF_SURPRISE * surprise(effect) - math.log(level) for name, effect in largest.items()}
+    missed = sorted((name for name in seen if seen[name] < needed[name]), key=lambda name: -seen[name])
+    effects = [largest[name] for name in missed]
+    first = {type(effect): effect for effect in reversed(effects)}
+    return tuple(sorted(effects, key=lambda effect: effect is not first[type(effect)]))
+
+
+def _with_intervals(ground: Ground, found: Found) -> tuple[Found, Sequence[Mapping[str, float]]]:
+    """A set fitted to the rows for fits and for selection, and the half-widths of its intervals."""
     model = ground.model(found.effects)
-    parts = [part.of_simulation(simulation) for part in (model.fit, model.selection)]
+    parts = [part.of_simulation(ground.simulation) for part in (model.fit, model.selection)]
     fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
-    return Explained(replace(found, effects=fit.effects), fit, alike)
+    return replace(found, effects=fit.effects), fit.half_widths
+
+
+def _explanation(
+    found: Found, half_widths: Sequence[Mapping[str, float]] = (), alike: Sequence[Sequence[Found]] = ()
+) -> Explanation:
+    """The explanation by a set; the terms of forces are put together, at its end."""
+    parts, forces = [], []
+    for index, effect in enumerate(found.effects):
+        half = half_widths[index] if half_widths else {}
+        ci95 = {name: interval(effect.parameters[name], width) for name, width in half.items()}
+        if isinstance(effect, ResidualForce):
+            forces.append((effect, ci95))
+            continue
+        others = alike[index] if index < len(alike) else ()
+        parts.append(Part(effect, True, ci95, tuple(map(_alternative, others))))
+    if forces:
+        terms = tuple(term for effect, _ in forces for term in effect.terms)
+        ci95 = {
+            f"{name.rsplit('_', 1)[0]}_{index}": ends
+            for index, (_, own) in enumerate(forces, start=1)
+            for name, ends in own.items()
+        }
+        parts.append(Part(ResidualForce(terms), False, ci95))
+    return Explanation(tuple(parts))
+
+
+def _alternative(other: Found) -> Alternative:
+    return Alternative(other.effects[-1], tuple((effect, {}) for effect in other.effects))

@@ -21,7 +21,9 @@ TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
-NOISE_EVALUATIONS, FEW_EVALUATIONS = 14, 7  # evaluations of a fit of the noise, and of one for a similar simulation
+NOISE_EVALUATIONS = 18
+MOST_FACTOR = 12.0  # largest logarithm of a factor on the typical noise
+USUAL_FACTORS = np.array([0.0, -0.7])
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
 
 
@@ -53,6 +55,7 @@ class StartStates:
         mean: (B, rows, m).
         covariance: (B, rows, m, m).
         slope: (B, rows before the block and in it, m, m), derivative of the coordinates one control step later.
+        factors: logarithms of the two factors of the fit of the noise.
     """
 
     record: Record
@@ -61,10 +64,11 @@ class StartStates:
     mean: np.ndarray
     covariance: np.ndarray
     slope: np.ndarray
+    factors: np.ndarray
 
     @classmethod
     def of(
-        cls, record: Record, blocks: Blocks, noise: Noise | None = None, slope: np.ndarray | None = None
+        cls, record: Record, blocks: Blocks, noise: Noise | None = None, similar: StartStates | None = None
     ) -> StartStates:
         """Filters the log from some rows before each block to its end.
 
@@ -72,20 +76,30 @@ class StartStates:
             record: the log and the simulation.
             blocks: the blocks.
             noise: the noise; estimated from these blocks by default.
-            slope: the derivatives of a similar simulation; computed by default.
+            similar: start states of a similar simulation in these blocks, whose derivatives are used.
         """
-        steps = _Steps.of(record, blocks, slope)
+        steps = _Steps.of(record, blocks, None if similar is None else similar.slope)
+        factors = USUAL_FACTORS
         if noise is None:
-            noise = steps.fitted_noise(NOISE_EVALUATIONS if slope is None else FEW_EVALUATIONS)
+            noise, factors = steps.fitted_noise(None if similar is None else similar.factors)
         mean, covariance, _ = steps.filtered(noise)
         before = _rows_before(blocks)
-        return cls(record, blocks, noise, mean[:, before:], covariance[:, before:], steps.slope)
+        return cls(record, blocks, noise, mean[:, before:], covariance[:, before:], steps.slope, factors)
 
     def rough(self, most: int) -> StartStates:
         """Returns the start states of at most ``most`` blocks, evenly spread, without the shortest windows."""
         some = slice(None, None, -(-len(self.blocks) // most))
         blocks = Blocks(self.blocks.first[some], self.blocks.steps, LENGTHS[-1:])
-        return StartStates(self.record, blocks, self.noise, self.mean[some], self.covariance[some], self.slope[some])
+        mean, covariance, slope = self.mean[some], self.covariance[some], self.slope[some]
+        return StartStates(self.record, blocks, self.noise, mean, covariance, slope, self.factors)
+
+    @property
+    def of_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rows of all blocks, (W), and the states of the log, (T, nq + nv), filtered in these rows."""
+        record, rows = self.record, self.blocks.first[:, None] + np.arange(self.blocks.steps)
+        states = record.states[0].copy()
+        states[rows] += (self.mean * record.spread) @ record.into_state.T
+        return rows.ravel(), states
 
     def spread_ahead(self, windows: Windows) -> np.ndarray:
         """Variance that the uncertain start states give the readings, (W, h, n), in squared spreads."""
@@ -155,18 +169,27 @@ class _Steps:
         jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
         return cls(record, slope, miss, live, known, jerk)
 
-    def fitted_noise(self, evaluations: int) -> Noise:
-        """The noise under which the next readings are most likely, as factors on :meth:`_typical_noise`."""
+    def fitted_noise(self, factors: np.ndarray | None) -> tuple[Noise, np.ndarray]:
+        """The noise under which the next readings are most likely, and its two factors on :meth:`_typical_noise`.
+
+        Args:
+            factors: logarithms of the factors of a similar simulation, from which the fit may begin.
+        """
         typical = self._typical_noise()
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
 
-        def loss(x: np.ndarray) -> float:
-            return -self.filtered(typical.scaled(*np.exp(np.clip(x, -12.0, 6.0))), some)[2]
+        def noise(x: np.ndarray) -> Noise:
+            return typical.scaled(*np.exp(np.clip(x, -MOST_FACTOR, 0.5 * MOST_FACTOR)))
 
-        simplex = np.array([[0.0, -0.7], [-1.0, -0.7], [0.0, -2.0]])
-        options = {"maxfev": evaluations, "initial_simplex": simplex}
-        best = minimize(loss, simplex[0], method="Nelder-Mead", options=options)
-        return typical.scaled(*np.exp(np.clip(best.x, -12.0, 6.0)))
+        def loss(x: np.ndarray) -> float:
+            return -self.filtered(noise(x), some)[2]
+
+        begins = [USUAL_FACTORS] if factors is None else [USUAL_FACTORS, factors]
+        begin = min(begins, key=loss) if len(begins) > 1 else USUAL_FACTORS
+        simplex = begin + np.array([[0.0, 0.0], [-0.7, 0.0], [0.0, -0.7]])
+        options = {"maxfev": NOISE_EVALUATIONS, "initial_simplex": simplex, "xatol": 0.1, "fatol": 0.01}
+        best = minimize(loss, begin, method="Nelder-Mead", options=options).x
+        return noise(best), best
 
     def _typical_noise(self) -> Noise:
         """Noise of the sensors by the products of successive misses, and the size of the misses.

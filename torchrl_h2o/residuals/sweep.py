@@ -23,12 +23,12 @@ from torchrl_h2o.effects import (
     JointRange,
     ObservationDelay,
 )
+from torchrl_h2o.residuals.elements import elements
+from torchrl_h2o.residuals.model_bounds import lowest_value
 from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, flat, weights, whitened
 from torchrl_h2o.residuals.score import FEWEST, Difference, Predictions, fitted_scales
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import log_density
-from torchrl_h2o.residuals.trace.families import elements
-from torchrl_h2o.residuals.trace.model_bounds import lowest_value
 
 #: effects that act otherwise at each size, so that every trial is simulated
 NOT_LINEAR = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay)
@@ -296,6 +296,10 @@ class Gains:
         shares, _ = self._solved(chosen, columns)
         shares = np.where(np.abs(shares) < START_SHARE, START_SHARE, shares)
         return self._lead(tuple(chosen), tuple(map(float, shares)), np.stack(columns, axis=1) @ shares)
+
+    def evidence_if_there(self, direction: Direction) -> float:
+        """Evidence of the rows for an effect if it were there at its trial beside the present errors."""
+        return -self._evidence(direction.change * self.inverse)
 
     def least_needed(self, variables: Sequence[Variable]) -> list[tuple[int, float]]:
         """Present effects in the order in which they may be dropped, with the evidence for each beside the later ones.

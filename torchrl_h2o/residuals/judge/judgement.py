@@ -12,14 +12,13 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, is_negligible
 from torchrl_h2o.residuals.evidence import Evidence
-from torchrl_h2o.residuals.explanation import Explanation, adds_noise
+from torchrl_h2o.residuals.explanation import Alternative, Explanation, Tried, adds_noise
 from torchrl_h2o.residuals.judge.caveats import undetermined_values
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error, with_floor, with_horizons
 from torchrl_h2o.residuals.judge.run_errors import run_errors
-from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
+from torchrl_h2o.residuals.judge.separation import separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
-from torchrl_h2o.residuals.judge.undetectable import undetectable_effects
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -33,7 +32,6 @@ from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.outcome import Attempt, RivalSet
 
 MAX_REJECTED = 30  # largest number of rejected effects in the report
 # share of the held-out error that an effect which was not put in must leave at most to be named all the same
@@ -72,7 +70,6 @@ class Judgement:
         runs: error of each run.
         verdict: what these figures say.
         failures: attempts that failed with an error, and why.
-        others: error and separating data of each other set of effects that explains the data as well.
         left_out: parts that were not computed because the time was up, in words.
     """
 
@@ -80,7 +77,7 @@ class Judgement:
     disturbed: tuple[OutsideInterval, ...]
     error: ErrorSummary | None
     errors_after: tuple[float, ...]
-    rejected: tuple[tuple[Attempt, float], ...]
+    rejected: tuple[tuple[Tried, float], ...]
     alternatives: tuple[Alternatives, ...]
     two_sample: TwoSample
     trace: ResidualTrace | None
@@ -88,7 +85,6 @@ class Judgement:
     runs: tuple[RunError, ...]
     verdict: Verdict
     failures: tuple[str, ...] = ()
-    others: tuple[tuple[RivalSet, float, str], ...] = ()
     left_out: tuple[str, ...] = ()
 
 
@@ -132,18 +128,11 @@ def judge(
     if verdict.kind == NOTHING_MISSING and (explanation.ended_in is not None or progress.left_out):
         verdict = replace(verdict, kind=UNDECIDED)
     if verdict.kind == NOTHING_MISSING and not explanation.failures:
-        one_more = partial(progress.closer, 1.0 / max(1, len(catalogue)))
-        unseen = optional(
-            "effects that the data could not have shown",
-            lambda: undetectable_effects(simulation, measured, catalogue, one_more, settings),
-            (),
-        )
-        verdict = replace(verdict, undetectable=tuple(effect_words(effect, simulation.names) for effect in unseen))
+        unseen = tuple(effect_words(effect, simulation.names) for effect in explanation.unseen)
+        verdict = replace(verdict, undetectable=unseen)
     details = _details(simulation, mended, measured, explanation, error, progress, settings)
     if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None and error is not None:
-        rejected, loss = details["rejected"], explanation.trace.loss
-        too_few = too_few_rows(simulation, measured, rejected, error, loss)
-        verdict = replace(verdict, too_few=too_few)
+        verdict = replace(verdict, too_few=too_few_rows(simulation, measured, details["rejected"], error))
     return Judgement(
         measured=measured,
         disturbed=tuple(disturbed),
@@ -168,7 +157,6 @@ def _details(
     unknown = (math.nan,) * len(effects)
     errors_after = optional("errors of each effect", lambda: _errors_after(simulation, effects, measured), unknown)
     alternatives = optional("errors of alternatives", lambda: _all_alternatives(simulation, measured, explanation), ())
-    others = optional("other sets", lambda: _others(simulation, mended, measured, explanation), ())
     if error is not None:
         error = optional("errors ahead", partial(with_horizons, error, simulation, mended, measured, settings), error)
         error = optional("the floor", partial(with_floor, error, mended, measured), error)
@@ -183,7 +171,6 @@ def _details(
         "error": error,
         "errors_after": errors_after,
         "alternatives": alternatives,
-        "others": others,
         "windows": windows,
         "runs": runs,
         "trace": trace,
@@ -217,23 +204,21 @@ def _errors_after(simulation: Simulation, effects: tuple[Effect, ...], measured:
 def too_few_rows(
     simulation: Simulation,
     measured: Measured,
-    rejected: Sequence[tuple[Attempt, float]],
+    rejected: Sequence[tuple[Tried, float]],
     error: ErrorSummary,
-    loss: float,
 ) -> str:
     """An effect that was not put in although it clearly lowers the error on data that chose nothing, in words.
 
     The catalogue may then explain what is missing, and only the part of the data by which effects are chosen is too
-    short for the tests. It has to lower the loss there as well: otherwise the two parts contradict each other.
+    short for the tests. It has to predict that part better as well: otherwise the two contradict each other.
 
     Args:
         simulation: the simulator without effects.
         measured: the data.
         rejected: attempts, and the error with each of them alone.
         error: the error without them.
-        loss: the loss without them on the part by which effects are chosen.
     """
-    rejected = [(attempt, after) for attempt, after in rejected if attempt.loss < LOWERS_MUCH * loss]
+    rejected = [(attempt, after) for attempt, after in rejected if attempt.evidence > 0.0]
     attempt, after = min(rejected, key=lambda pair: (np.isnan(pair[1]), pair[1]), default=(None, math.nan))
     if attempt is None or not after < LOWERS_MUCH * error.before:
         return ""
@@ -263,12 +248,10 @@ def _without_noise(effects: tuple[Effect, ...]) -> list[Effect]:
 
 def _rejected(
     simulation: Simulation, measured: Measured, explanation: Explanation
-) -> tuple[tuple[tuple[Attempt, float], ...], tuple[str, ...]]:
+) -> tuple[tuple[tuple[Tried, float], ...], tuple[str, ...]]:
     """The attempts that are not part of the explanation, with the error of each alone; and those that failed."""
-    trace = explanation.trace
-    found = {entry.name for entry in trace.entries}
-    sized = [attempt for attempt in trace.attempts if not is_negligible(attempt.effect, attempt.entry.trials)]
-    listed = [attempt for attempt in sized[:MAX_REJECTED] if attempt.entry.name not in found]
+    sized = [attempt for attempt in explanation.tried if not is_negligible(attempt.effect, attempt.entry.trials)]
+    listed = sized[:MAX_REJECTED]
     rejected, failures = [], []
     for attempt in listed:
         try:
@@ -294,25 +277,15 @@ def _alternatives(
     measured: Measured,
     effects: tuple[Effect, ...],
     index: int,
-    others: tuple[Effect, ...],
+    others: tuple[Alternative, ...],
 ) -> Alternatives:
-    """An effect and its alternatives, each judged together with the remaining effects."""
-    alike, before, after = (effects[index], *others), effects[:index], effects[index + 1 :]
-    errors = (overall_error(simulation.with_effects(*before, other, *after), measured) for other in alike)
+    """An effect and its alternatives, each judged together with the remaining effects as they were fitted with it."""
+    before, after = effects[:index], effects[index + 1 :]
+    sets = [_without_noise(effects), *([effect for effect, _ in other.together] for other in others)]
+    errors = (overall_error(simulation.with_effects(*one), measured) for one in sets)
+    alike = (effects[index], *(other.effect for other in others))
     where = separated_by(simulation, measured, alike, _without_noise(before), _without_noise(after))
     return Alternatives(alike, tuple(errors), where)
-
-
-def _others(
-    simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation
-) -> tuple[tuple[RivalSet, float, str], ...]:
-    """Error of each other set of effects, and the data that would distinguish it from the effects found."""
-    others = []
-    for rival in explanation.trace.others:
-        other = simulation.with_effects(*rival.fit.effects)
-        where = difference_between((mended, other), measured)
-        others.append((rival, overall_error(other, measured), where))
-    return tuple(others)
 
 
 def _two_sample(

@@ -7,13 +7,12 @@ import numpy as np
 from torchrl_h2o.residuals.measured.constant_velocity import NEGLIGIBLE_ERROR
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
+from torchrl_h2o.residuals.measured.significance import WORST, p_value_of_losses
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.errors import HeadlineError
 from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.problem import WORST
-from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
 FAR_WINDOWS = 8  # smallest number of windows by which the error far ahead is judged
 WORSE = 1.1  # factor on the median error of a quantity above which the effects make it worse

@@ -20,6 +20,7 @@ from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.missing_force import LESS_FORCE, MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
+from torchrl_h2o.residuals.measured.significance import WORST, p_value_of_losses
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED,
@@ -34,8 +35,6 @@ from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.problem import WORST
-from torchrl_h2o.residuals.trace.significance import p_value_of_losses
 
 # held-out AUC above which a classifier tells measured from simulated; noise and contacts alone give up to 0.56
 TELLING_AUC = 0.65

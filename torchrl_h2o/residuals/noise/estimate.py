@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_std, stand_in
+from torchrl_h2o.residuals.measured.significance import p_value
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.noise.scatter import Scatter
 from torchrl_h2o.residuals.noise.variances import BLOCKS, fitted_variances, log_likelihood
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.trace.significance import p_value
 
 MIN_SHARE = 1e-3  # smallest reported standard deviation, as a share of the control range
 # largest plausible standard deviation, in RMS of the actions; larger estimates come from filtered sensors

@@ -28,7 +28,7 @@ def lowest_value(effect: Effect, model: mujoco.MjModel, others: Iterable[Effect]
     Examples:
         >>> import mujoco
         >>> from torchrl_h2o.effects import JointDamping
-        >>> from torchrl_h2o.residuals.trace.model_bounds import lowest_value
+        >>> from torchrl_h2o.residuals.model_bounds import lowest_value
         >>> body = '<body><joint name="hip" damping="0.5"/><geom size="1"/></body>'
         >>> model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
         >>> lowest_value(JointDamping(), model)

@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import JointForce
-from torchrl_h2o.residuals.undeclared.inverse_force import force_response, residual_forces, step_path
+from torchrl_h2o.residuals.forces.inverse_force import force_response, residual_forces, step_path
 
 
 def test_constant_force_is_read_back():

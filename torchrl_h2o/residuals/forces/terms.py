@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 
 from torchrl_h2o.effects.force.residual_force import DegreeOfFreedom, coordinate
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
-from torchrl_h2o.residuals.undeclared.inverse_force import StepPath
+from torchrl_h2o.residuals.forces.inverse_force import StepPath
 
 NEGLIGIBLE = 1e-9  # relative spread or norm at which a coordinate or column counts as constant
 # largest number of periods over the range of a position; faster waves cannot be distinguished from noise

@@ -12,18 +12,7 @@ from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 
 MAX_RATIO = 100.0  # largest factor that a single block may contribute to the third test's likelihood ratio
 LOSS_FLOOR = 1e-6  # smallest typical loss of a block, as a share of the mean loss
-BEYOND_NOISE = 4.0  # required multiple of the gain of the same addition in synthetic data with sensor noise only
-
-
-def stop_test(settings: LoopSettings) -> str:
-    """Description of the test by which the search for effects stops."""
-    return (
-        "one-sided tests (Student's t, Wilcoxon's signed ranks, and a likelihood ratio for heavy-tailed residuals) on "
-        f"the held-out loss, paired over {settings.blocks} blocks of neighbouring windows, at a nominal level of "
-        f"{100.0 * settings.level:g} % divided by the number of effects tried; where sensors are noisy, an effect must "
-        f"also explain {BEYOND_NOISE:g} times the share of the loss that it explains in data with "
-        "sensor noise alone"
-    )
+WORST = 1e3  # bound on a scaled residual, also used where the simulation diverges
 
 
 def p_value(gain: np.ndarray, settings: LoopSettings = DEFAULTS) -> float:

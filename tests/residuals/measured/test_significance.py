@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from torchrl_h2o.residuals.trace.significance import p_value, p_value_of_losses
+from torchrl_h2o.residuals.measured.significance import p_value, p_value_of_losses
 
 
 def noise(seed, windows=300, memory=0.0):

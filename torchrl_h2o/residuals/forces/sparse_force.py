@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import f
 
 from torchrl_h2o.effects.force.term import ForceTerm
-from torchrl_h2o.residuals.undeclared.terms import NEGLIGIBLE, Factors, TermLibrary
+from torchrl_h2o.residuals.forces.terms import NEGLIGIBLE, Factors, TermLibrary
 
 DEPENDENT = 1e-12  # square of a unit column's part beside the chosen ones up to which it depends on them
 MAX_TERMS = 3  # largest number of terms on one degree of freedom per round

@@ -1,1 +1,0 @@
-"""Search for effects of the catalogue that explain the residual: screening, fits, tests, alternatives."""

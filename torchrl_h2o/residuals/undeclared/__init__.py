@@ -1,1 +1,0 @@
-"""Forces outside the catalogue: inverse dynamics of the residual, sparse regression, and the comparison."""
