@@ -56,12 +56,12 @@ def rank(pair: Pair) -> dict:
     simulation, begin = pair.simulation, time.process_time()
     measured = Measured.from_ted(pair.data, simulation)
     sets = (pair.right, pair.wrong)
-    models = [Ground.of(simulation, measured, effects).model for effects in sets]
+    models = [Ground.of(simulation, measured, effects).base for effects in sets]
     # windows count as little as the more alike errors of the two sets make them
     counts = tuple(np.minimum(*both) for both in zip(*(model.fit.counts for model in models), strict=True))
     models = [Model(*(replace(part, counts=counts) for part in (model.fit, model.selection))) for model in models]
     filtered = time.process_time()
-    right, wrong = (model.scores(effects) for model, effects in zip(models, sets, strict=True))
+    right, wrong = (model.scores() for model in models)
     scored = time.process_time()
     difference = Difference(right - wrong)
     prior = _prior(pair.right) - _prior(pair.wrong)

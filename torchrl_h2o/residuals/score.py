@@ -281,10 +281,6 @@ class Model:
         """
         return self._scored(tuple(effects))[0]
 
-    def on_selection(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        """Scores of the blocks for selection, (S), with effects added."""
-        return self.scores(effects)[len(self.fit.blocks) :]
-
     def one_step_ahead(self, effects: Sequence[Effect] = ()) -> np.ndarray | None:
         """Score of the blocks for selection one step ahead, (S), with effects added.
 

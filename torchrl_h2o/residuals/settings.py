@@ -15,25 +15,15 @@ class LoopSettings:
     """
 
     level: float = 0.01
-    """Significance level of a whole search; a search over a catalogue divides it by the number of entries."""
+    """Inverse of the likelihood ratio that the rows for selection must show for an effect; level of the other tests."""
     blocks: int = 30
     """Blocks of neighbouring windows that the paired tests treat as independent."""
     horizons: tuple[int, ...] = (1, 2, 5, 10, 20, 50)
     """Control steps ahead at which errors are reported."""
     window_seconds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-    """Window lengths that the search chooses from, in s, ascending; one control step is always among them."""
+    """Times ahead of which the verdict takes the longest that the data allow, in s, ascending."""
     max_windows: int = 3500
-    """Largest number of windows in a fit or a judgement; more are slower and hardly more precise."""
-    screened_steps: int = 400
-    """Control steps, over all windows, on which entries of the catalogue are screened."""
-    fitted_steps: int = 1200
-    """Control steps, over all windows, in a fit during the search."""
-    max_evaluations: int = 25
-    """Evaluations of the residual in a full fit, finite differences not counted."""
-    max_effects: int = 6
-    """Largest number of effects in one explanation; the same effect on each of several joints counts as one."""
-    rounds: int = 3
-    """Largest number of rounds of growing and simplifying."""
+    """Largest number of windows in a judgement; more are slower and hardly more precise."""
     classifier_updates: int = 600
     """Updates of the discriminators in the two-sample test."""
 

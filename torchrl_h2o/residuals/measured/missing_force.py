@@ -29,7 +29,6 @@ RESTING_SHARE = 0.1  # share of a joint's usual speed below which it counts as r
 LEAST_MOVING = 50  # smallest number of windows in which a joint moves in one direction for the others to be left out
 LEAST_ROWS = 200  # smallest number of rows
 
-SMALL = 0.02  # share of a missing force that the means over windows may make up
 LOWER = 0.95  # factor on a missing force below which it falls; chance alone changes it less
 _MEDIAN_OF_NORMAL = 0.6745  # median size of a normal number, in its standard deviation
 _WITHOUT_CONTACTS = (mujoco.mjtConstraint.mjCNSTR_EQUALITY, mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
@@ -187,10 +186,6 @@ class MissingForces:
         floor = 1e-3 * max(self.before.max(), self.after.max(), 1e-12)
         before = np.maximum(self.before, np.minimum(2.0 * self.by_noise, self.after))
         return (self.after + floor) / (before + floor)
-
-    def hardly_any(self, share: float = SMALL) -> bool:
-        """Whether noise explains about what is missing with the effects, or it is a small share of that without."""
-        return bool((self.after <= np.maximum(2.0 * self.by_noise, share * self.before)).all())
 
     def rise_by(self, factor: float) -> bool:
         """Whether the effects raise one force by more than a factor, and do not lower the others as much.

@@ -149,11 +149,6 @@ class Measured:
         return len(self.observation)
 
     @property
-    def no_noise(self) -> np.ndarray:
-        """Standard deviation of the readings' noise, (n), of sensors without noise: zeros."""
-        return np.zeros(self.observation.shape[1])
-
-    @property
     def held_out(self) -> np.ndarray:
         """Mask, (T), of the transitions on which errors are reported."""
         return self.split == Split.REPORT

@@ -1,0 +1,100 @@
+"""A search finds what each joint lacks together, replaces what explains less, and takes no noise for an effect."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import double_pendulum, recorded
+from torchrl_h2o.effects import (
+    ActionBias,
+    ActionDelay,
+    ActionGain,
+    Armature,
+    BodyMass,
+    Gravity,
+    JointDamping,
+    JointFrictionLoss,
+    ResidualForce,
+)
+from torchrl_h2o.residuals import search
+from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.search import surprise_of
+
+SIMULATION = double_pendulum()
+KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
+CATALOGUE = [entry for entry in SIMULATION.catalogue() if isinstance(entry.effect, KINDS)]
+EACH_JOINT = (
+    *(JointFrictionLoss(0.03, "shoulder"), JointFrictionLoss(0.01, "elbow")),
+    *(JointDamping(0.02, "shoulder"), JointDamping(0.006, "elbow")),
+    *(Armature(0.01, "shoulder"), Armature(0.002, "elbow")),
+)
+
+
+def found(measured, catalogue=CATALOGUE, known=()):
+    return search(SIMULATION, measured, catalogue, progress=LoopBar(disable=True), known=known)
+
+
+def values(effects):
+    return {
+        (type(effect).__name__, getattr(effect, "joints", None)): next(iter(effect.parameters.values())).value
+        for effect in effects
+    }
+
+
+@pytest.mark.slow
+def test_what_each_joint_lacks_is_found_with_a_delay_beside_it():
+    truth = (*EACH_JOINT, ActionDelay(0.008))
+    explanation = found(recorded(SIMULATION.with_effects(*truth), 2500, noise=0.001))
+    assert values(explanation.effects) == pytest.approx(values(truth), rel=0.1)
+
+
+def test_the_same_friction_in_all_joints_is_one_effect():
+    (part,) = found(recorded(SIMULATION.with_effects(JointFrictionLoss(0.02)), 1200)).parts
+    assert part.effect.joints == "*"
+    assert part.effect.torque == pytest.approx(0.02, rel=0.02)
+
+
+def test_noise_of_the_logged_torques_is_no_friction():
+    """It moves the simulator and not the machine, so what makes the simulator deaf to it predicts far ahead better."""
+    measured = recorded(SIMULATION, 2000, noise=1e-4)
+    noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
+    assert found(replace(measured, action=measured.action + noise)).effects == ()
+
+
+@pytest.mark.slow
+def test_a_force_outside_the_catalogue_stands_beside_its_effects():
+    ripple = ResidualForce("torque on shoulder: 0.1 · sin(6 q)")
+    explanation = found(recorded(SIMULATION.with_effects(Gravity(1.2), ripple), 2500))
+    gravity, force = explanation.parts
+    assert (gravity.declared, force.declared) == (True, False)
+    assert gravity.effect.scale == pytest.approx(1.2, rel=0.02)
+    assert force.effect.parameters["frequency_1"].value == pytest.approx(6.0, rel=0.02)
+
+
+def test_a_search_goes_on_from_known_effects():
+    truth = (Gravity(1.3), ActionDelay(0.013))
+    explanation = found(recorded(SIMULATION.with_effects(*truth), 1200), known=[Gravity(1.25)])
+    assert values(explanation.effects) == pytest.approx(values(truth), rel=0.01)
+
+
+def test_what_was_tried_and_not_put_in_is_listed_by_its_evidence():
+    tried = found(recorded(SIMULATION.with_effects(Gravity(1.3)), 1200)).tried
+    evidence = [one.evidence for one in tried]
+    assert evidence == sorted(evidence, reverse=True)
+    assert not any(isinstance(one.effect, Gravity) for one in tried)
+
+
+def test_effects_of_a_size_that_no_row_shows_are_listed_where_nothing_is_found():
+    """Noise of a third of the motion hides dry friction of a usual size; without noise all effects would show."""
+    still = recorded(SIMULATION, 1200, noise=0.3)
+    kinds = {type(effect) for effect in found(still).unseen}
+    assert JointFrictionLoss in kinds
+    assert not found(recorded(SIMULATION, 1200)).unseen
+
+
+def test_the_most_unusual_of_a_kind_counts_and_each_term_of_a_force():
+    assert surprise_of([JointFrictionLoss(0.1, "shoulder"), ActionBias(0.1)]) == 0
+    assert surprise_of([BodyMass(1.1, "upper"), BodyMass(1.2, "lower")]) == surprise_of([BodyMass(1.1, "upper")]) == 1
+    one, two = (ResidualForce(("torque on elbow: 0.1 · t",) * n) for n in (1, 2))
+    assert 0 < surprise_of([one]) < surprise_of([two])
