@@ -19,7 +19,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.search import surprise_of
+from torchrl_h2o.residuals.search import Found, Ground, surprise_of
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -60,6 +60,17 @@ def test_noise_of_the_logged_torques_is_no_friction():
     measured = recorded(SIMULATION, 2000, noise=1e-4)
     noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
     assert found(replace(measured, action=measured.action + noise)).effects == ()
+
+
+def test_what_predicts_the_next_row_worse_is_not_added_where_the_motion_is_noisier_than_the_sensors():
+    ground = Ground.of(SIMULATION, recorded(SIMULATION, 800, noise=1e-4))
+    blocks = np.arange(ground.num_fit + len(ground.base.selection.blocks)) % 7
+    entry = CATALOGUE[0]
+    less = Found((), (), 0.01 * blocks, blocks[ground.num_fit :])
+    more = Found((entry,), (entry.starts[0],), 5.0 + 0.1 * blocks, less.one_step - 1.0)
+    assert not ground.adds(more, less, 0.01)
+    assert ground.adds(replace(more, one_step=None), less, 0.01)
+    assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less, 0.01)
 
 
 @pytest.mark.slow

@@ -248,13 +248,16 @@ def with_force(
         rows, states = starts.of_rows
         rough = ground.rough(found.effects)
         simulation = starts.record.simulation
-        scored = []
-        for entry, effect in force_candidates(simulation, starts.record.measured, states, rows, catalogue):
-            if entry.name not in found.names:
-                scored.append((rough.score((*found.effects, effect)), entry, effect))
-        best = sorted(scored, key=lambda one: -one[0])[:FITTED]
-        fitted = [ground.sketched(rough, (*found.entries, e), (*found.effects, effect)) for _, e, effect in best]
-        better = [one for one in fitted if ground.adds(one, found, level, max(1, len(scored)))]
+        sets = []
+        for pairs in force_candidates(simulation, starts.record.measured, states, rows, catalogue):
+            new = [pair for pair in pairs if pair[0].name not in found.names]
+            if new:
+                entries = (*found.entries, *(entry for entry, _ in new))
+                effects = (*found.effects, *(effect for _, effect in new))
+                sets.append((rough.score(effects), entries, effects))
+        best = sorted(sets, key=lambda one: -one[0])[:FITTED]
+        fitted = [ground.sketched(rough, entries, effects) for _, entries, effects in best]
+        better = [one for one in fitted if ground.adds(one, found, level, max(1, len(sets)))]
         if not better:
             break
         best_one = _most_usual(better)

@@ -39,7 +39,7 @@ def force_candidates(
     states: np.ndarray,
     rows: np.ndarray,
     catalogue: Sequence[CatalogueEntry] = (),
-) -> list[tuple[CatalogueEntry, Effect]]:
+) -> list[tuple[tuple[CatalogueEntry, Effect], ...]]:
     """Regresses the forces that the simulator lacks on a library of terms, for each degree of freedom alone.
 
     Args:
@@ -47,10 +47,10 @@ def force_candidates(
         measured: the data.
         states: start states, (T, nq + nv).
         rows: (W), the transitions.
-        catalogue: effects that are tried anyway; a term that is one of them is left out.
+        catalogue: effects that are tried anyway; a term that is one of them is no candidate by itself.
 
     Returns:
-        An entry and an effect for each term.
+        Candidates, each one or several entries with their effects: each term, and all terms on a degree of freedom.
     """
     rows = rows[:: 1 + len(rows) // ROWS]
     residual = residuals(simulation, measured, rows, states=states)[:, 0]
@@ -59,21 +59,21 @@ def force_candidates(
     path = step_path(simulation, measured, rows, states=states)
     observed = cast("np.ndarray", simulation.state_map.restore.any(1))
     bent = bent_controls(simulation, measured.action[rows])
-    terms = [
-        term
-        for freedom in degrees_of_freedom(simulation.model)
-        for term in sparse_force(
-            TermLibrary(freedom, path, observed, bent),
-            forces.force[:, freedom.velocity],
-            forces.weight[:, freedom.velocity],
-        ).terms
-    ]
-    named = [effect_of_term(term) for term in terms]
-    return [
-        force_entry(ResidualForce((str(term),)))
-        for term, effect in zip(terms, named, strict=True)
-        if effect is None or entry_of(effect, catalogue) is None
-    ]
+    candidates = []
+    for freedom in degrees_of_freedom(simulation.model):
+        library = TermLibrary(freedom, path, observed, bent)
+        terms = sparse_force(library, forces.force[:, freedom.velocity], forces.weight[:, freedom.velocity]).terms
+        together = tuple(_entry_of_term(term, catalogue) for term in terms)
+        candidates += [(one,) for one in together if isinstance(one[1], ResidualForce)]
+        candidates += [together] if len(together) > 1 else []
+    return candidates
+
+
+def _entry_of_term(term: ForceTerm, catalogue: Sequence[CatalogueEntry]) -> tuple[CatalogueEntry, Effect]:
+    """The entry and the effect of the catalogue that a term is, or those of a force."""
+    effect = effect_of_term(term)
+    entry = None if effect is None else entry_of(effect, catalogue)
+    return force_entry(ResidualForce((str(term),))) if effect is None or entry is None else (entry, effect)
 
 
 def force_entry(force: ResidualForce) -> tuple[CatalogueEntry, ResidualForce]:
