@@ -351,6 +351,9 @@ def _most_usual(sets: Sequence[Found]) -> Found:
 def prune(ground: Ground, found: Found, level: float) -> Found:
     """Drops effects without which the rows for selection are predicted as well, the least needed ones first."""
     before, kept = found, set[str]()
+    pairs = zip(found.entries, found.effects, strict=True)
+    if idle := {entry.name for entry, effect in pairs if is_negligible(effect, entry.trials)}:
+        found = ground.found(*found.without(idle))
     found = _without_needless_kinds(ground, found, level)
     while found.names - kept and len(kept) < MOST_KEPT:
         estimates = [one for one in _estimates(ground.fit_part(found.effects), found) if one[0] not in kept]
