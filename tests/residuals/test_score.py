@@ -17,9 +17,10 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.score import Difference, Model
-from torchrl_h2o.residuals.search import Ground, search
+from torchrl_h2o.residuals.search import search
 
 TRUTH = JointFrictionLoss(0.1)
 CATALOGUE = (

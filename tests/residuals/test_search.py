@@ -18,8 +18,8 @@ from torchrl_h2o.effects import (
     ResidualForce,
 )
 from torchrl_h2o.residuals import search
+from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.search import Found, Ground, surprise_of
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)

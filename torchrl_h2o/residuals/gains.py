@@ -1,0 +1,226 @@
+"""What each candidate of a sweep could gain beside the present effects, by linear algebra."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from torchrl_h2o.effects import Armature, CatalogueEntry, Effect, JointDamping, JointFrictionLoss
+from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, weights, whitened
+from torchrl_h2o.residuals.score import FEWEST, Difference, Predictions, fitted_scales
+from torchrl_h2o.residuals.start_states import log_density
+from torchrl_h2o.residuals.sweep import Direction
+
+#: what every driven joint has, so that a machine may lack all of it
+OF_JOINTS = (JointFrictionLoss, JointDamping, Armature)
+START_SHARE = 0.02  # least share of a trial from which the values of every joint are fitted together
+LEAST_NATS = 2.0  # estimated gain of all blocks with which one of several joints or motors has an effect of its own
+
+
+@dataclass(frozen=True)
+class Lead:
+    """A candidate with its estimated gain: one effect, or the same effect on each of several joints or motors.
+
+    Args:
+        directions: the direction of each effect.
+        shares: estimated share of each trial.
+        gain: estimated gain of the score in nats a block, if the errors are linear in the effect.
+        evidence: estimated evidence of the rows for the candidate.
+    """
+
+    directions: tuple[Direction, ...]
+    shares: tuple[float, ...]
+    gain: float
+    evidence: float
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the entries."""
+        return frozenset(direction.entry.name for direction in self.directions)
+
+    def beside(
+        self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], factor: float
+    ) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
+        """Present entries and effects with the candidate at a factor of its shares.
+
+        Effects on each of several joints take the place of present ones of the same kind, and begin at their values.
+        """
+        own = [direction.effect(factor * share) for direction, share in zip(self.directions, self.shares, strict=True)]
+        kept = list(zip(entries, effects, strict=True))
+        if len(own) > 1:
+            kinds = {type(one) for one in own}
+            alone = {entry.name for entry, _ in kept if entry.name in self.names}
+            for entry, effect in kept:
+                own = [
+                    _sum(one, effect)
+                    if type(one) is type(effect) and (entry.name == d.entry.name or entry.name not in alone)
+                    else one
+                    for d, one in zip(self.directions, own, strict=True)
+                ]
+            kept = [pair for pair in kept if type(pair[1]) not in kinds]
+        return (
+            (*(entry for entry, _ in kept), *(direction.entry for direction in self.directions)),
+            (*(effect for _, effect in kept), *own),
+        )
+
+
+def _sum(effect: Effect, present: Effect) -> Effect:
+    """An effect of one parameter with that of another one of its kind in it."""
+    values = {}
+    for name, parameter in effect.parameters.items():
+        other = present.parameters[name].value
+        value = parameter.value * other if parameter.neutral == 1.0 else parameter.value + other - parameter.neutral
+        values[name] = float(np.clip(value, *parameter.bounds))
+    return effect.with_parameters(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """Gains of candidates beside effects that are readjusted, for the errors at hand.
+
+    Args:
+        white: whitened errors, (N).
+        inverse: inverse scales of the errors, (N).
+        share: shares of the errors in the score, (N).
+        beside: changes by the values of the present effects, whitened, (N, p).
+        block: index of the block of each error, (N).
+    """
+
+    white: np.ndarray
+    inverse: np.ndarray
+    share: np.ndarray
+    beside: np.ndarray
+    block: np.ndarray
+
+    @classmethod
+    def of(cls, predictions: Predictions, errors: Sequence[np.ndarray], beside: Sequence[np.ndarray]) -> Gains:
+        """Prepares the gains for errors (as :meth:`Predictions.errors`), beside changes (N) of present effects."""
+        white, inverse, share = whitened(predictions, errors, fitted_scales(predictions, errors))
+        columns = np.stack([change * inverse for change in beside], 1) if beside else np.zeros((len(white), 0))
+        return cls(white, inverse, share, columns, block_of(predictions))
+
+    def leads(self, directions: Sequence[Direction]) -> list[Lead]:
+        """The candidates in descending order of their gain: each direction, and those of each kind together."""
+        columns = self._free_of_present(directions)
+        found = [lead for one, column in zip(directions, columns, strict=True) if (lead := self._alone(one, column))]
+        kinds: dict[tuple, dict[str, int]] = {}
+        for index, one in enumerate(directions):
+            if one.element is not None:
+                kinds.setdefault((type(one.entry.effect), one.sign), {}).setdefault(one.entry.name, index)
+        for own in (list(members.values()) for members in kinds.values()):
+            if len(own) > 1 and (lead := self._together([directions[i] for i in own], [columns[i] for i in own])):
+                found.append(lead)
+        return sorted(found, key=lambda lead: -lead.gain)
+
+    def of_joints(self, directions: Sequence[Direction]) -> Lead | None:
+        """Friction, damping and rotor of every joint together; None if the sweep has none."""
+        own = {
+            one.entry.name: one for one in directions if type(one.entry.effect) in OF_JOINTS and one.element is not None
+        }
+        chosen = [one for one in own.values() if one.sign]
+        if len(chosen) < 2:
+            return None
+        columns = self._free_of_present(chosen)
+        shares, _ = self._solved(chosen, columns)
+        shares = np.where(np.abs(shares) < START_SHARE, START_SHARE, shares)
+        return self._lead(tuple(chosen), tuple(map(float, shares)), np.stack(columns, axis=1) @ shares)
+
+    def evidence_if_there(self, direction: Direction) -> float:
+        """Evidence of the rows for an effect if it were there at its trial beside the present errors."""
+        return -self._evidence(direction.change * self.inverse)
+
+    def least_needed(self, variables: Sequence[Variable]) -> list[tuple[int, float]]:
+        """Present effects in the order in which they may be dropped, with the evidence for each beside the later ones.
+
+        The others are readjusted; the errors are taken as linear in all variables.
+        """
+        moves = np.array([one.to_neutral for one in variables])
+        weight = self.share * weights(self.white)
+        gram = self.beside.T @ (weight[:, None] * self.beside)
+        inverse = np.linalg.pinv(gram + np.diag(RIDGE * np.diag(gram) + 1e-12))
+        of_effect: dict[int, list[int]] = {}
+        for index, one in enumerate(variables):
+            of_effect.setdefault(one.effect, []).append(index)
+        found: list[tuple[int, float]] = []
+        dropped: list[int] = []
+        before = np.zeros(len(self.white))
+        while of_effect:
+
+            def lost(effect: int, dropped: Sequence[int] = tuple(dropped)) -> float:
+                own = [*dropped, *of_effect[effect]]
+                with np.errstate(invalid="ignore"):
+                    loss = moves[own] @ np.linalg.pinv(inverse[np.ix_(own, own)]) @ moves[own]
+                return float(loss) if math.isfinite(loss) else math.inf
+
+            effect = min(of_effect, key=lost)
+            own = [*dropped, *of_effect[effect]]
+            if not np.isfinite(moves[own]).all():
+                found += [(other, math.inf) for other in of_effect]
+                break
+            change = self.beside @ (inverse[:, own] @ (np.linalg.pinv(inverse[np.ix_(own, own)]) @ moves[own]))
+            found.append((effect, -self._evidence(change, before)))
+            dropped, before = own, change
+            del of_effect[effect]
+        return found
+
+    def _free_of_present(self, directions: Sequence[Direction]) -> list[np.ndarray]:
+        """Whitened changes, each after the present effects have been readjusted."""
+        weight, found = self.share * weights(self.white), []
+        weighted = weight[:, None] * self.beside
+        gram = weighted.T @ self.beside
+        solve = np.linalg.pinv(gram + 1e-9 * np.diag(np.diag(gram))) if len(gram) else gram
+        for direction in directions:
+            column = direction.change * self.inverse
+            found.append(column - self.beside @ (solve @ (weighted.T @ column)) if len(gram) else column)
+        return found
+
+    def _alone(self, direction: Direction, column: np.ndarray) -> Lead | None:
+        weight = self.share * weights(self.white)
+        best = -(weight * self.white) @ column / max((weight * column) @ column, 1e-300)
+        low, high = direction.shares
+        shares = [
+            float(np.clip(share, low, high)) for share in (best, 2.0 * best, 0.5 * best, math.copysign(1.0, best))
+        ]
+        gains = [self._gain(share * column) for share in shares]
+        most = int(np.argmax(gains))
+        return self._lead((direction,), (shares[most],), shares[most] * column) if gains[most] > 0.0 else None
+
+    def _together(self, directions: Sequence[Direction], columns: Sequence[np.ndarray]) -> Lead | None:
+        """Directions of one kind, each with a share of its own, as far as they gain something."""
+        shares, gram = self._solved(directions, columns)
+        lost = 0.5 * shares**2 / np.diag(np.linalg.pinv(gram + 1e-12 * np.eye(len(gram))))  # without each, in nats
+        acting = np.flatnonzero(lost > LEAST_NATS).tolist()
+        if len(acting) < len(columns):
+            kept = [directions[i] for i in acting], [columns[i] for i in acting]
+            return self._together(*kept) if len(acting) > 1 else None
+        return self._lead(tuple(directions), tuple(map(float, shares)), np.stack(columns, axis=1) @ shares)
+
+    def _solved(self, directions: Sequence[Direction], columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The shares with the best score, within their bounds, and the curvature of the score."""
+        matrix = np.stack(columns, axis=1)
+        low, high = np.transpose([one.shares for one in directions])
+        shares, moved, gram = np.zeros(len(columns)), self.white, np.eye(len(columns))
+        for _ in range(REWEIGHTED):
+            root = np.sqrt(self.share * weights(moved))
+            scaled = root[:, None] * matrix
+            gram = scaled.T @ scaled
+            factor = np.linalg.cholesky(gram + np.diag(RIDGE * np.diag(gram) + 1e-12)).T
+            pull = -scaled.T @ (root * self.white)
+            shares = lsq_linear(factor, np.linalg.solve(factor.T, pull), bounds=(low, np.maximum(high, low + 1e-9))).x
+            moved = self.white + matrix @ shares
+        return shares, gram
+
+    def _lead(self, directions: tuple[Direction, ...], shares: tuple[float, ...], change: np.ndarray) -> Lead:
+        return Lead(directions, shares, self._gain(change) / (self.block.max() + 1), self._evidence(change))
+
+    def _gain(self, change: np.ndarray) -> float:
+        return float((log_density(self.white + change) - log_density(self.white)) @ self.share)
+
+    def _evidence(self, change: np.ndarray, before: np.ndarray | float = 0.0) -> float:
+        by_error = (log_density(self.white + change) - log_density(self.white + before)) * self.share
+        difference = Difference(np.bincount(self.block, by_error))
+        return difference.evidence if difference.acting >= FEWEST else float(difference.by_block.sum())

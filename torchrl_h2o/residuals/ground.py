@@ -1,0 +1,177 @@
+"""Sets of effects with their scores, and the ground on which they are compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
+from torchrl_h2o.effects.catalogue.plausibility import surprise
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.refit import fit_set
+from torchrl_h2o.residuals.score import Difference, Model, Predictions
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+
+ROUGH_STEPS = 2560  # physics steps that are simulated for each candidate of a sweep and in first fits
+ROUGH_ROWS = 1024  # rows beyond which these are not more
+FITTED = 3  # of these, the best whose values are fitted
+SKETCH = 3  # steps of such a fit
+GROWN = 5  # steps of the fit of a set after an effect was added
+REFITTED = 3  # fits of a set, each from the start states that the fit before gives
+NATS_OF_SURPRISE = 2.0  # evidence that an effect needs for each degree of surprise
+MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
+ONE_MORE = 1.0  # that evidence
+SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
+
+
+def surprise_of(effects: Iterable[Effect]) -> int:
+    """How unusual effects are in all: the most unusual of each kind counts, because joints resemble each other.
+
+    Each term of a force that no effect of the catalogue describes counts by itself.
+    """
+    most: dict[type, int] = {}
+    forces = 0
+    for effect in effects:
+        if isinstance(effect, ResidualForce):
+            forces += SURPRISE_OF_FORCE * len(effect.terms)
+        else:
+            most[type(effect)] = max(surprise(effect), most.get(type(effect), 0))
+    return sum(most.values()) + forces
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A set of effects with its score.
+
+    Args:
+        entries: entries of the catalogue.
+        effects: the effects with their values.
+        scores: scores of the blocks for fits and of those for selection, (F + S).
+        one_step: scores of the blocks for selection one step ahead, (S), if they tell more than the sensors' noise.
+    """
+
+    entries: tuple[CatalogueEntry, ...]
+    effects: tuple[Effect, ...]
+    scores: np.ndarray
+    one_step: np.ndarray | None = None
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the entries."""
+        return frozenset(entry.name for entry in self.entries)
+
+    @property
+    def surprise(self) -> int:
+        """How unusual the effects are in all; see :func:`surprise_of`."""
+        return surprise_of(self.effects)
+
+    def without(self, names: Collection[str]) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
+        """Entries and effects without some of them."""
+        kept = [pair for pair in zip(self.entries, self.effects, strict=True) if pair[0].name not in names]
+        return tuple(entry for entry, _ in kept), tuple(effect for _, effect in kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Compares sets, each by predictions from start states that are filtered with this set.
+
+    Args:
+        simulation: the simulator without effects.
+        base: predictions of a set near those to compare, whose derivatives the filters of all sets use.
+    """
+
+    simulation: Simulation
+    base: Model
+    _models: dict[tuple[Effect, ...], Model] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, simulation: Simulation, measured: Measured, effects: Sequence[Effect] = ()) -> Ground:
+        """The ground near a set of effects."""
+        model = Model.of(simulation.with_effects(*effects), measured)
+        counts = model.fit.effective_counts(model.fit.errors())
+        base = Model(replace(model.fit, counts=counts), replace(model.selection, counts=counts))
+        return cls(simulation, base, {tuple(effects): base})
+
+    @property
+    def num_fit(self) -> int:
+        """Number of blocks for fits."""
+        return len(self.base.fit.blocks)
+
+    def model(self, effects: Sequence[Effect]) -> Model:
+        """Predictions from start states filtered with effects."""
+        key = tuple(effects)
+        if key not in self._models:
+            while len(self._models) > 2 * FITTED:
+                del self._models[next(iter(self._models))]
+            self._models[key] = self.base.of_simulation(self.simulation.with_effects(*key))
+        return self._models[key]
+
+    def fit_part(self, effects: Sequence[Effect]) -> Predictions:
+        """Predictions of the simulator without effects, on the rows for fits, from start states filtered with some."""
+        return self.model(effects).fit.of_simulation(self.simulation)
+
+    def rough(self, effects: Sequence[Effect]) -> Predictions:
+        """As :meth:`fit_part` in some of the blocks, without the shortest windows."""
+        part = self.model(effects).fit
+        rows = min(ROUGH_ROWS, ROUGH_STEPS // self.simulation.frame_skip)
+        rough = part.starts.rough(max(8, rows // part.blocks.steps))
+        return Predictions(rough).of_simulation(self.simulation)
+
+    def found(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+        """A set with its scores."""
+        model = self.model(effects)
+        return Found(tuple(entries), tuple(effects), model.scores(), model.one_step_ahead())
+
+    def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+        """A set with its values fitted from the present ones."""
+        found = self.found(entries, effects)
+        for _ in range(REFITTED if entries else 0):
+            fit = fit_set([self.fit_part(found.effects)], entries, found.effects, most_steps=GROWN)
+            other = self.found(entries, fit.effects)
+            gain = other.scores[: self.num_fit].mean() - found.scores[: self.num_fit].mean()
+            found = other if gain > 0.0 else found
+            if gain < 0.01 * len(self.simulation.state_map.names):
+                break
+        return found
+
+    def sketched(self, part: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+        """A set with its values fitted to predictions, such as rough ones, in a few steps."""
+        return self.found(entries, fit_set([part], entries, effects, most_steps=SKETCH).effects if entries else ())
+
+    def needed(self, more: Found, less: Found, level: float) -> float:
+        """Evidence that a larger set needs: a significant one, and more for unusual effects.
+
+        What several joints have, such as friction, further ones have too: these need hardly any evidence.
+        """
+        kinds = [type(effect) for effect in less.effects]
+        added = [
+            effect for entry, effect in zip(more.entries, more.effects, strict=True) if entry.name not in less.names
+        ]
+        if all(kinds.count(type(effect)) >= MANY for effect in added):
+            return ONE_MORE
+        return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(level)
+
+    def evidence(self, more: Found, less: Found) -> float:
+        """Evidence of the rows for selection that one set predicts better than another."""
+        return Difference((more.scores - less.scores)[self.num_fit :]).evidence
+
+    def adds(self, more: Found, less: Found, level: float, among: int = 1) -> bool:
+        """Whether a set predicts better than a smaller one, by more than its surprise.
+
+        Rows for selection must show half of the evidence needed, and all rows must show all of it, and more where the
+        set is the best of many.
+
+        Noise in the commands moves the simulator and not the machine, and over many steps an effect predicts better
+        that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
+        effect must therefore predict the next step better, too.
+        """
+        needed = self.needed(more, less, level)
+        in_all = Difference(more.scores - less.scores).evidence
+        if self.evidence(more, less) <= 0.5 * needed or in_all <= needed + math.log(among):
+            return False
+        if more.one_step is None or less.one_step is None:
+            return True
+        return Difference(more.one_step - less.one_step).evidence > 0.5 * min(needed, -math.log(level))

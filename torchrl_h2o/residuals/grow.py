@@ -1,0 +1,175 @@
+"""Adds effects to a set: those of the catalogue that could gain most, then forces outside it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+
+from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce, is_negligible
+from torchrl_h2o.effects.catalogue.plausibility import is_outside
+from torchrl_h2o.residuals.explanation import Tried
+from torchrl_h2o.residuals.forces.candidates import force_candidates
+from torchrl_h2o.residuals.gains import Gains, Lead
+from torchrl_h2o.residuals.ground import FITTED, Found, Ground
+from torchrl_h2o.residuals.refit import slopes_of, variables_of
+from torchrl_h2o.residuals.score import Difference, Predictions
+from torchrl_h2o.residuals.sweep import Direction
+
+TRIED = 8  # candidates of the largest estimated gain whose gain is then simulated
+ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
+MOST_REFUSED = 9  # candidates that are refused one after another before none is added
+MOST_TERMS = 6  # largest number of terms of a force outside the catalogue
+MOST_EFFECTS = 80  # largest number of entries in a set
+
+
+def grow(
+    ground: Ground,
+    found: Found,
+    directions: Sequence[Direction],
+    level: float,
+    advance: Callable[[Found], object],
+    tried: dict[str, Tried],
+) -> Found:
+    """Adds candidates one after another while the rows for selection are predicted better."""
+    refused: set[frozenset[str]] = set()
+    among = max(1, len({one.entry.name for one in directions}))
+    while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
+        fitted = with_one_more(ground, found, directions, refused, -math.log(level))
+        if not fitted:
+            break
+        for one in fitted:
+            _remember(tried, one, found)
+        better = [one for one in fitted if ground.adds(one, found, level, among)]
+        if better:
+            best = most_usual(better)
+            many = len(best.entries) > len(found.entries) + 2
+            found, refused = ground.fitted(best.entries, best.effects), set()
+            advance(found)
+            if many:  # the errors now change with the candidates in other ways than at the sweep
+                break
+        else:
+            refused |= {one.names - found.names for one in fitted}
+    return found
+
+
+def _remember(tried: dict[str, Tried], more: Found, less: Found) -> None:
+    """Keeps an effect that was fitted beside others, with its evidence."""
+    added = [pair for pair in zip(more.entries, more.effects, strict=True) if pair[0].name not in less.names]
+    if len(added) == 1 and not isinstance(added[0][1], ResidualForce):
+        tried[added[0][0].name] = Tried(*added[0], Difference(more.scores - less.scores).evidence)
+
+
+def with_force(
+    ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], level: float, advance: Callable[[Found], object]
+) -> Found:
+    """Adds terms of a force outside the catalogue while the rows for selection are predicted better."""
+    for _ in range(MOST_TERMS):
+        starts = ground.model(found.effects).fit.starts
+        rows, states = starts.of_rows
+        rough = ground.rough(found.effects)
+        simulation = starts.record.simulation
+        sets = []
+        for pairs in force_candidates(simulation, starts.record.measured, states, rows, catalogue):
+            new = [pair for pair in pairs if pair[0].name not in found.names]
+            if new:
+                entries = (*found.entries, *(entry for entry, _ in new))
+                effects = (*found.effects, *(effect for _, effect in new))
+                sets.append((rough.score(effects), entries, effects))
+        best = sorted(sets, key=lambda one: -one[0])[:FITTED]
+        fitted = [ground.sketched(rough, entries, effects) for _, entries, effects in best]
+        better = [one for one in fitted if ground.adds(one, found, level, max(1, len(sets)))]
+        if not better:
+            break
+        best_one = most_usual(better)
+        found = ground.fitted(best_one.entries, best_one.effects)
+        advance(found)
+    return found
+
+
+def with_one_more(
+    ground: Ground,
+    found: Found,
+    directions: Sequence[Direction],
+    passed_over: Collection[frozenset[str]] = (),
+    least: float = 0.0,
+) -> list[Found]:
+    """The set with each of the few best candidates, whose values are fitted in a few steps."""
+    rough = ground.rough(found.effects)
+    gains = gains_beside(rough, found)
+    leads = [
+        lead
+        for lead in best_of_each(gains.leads(directions))
+        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > 0.5 * least
+    ]
+    tried = [one[1:] for one in sorted(_simulated(rough, found, leads[:TRIED]), key=lambda one: -one[0])[:FITTED]]
+    joints = gains.of_joints(directions) if leads else None
+    if joints is not None and joints.names not in passed_over and not joints.names <= found.names:
+        tried.append(joints.beside(found.entries, found.effects, 1.0))
+    fitted = []
+    for entries, effects in tried:
+        try:
+            one = ground.sketched(rough, entries, effects)
+        except ValueError:  # the model rejects the effects together
+            continue
+        if _is_usable(ground, one, found):
+            fitted.append(one)
+    return fitted
+
+
+def gains_beside(part: Predictions, found: Found) -> Gains:
+    """Gains of candidates beside a set, whose values are readjusted."""
+    errors, beside = part.errors(found.effects), []
+    if found.entries:
+        variables = variables_of(part, found.entries, found.effects)
+        beside = list(slopes_of([part], found.effects, variables, [errors])[0].T)
+    return Gains.of(part, errors, beside)
+
+
+def best_of_each(leads: Sequence[Lead]) -> list[Lead]:
+    """The best direction of each candidate, in descending order of the estimated gain."""
+    best: dict[frozenset[str], Lead] = {}
+    for lead in leads:
+        best.setdefault(lead.names, lead)
+    return list(best.values())
+
+
+def _simulated(
+    rough: Predictions, found: Found, leads: Sequence[Lead]
+) -> list[tuple[float, tuple[CatalogueEntry, ...], tuple[Effect, ...]]]:
+    """Score on the rows for fits, entries and effects of each lead beside the present set, at the best of few sizes."""
+    results = []
+    for lead in leads:
+        best = None
+        for factor in dict.fromkeys((1.0, 0.5, 1.0 / max(abs(share) for share in lead.shares))):
+            entries, effects = lead.beside(found.entries, found.effects, factor)
+            try:
+                score = rough.score(effects)
+            except ValueError:
+                continue
+            if best is None or score > best[0]:
+                best = (score, entries, effects)
+        if best is not None:
+            results.append(best)
+    return results
+
+
+def _is_usable(ground: Ground, found: Found, before: Found) -> bool:
+    return not any(
+        is_negligible(effect, entry.trials) or is_outside(effect, ground.simulation.model)
+        for entry, effect in zip(found.entries, found.effects, strict=True)
+        if entry.name not in before.names and len(found.names - before.names) == 1
+    )
+
+
+def most_usual(sets: Sequence[Found]) -> Found:
+    """The best set, or the most usual and smallest one of those that are not significantly worse."""
+    best = max(sets, key=lambda one: one.scores.mean())
+    alike = [one for one in sets if Difference(best.scores - one.scores).evidence < ALIKE]
+    return min([best, *alike], key=lambda one: (one.surprise, len(one.entries), -one.scores.mean()))
+
+
+def is_preferred(other: Found, found: Found) -> bool:
+    """Whether a set explains the data better than another, or as well and by fewer or more usual effects."""
+    evidence = Difference(other.scores - found.scores).evidence
+    simpler = (other.surprise, len(other.entries)) < (found.surprise, len(found.entries))
+    return evidence > ALIKE or (evidence > -ALIKE and simpler)

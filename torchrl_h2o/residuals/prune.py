@@ -1,0 +1,99 @@
+"""Drops effects that a set does not need, and replaces others by better or more usual ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+
+from torchrl_h2o.effects import is_negligible
+from torchrl_h2o.residuals.ground import Found, Ground
+from torchrl_h2o.residuals.grow import ALIKE, gains_beside, is_preferred, most_usual, with_one_more
+from torchrl_h2o.residuals.refit import variables_of
+from torchrl_h2o.residuals.score import Difference, Predictions
+from torchrl_h2o.residuals.sweep import Direction
+
+SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
+MOST_KEPT = 3  # effects that were needed when they were dropped, after which no more are
+SWAPS = 4  # largest number of effects that are replaced by others
+
+
+def prune(ground: Ground, found: Found, level: float) -> Found:
+    """Drops effects without which the rows for selection are predicted as well, the least needed ones first."""
+    before, kept = found, set[str]()
+    pairs = zip(found.entries, found.effects, strict=True)
+    if idle := {entry.name for entry, effect in pairs if is_negligible(effect, entry.trials)}:
+        found = ground.found(*found.without(idle))
+    found = _without_needless_kinds(ground, found, level)
+    while found.names - kept and len(kept) < MOST_KEPT:
+        estimates = [one for one in _estimates(ground.fit_part(found.effects), found) if one[0] not in kept]
+        cost = {name: ground.needed(found, Found(*found.without({name}), found.scores), level) for name, _ in estimates}
+        weak = [name for name, estimate in estimates if estimate < 0.5 * cost[name]]
+        if not weak and (open_ := [name for name, estimate in estimates if estimate < SURE * cost[name]]):
+            weak = open_[:1]
+        count = len(weak)
+        while count:
+            fewer = _fewer(ground, found, weak[:count])
+            if fewer is not None and not ground.adds(found, fewer, level):
+                found = fewer
+                break
+            count //= 2
+        else:
+            if not weak:
+                break
+            kept.add(weak[0])
+    return found if found is before else ground.fitted(found.entries, found.effects)
+
+
+def _without_needless_kinds(ground: Ground, found: Found, level: float) -> Found:
+    """Drops an effect on all of its joints or motors if the rows for selection are predicted as well without it."""
+    for kind in dict.fromkeys(map(type, found.effects)):
+        same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if type(effect) is kind}
+        if len(same) > 1:
+            fewer = _fewer(ground, found, same)
+            if fewer is not None and not ground.adds(found, fewer, level):
+                found = fewer
+    return found
+
+
+def _fewer(ground: Ground, found: Found, dropped: Collection[str]) -> Found | None:
+    """The set without some effects; None if the model rejects the others without these."""
+    try:
+        return ground.sketched(ground.fit_part(found.effects), *found.without(dropped))
+    except ValueError:
+        return None
+
+
+def _estimates(part: Predictions, found: Found) -> list[tuple[str, float]]:
+    """Effects in the order in which they may be dropped, with the estimated evidence of the rows for fits for each."""
+    variables = variables_of(part, found.entries, found.effects)
+    estimates = gains_beside(part, found).least_needed(variables)
+    return [(found.entries[index].name, evidence) for index, evidence in estimates]
+
+
+def replaced(
+    ground: Ground, found: Found, directions: Sequence[Direction], advance: Callable[[], object]
+) -> tuple[Found, list[list[Found]]]:
+    """Replaces effects by better or more usual ones, and lists for each effect those that explain the data as well.
+
+    The same effect on each of several joints or motors stays.
+    """
+    alike: list[list[Found]] = []
+    swaps = 0
+    while len(alike) < len(found.entries):
+        advance()
+        entry, effect = found.entries[len(alike)], found.effects[len(alike)]
+        if sum(type(other) is type(effect) for other in found.effects) > 1:
+            alike.append([])
+            continue
+        fewer = ground.found(*found.without({entry.name}))
+        fitted = [
+            ground.fitted(one.entries, one.effects)
+            for one in with_one_more(ground, fewer, directions, [frozenset({entry.name})])
+            if 2.0 * (one.scores - fewer.scores).mean() > (found.scores - fewer.scores).mean()
+        ]
+        others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
+        better = [one for one in others if is_preferred(one, found)]
+        if better and swaps < SWAPS:
+            found, alike, swaps = most_usual(better), [], swaps + 1
+        else:
+            alike.append(sorted(others, key=lambda one: -one.scores.mean()))
+    return found, alike
