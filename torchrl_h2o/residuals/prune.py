@@ -85,10 +85,12 @@ def replaced(
             alike.append([])
             continue
         fewer = ground.found(*found.without({entry.name}))
+        sketched = with_one_more(ground, fewer, directions, [frozenset({entry.name})])
+        sketched.sort(key=lambda one: -one.scores.mean())
         fitted = [
             ground.fitted(one.entries, one.effects)
-            for one in with_one_more(ground, fewer, directions, [frozenset({entry.name})])
-            if 2.0 * (one.scores - fewer.scores).mean() > (found.scores - fewer.scores).mean()
+            for rank, one in enumerate(sketched)
+            if not rank or 2.0 * (one.scores - fewer.scores).mean() > (found.scores - fewer.scores).mean()
         ]
         others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
         better = [one for one in others if is_preferred(one, found)]
