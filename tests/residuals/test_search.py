@@ -68,9 +68,9 @@ def test_what_predicts_the_next_row_worse_is_not_added_where_the_motion_is_noisi
     entry = CATALOGUE[0]
     less = Found((), (), 0.01 * blocks, blocks[ground.num_fit :])
     more = Found((entry,), (entry.starts[0],), 5.0 + 0.1 * blocks, less.one_step - 1.0)
-    assert not ground.adds(more, less, 0.01)
-    assert ground.adds(replace(more, one_step=None), less, 0.01)
-    assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less, 0.01)
+    assert not ground.adds(more, less)
+    assert ground.adds(replace(more, one_step=None), less)
+    assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less)
 
 
 @pytest.mark.slow

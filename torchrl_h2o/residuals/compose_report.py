@@ -20,6 +20,7 @@ from torchrl_h2o.residuals.report.contents import (
     FoundEffect,
     IndistinguishableGroup,
     Interval,
+    OtherExplanation,
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
@@ -80,6 +81,10 @@ def compose_report(
         failures=judgement.failures,
         ended_in=explanation.ended_in,
         left_out=judgement.left_out,
+        others=tuple(
+            OtherExplanation(effects, error, where, tuple(map(words, effects)))
+            for effects, error, where in judgement.others
+        ),
     )
 
 
@@ -143,7 +148,7 @@ def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> t
         RejectedEffect(
             tried.effect,
             error,
-            min(1.0, math.exp(-tried.evidence)),
+            math.exp(-max(tried.evidence, 0.0)),
             reasons[tried.effect in alike],
             words(tried.effect),
             units(tried.effect),

@@ -62,6 +62,7 @@ class Explanation:
     Args:
         parts: the effects in the order of their composition; empty if nothing is missing.
         tried: effects that were not put in, those of the most evidence first.
+        others: other sets of effects that explain the data as well, with more than one other effect.
         unseen: effects of a usual size that the data could not have shown; only where nothing was found.
         failures: attempts that failed with an error, and why.
         ended_in: stage in which the time for the search was up, or which did not begin for that; None if all ended.
@@ -69,6 +70,7 @@ class Explanation:
 
     parts: tuple[Part, ...]
     tried: tuple[Tried, ...] = ()
+    others: tuple[tuple[Effect, ...], ...] = ()
     unseen: tuple[Effect, ...] = ()
     failures: tuple[str, ...] = ()
     ended_in: str | None = None

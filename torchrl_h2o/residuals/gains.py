@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -41,6 +42,11 @@ class Lead:
     def names(self) -> frozenset[str]:
         """Names of the entries."""
         return frozenset(direction.entry.name for direction in self.directions)
+
+    @property
+    def factors(self) -> tuple[float, ...]:
+        """Factors of the shares that are worth a simulation: as estimated, half of it, and the size of the trial."""
+        return tuple(dict.fromkeys((1.0, 0.5, 1.0 / max(abs(share) for share in self.shares))))
 
     def beside(
         self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], factor: float
@@ -103,6 +109,11 @@ class Gains:
         columns = np.stack([change * inverse for change in beside], 1) if beside else np.zeros((len(white), 0))
         return cls(white, inverse, share, columns, block_of(predictions))
 
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Weights of the errors with which half their sum of squares has the gradient of the score, (N)."""
+        return self.share * weights(self.white)
+
     def leads(self, directions: Sequence[Direction]) -> list[Lead]:
         """The candidates in descending order of their gain: each direction, and those of each kind together."""
         columns = self._free_of_present(directions)
@@ -139,8 +150,7 @@ class Gains:
         The others are readjusted; the errors are taken as linear in all variables.
         """
         moves = np.array([one.to_neutral for one in variables])
-        weight = self.share * weights(self.white)
-        gram = self.beside.T @ (weight[:, None] * self.beside)
+        gram = self.beside.T @ (self.weight[:, None] * self.beside)
         inverse = np.linalg.pinv(gram + np.diag(RIDGE * np.diag(gram) + 1e-12))
         of_effect: dict[int, list[int]] = {}
         for index, one in enumerate(variables):
@@ -169,8 +179,7 @@ class Gains:
 
     def _free_of_present(self, directions: Sequence[Direction]) -> list[np.ndarray]:
         """Whitened changes, each after the present effects have been readjusted."""
-        weight, found = self.share * weights(self.white), []
-        weighted = weight[:, None] * self.beside
+        weighted, found = self.weight[:, None] * self.beside, []
         gram = weighted.T @ self.beside
         solve = np.linalg.pinv(gram + 1e-9 * np.diag(np.diag(gram))) if len(gram) else gram
         for direction in directions:
@@ -179,8 +188,7 @@ class Gains:
         return found
 
     def _alone(self, direction: Direction, column: np.ndarray) -> Lead | None:
-        weight = self.share * weights(self.white)
-        best = -(weight * self.white) @ column / max((weight * column) @ column, 1e-300)
+        best = -(self.weight * self.white) @ column / max((self.weight * column) @ column, 1e-300)
         low, high = direction.shares
         shares = [
             float(np.clip(share, low, high)) for share in (best, 2.0 * best, 0.5 * best, math.copysign(1.0, best))

@@ -13,6 +13,7 @@ from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import fit_set
 from torchrl_h2o.residuals.score import Difference, Model, Predictions
+from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 ROUGH_STEPS = 2560  # physics steps that are simulated for each candidate of a sweep and in first fits
@@ -81,19 +82,27 @@ class Ground:
     Args:
         simulation: the simulator without effects.
         base: predictions of a set near those to compare, whose derivatives the filters of all sets use.
+        level: significance level at which an effect is added.
     """
 
     simulation: Simulation
     base: Model
+    level: float = DEFAULTS.level
     _models: dict[tuple[Effect, ...], Model] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, simulation: Simulation, measured: Measured, effects: Sequence[Effect] = ()) -> Ground:
+    def of(
+        cls,
+        simulation: Simulation,
+        measured: Measured,
+        effects: Sequence[Effect] = (),
+        level: float = DEFAULTS.level,
+    ) -> Ground:
         """The ground near a set of effects."""
         model = Model.of(simulation.with_effects(*effects), measured)
         counts = model.fit.effective_counts(model.fit.errors())
         base = Model(replace(model.fit, counts=counts), replace(model.selection, counts=counts))
-        return cls(simulation, base, {tuple(effects): base})
+        return cls(simulation, base, level, {tuple(effects): base})
 
     @property
     def num_fit(self) -> int:
@@ -141,7 +150,7 @@ class Ground:
         """A set with its values fitted to predictions, such as rough ones, in a few steps."""
         return self.found(entries, fit_set([part], entries, effects, most_steps=SKETCH).effects if entries else ())
 
-    def needed(self, more: Found, less: Found, level: float) -> float:
+    def needed(self, more: Found, less: Found) -> float:
         """Evidence that a larger set needs: a significant one, and more for unusual effects.
 
         What several joints have, such as friction, further ones have too: these need hardly any evidence.
@@ -152,13 +161,9 @@ class Ground:
         ]
         if all(kinds.count(type(effect)) >= MANY for effect in added):
             return ONE_MORE
-        return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(level)
+        return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(self.level)
 
-    def evidence(self, more: Found, less: Found) -> float:
-        """Evidence of the rows for selection that one set predicts better than another."""
-        return Difference((more.scores - less.scores)[self.num_fit :]).evidence
-
-    def adds(self, more: Found, less: Found, level: float, among: int = 1) -> bool:
+    def adds(self, more: Found, less: Found, among: int = 1) -> bool:
         """Whether a set predicts better than a smaller one, by more than its surprise.
 
         Rows for selection must show half of the evidence needed, and all rows must show all of it, and more where the
@@ -168,10 +173,11 @@ class Ground:
         that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
         effect must therefore predict the next step better, too.
         """
-        needed = self.needed(more, less, level)
-        in_all = Difference(more.scores - less.scores).evidence
-        if self.evidence(more, less) <= 0.5 * needed or in_all <= needed + math.log(among):
+        needed = self.needed(more, less)
+        difference = more.scores - less.scores
+        in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
+        if in_selection <= 0.5 * needed or in_all <= needed + math.log(among):
             return False
         if more.one_step is None or less.one_step is None:
             return True
-        return Difference(more.one_step - less.one_step).evidence > 0.5 * min(needed, -math.log(level))
+        return Difference(more.one_step - less.one_step).evidence > 0.5 * min(needed, -math.log(self.level))

@@ -21,12 +21,13 @@ MOST_REFUSED = 9  # candidates that are refused one after another before none is
 MOST_TERMS = 6  # largest number of terms of a force outside the catalogue
 MOST_EFFECTS = 80  # largest number of entries in a set
 
+Set = tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]
+
 
 def grow(
     ground: Ground,
     found: Found,
     directions: Sequence[Direction],
-    level: float,
     advance: Callable[[Found], object],
     tried: dict[str, Tried],
 ) -> Found:
@@ -34,12 +35,12 @@ def grow(
     refused: set[frozenset[str]] = set()
     among = max(1, len({one.entry.name for one in directions}))
     while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
-        fitted = with_one_more(ground, found, directions, refused, -math.log(level))
+        fitted = with_one_more(ground, found, directions, refused, joints_together=True)
         if not fitted:
             break
         for one in fitted:
             _remember(tried, one, found)
-        better = [one for one in fitted if ground.adds(one, found, level, among)]
+        better = [one for one in fitted if ground.adds(one, found, among)]
         if better:
             best = most_usual(better)
             many = len(best.entries) > len(found.entries) + 2
@@ -60,28 +61,25 @@ def _remember(tried: dict[str, Tried], more: Found, less: Found) -> None:
 
 
 def with_force(
-    ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], level: float, advance: Callable[[Found], object]
+    ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], advance: Callable[[Found], object]
 ) -> Found:
     """Adds terms of a force outside the catalogue while the rows for selection are predicted better."""
     for _ in range(MOST_TERMS):
         starts = ground.model(found.effects).fit.starts
         rows, states = starts.of_rows
-        rough = ground.rough(found.effects)
-        simulation = starts.record.simulation
         sets = []
-        for pairs in force_candidates(simulation, starts.record.measured, states, rows, catalogue):
+        for pairs in force_candidates(starts.record.simulation, starts.record.measured, states, rows, catalogue):
             new = [pair for pair in pairs if pair[0].name not in found.names]
             if new:
-                entries = (*found.entries, *(entry for entry, _ in new))
-                effects = (*found.effects, *(effect for _, effect in new))
-                sets.append((rough.score(effects), entries, effects))
-        best = sorted(sets, key=lambda one: -one[0])[:FITTED]
-        fitted = [ground.sketched(rough, entries, effects) for _, entries, effects in best]
-        better = [one for one in fitted if ground.adds(one, found, level, max(1, len(sets)))]
+                entries, effects = zip(*new, strict=True)
+                sets.append([((*found.entries, *entries), (*found.effects, *effects))])
+        rough = ground.rough(found.effects)
+        fitted = _sketched(ground, rough, _best_simulated(rough, sets))
+        better = [one for one in fitted if ground.adds(one, found, max(1, len(sets)))]
         if not better:
             break
-        best_one = most_usual(better)
-        found = ground.fitted(best_one.entries, best_one.effects)
+        best = most_usual(better)
+        found = ground.fitted(best.entries, best.effects)
         advance(found)
     return found
 
@@ -91,29 +89,61 @@ def with_one_more(
     found: Found,
     directions: Sequence[Direction],
     passed_over: Collection[frozenset[str]] = (),
-    least: float = 0.0,
+    *,
+    joints_together: bool = False,
 ) -> list[Found]:
-    """The set with each of the few best candidates, whose values are fitted in a few steps."""
+    """The set with each of the few best candidates, whose values are fitted in a few steps.
+
+    Args:
+        ground: where sets are compared.
+        found: the set.
+        directions: the candidates.
+        passed_over: names of the entries of candidates that are not tried.
+        joints_together: whether friction, damping and rotors of all joints together are a candidate.
+    """
     rough = ground.rough(found.effects)
     gains = gains_beside(rough, found)
+    least = -0.5 * math.log(ground.level)  # what fewer rows must show; the rows for selection decide
     leads = [
         lead
         for lead in best_of_each(gains.leads(directions))
-        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > 0.5 * least
+        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > least
     ]
-    tried = [one[1:] for one in sorted(_simulated(rough, found, leads[:TRIED]), key=lambda one: -one[0])[:FITTED]]
-    joints = gains.of_joints(directions) if leads else None
+    sets = [[lead.beside(found.entries, found.effects, factor) for factor in lead.factors] for lead in leads[:TRIED]]
+    best = _best_simulated(rough, sets)
+    joints = gains.of_joints(directions) if leads and joints_together else None
     if joints is not None and joints.names not in passed_over and not joints.names <= found.names:
-        tried.append(joints.beside(found.entries, found.effects, 1.0))
-    fitted = []
-    for entries, effects in tried:
+        best.append(joints.beside(found.entries, found.effects, 1.0))
+    return [one for one in _sketched(ground, rough, best) if _is_usable(ground, one, found)]
+
+
+def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> list[Set]:
+    """The sets of the few best candidates by their score, each at the best of its sizes."""
+    scored = []
+    for sizes in candidates:
+        best = max(((_score(rough, effects), entries, effects) for entries, effects in sizes), key=lambda one: one[0])
+        scored.append(best)
+    scored.sort(key=lambda one: -one[0])
+    return [(entries, effects) for score, entries, effects in scored[:FITTED] if score > -math.inf]
+
+
+def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
+    """Score with effects; minus infinity if the model rejects them together."""
+    try:
+        return rough.score(effects)
+    except ValueError:
+        return -math.inf
+
+
+def _sketched(ground: Ground, rough: Predictions, sets: Sequence[Set]) -> list[Found]:
+    """Sets with their values fitted in a few steps, without those that the model rejects."""
+    found = []
+    for entries, effects in sets:
         try:
-            one = ground.sketched(rough, entries, effects)
-        except ValueError:  # the model rejects the effects together
+            found.append(ground.sketched(rough, entries, effects))
+        except ValueError:
             continue
-        if _is_usable(ground, one, found):
-            fitted.append(one)
-    return fitted
+    return found
 
 
 def gains_beside(part: Predictions, found: Found) -> Gains:
@@ -131,26 +161,6 @@ def best_of_each(leads: Sequence[Lead]) -> list[Lead]:
     for lead in leads:
         best.setdefault(lead.names, lead)
     return list(best.values())
-
-
-def _simulated(
-    rough: Predictions, found: Found, leads: Sequence[Lead]
-) -> list[tuple[float, tuple[CatalogueEntry, ...], tuple[Effect, ...]]]:
-    """Score on the rows for fits, entries and effects of each lead beside the present set, at the best of few sizes."""
-    results = []
-    for lead in leads:
-        best = None
-        for factor in dict.fromkeys((1.0, 0.5, 1.0 / max(abs(share) for share in lead.shares))):
-            entries, effects = lead.beside(found.entries, found.effects, factor)
-            try:
-                score = rough.score(effects)
-            except ValueError:
-                continue
-            if best is None or score > best[0]:
-                best = (score, entries, effects)
-        if best is not None:
-            results.append(best)
-    return results
 
 
 def _is_usable(ground: Ground, found: Found, before: Found) -> bool:

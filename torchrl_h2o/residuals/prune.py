@@ -16,23 +16,23 @@ MOST_KEPT = 3  # effects that were needed when they were dropped, after which no
 SWAPS = 4  # largest number of effects that are replaced by others
 
 
-def prune(ground: Ground, found: Found, level: float) -> Found:
+def prune(ground: Ground, found: Found) -> Found:
     """Drops effects without which the rows for selection are predicted as well, the least needed ones first."""
     before, kept = found, set[str]()
     pairs = zip(found.entries, found.effects, strict=True)
     if idle := {entry.name for entry, effect in pairs if is_negligible(effect, entry.trials)}:
         found = ground.found(*found.without(idle))
-    found = _without_needless_kinds(ground, found, level)
+    found = _without_needless_kinds(ground, found)
     while found.names - kept and len(kept) < MOST_KEPT:
         estimates = [one for one in _estimates(ground.fit_part(found.effects), found) if one[0] not in kept]
-        cost = {name: ground.needed(found, Found(*found.without({name}), found.scores), level) for name, _ in estimates}
+        cost = {name: ground.needed(found, Found(*found.without({name}), found.scores)) for name, _ in estimates}
         weak = [name for name, estimate in estimates if estimate < 0.5 * cost[name]]
         if not weak and (open_ := [name for name, estimate in estimates if estimate < SURE * cost[name]]):
             weak = open_[:1]
         count = len(weak)
         while count:
             fewer = _fewer(ground, found, weak[:count])
-            if fewer is not None and not ground.adds(found, fewer, level):
+            if fewer is not None and not ground.adds(found, fewer):
                 found = fewer
                 break
             count //= 2
@@ -43,13 +43,13 @@ def prune(ground: Ground, found: Found, level: float) -> Found:
     return found if found is before else ground.fitted(found.entries, found.effects)
 
 
-def _without_needless_kinds(ground: Ground, found: Found, level: float) -> Found:
+def _without_needless_kinds(ground: Ground, found: Found) -> Found:
     """Drops an effect on all of its joints or motors if the rows for selection are predicted as well without it."""
     for kind in dict.fromkeys(map(type, found.effects)):
         same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if type(effect) is kind}
         if len(same) > 1:
             fewer = _fewer(ground, found, same)
-            if fewer is not None and not ground.adds(found, fewer, level):
+            if fewer is not None and not ground.adds(found, fewer):
                 found = fewer
     return found
 

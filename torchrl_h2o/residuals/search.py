@@ -12,7 +12,9 @@ import numpy as np
 from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
+from torchrl_h2o.effects.model.joint import LOCKED, JointRange
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
+from torchrl_h2o.residuals.forces.candidates import force_entry
 from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground
 from torchrl_h2o.residuals.grow import best_of_each, gains_beside, grow, is_preferred, with_force
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -66,7 +68,7 @@ def search(
         OutOfTimeError: if the time of ``progress`` is up before there is a first result.
     """
     tried: dict[str, Tried] = {}
-    latest = [_known(catalogue, known)]
+    latest = [known_set(catalogue, known)]
 
     def better(found: Found) -> None:
         latest.append(found)
@@ -77,9 +79,9 @@ def search(
 
     ended_in, unseen, alike = None, (), []
     progress.stage(EFFECTS)
-    ground = Ground.of(simulation, measured, latest[0].effects)
+    ground = Ground.of(simulation, measured, latest[0].effects, level)
     try:
-        ground, alike, unseen = _searched(ground, latest[0], catalogue, level, progress, better, tried)
+        ground, alike, unseen = _searched(ground, latest[0], catalogue, progress, better, tried)
     except OutOfTimeError as end:
         ended_in = str(end)
     found = latest[-1]
@@ -93,17 +95,21 @@ def search(
     return replace(explanation, tried=tuple(left), unseen=unseen, ended_in=ended_in)
 
 
-def _known(catalogue: Sequence[CatalogueEntry], known: Sequence[Effect]) -> Found:
-    pairs = [(entry_of(effect, catalogue), effect) for effect in known if not effect.random]
-    there = [(entry, effect) for entry, effect in pairs if entry is not None]
-    return Found(tuple(entry for entry, _ in there), tuple(effect for _, effect in there), np.zeros(0))
+def known_set(catalogue: Sequence[CatalogueEntry], known: Sequence[Effect]) -> Found:
+    """The set from which a search begins: effects of the catalogue, and each term of a force by itself."""
+    pairs: list[tuple[CatalogueEntry, Effect]] = []
+    for effect in known:
+        if isinstance(effect, ResidualForce):
+            pairs += [force_entry(ResidualForce((term,))) for term in effect.terms]
+        elif not effect.random and (entry := entry_of(effect, catalogue)) is not None:
+            pairs.append((entry, effect))
+    return Found(tuple(entry for entry, _ in pairs), tuple(effect for _, effect in pairs), np.zeros(0))
 
 
 def _searched(
     ground: Ground,
     found: Found,
     catalogue: Sequence[CatalogueEntry],
-    level: float,
     progress: LoopBar,
     better: Callable[[Found], object],
     tried: dict[str, Tried],
@@ -114,7 +120,7 @@ def _searched(
     measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
         if number:
-            ground = Ground.of(ground.simulation, measured, found.effects)
+            ground = Ground.of(ground.simulation, measured, found.effects, ground.level)
         found = ground.fitted(found.entries, found.effects)
         if number > 1:
             best = best_of_each(gains_beside(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
@@ -124,20 +130,20 @@ def _searched(
         rough = ground.rough(found.effects)
         directions = sweep(rough, entries, found.effects, closer)
         if not number and not found.entries:
-            unseen = _unseen(ground, rough, every, directions, level)
-        before = found.names
-        found = grow(ground, found, directions, level, better, tried)
+            unseen = _unseen(ground, rough, every, directions)
+        before, alike = found.names, []  # alternatives belong to one set
+        found = grow(ground, found, directions, better, tried)
         if found.names == before:
             progress.stage(FORCES)
-            found = with_force(ground, found, every, level, better)
+            found = with_force(ground, found, every, better)
             if before and found.names != before:  # a force alone may explain what effects were found for
-                alone = with_force(ground, ground.found((), ()), every, level, lambda _: None)
+                alone = with_force(ground, ground.found((), ()), every, lambda _: None)
                 if alone.entries and is_preferred(alone, found):
                     found = alone
                     better(found)
         if found.names == before:
             progress.stage(OTHERS)
-            found = prune(ground, found, level)
+            found = prune(ground, found)
             better(found)
             found, alike = replaced(ground, found, directions, lambda: progress.closer(0.05))
             better(found)
@@ -151,7 +157,6 @@ def _unseen(
     rough: Predictions,
     entries: Sequence[CatalogueEntry],
     directions: Sequence[Direction],
-    level: float,
 ) -> tuple[Effect, ...]:
     """Effects at their largest trials that these data would not show, the first of each kind before the others."""
     gains = gains_beside(rough, Found((), (), np.zeros(0)))
@@ -159,11 +164,13 @@ def _unseen(
     largest: dict[str, Effect] = {entry.name: entry.starts[-1] for entry in entries}
     blocks = len(ground.base.selection.blocks) / len(rough.blocks)
     for direction in directions:
+        if isinstance(direction.entry.effect, JointRange) and direction.trial["scale"] <= LOCKED:
+            continue  # any motion shows that a joint is not locked
         evidence = blocks * gains.evidence_if_there(direction)
         if evidence > seen[direction.entry.name]:
             seen[direction.entry.name] = evidence
             largest[direction.entry.name] = direction.entry.effect.with_parameters(direction.trial)
-    needed = {name: NATS_OF_SURPRISE * surprise(effect) - math.log(level) for name, effect in largest.items()}
+    needed = {name: NATS_OF_SURPRISE * surprise(effect) - math.log(ground.level) for name, effect in largest.items()}
     missed = sorted((name for name in seen if seen[name] < needed[name]), key=lambda name: -seen[name])
     effects = [largest[name] for name in missed]
     first = {type(effect): effect for effect in reversed(effects)}
@@ -189,8 +196,8 @@ def _explanation(
         if isinstance(effect, ResidualForce):
             forces.append((effect, ci95))
             continue
-        others = alike[index] if index < len(alike) else ()
-        parts.append(Part(effect, True, ci95, tuple(map(_alternative, others))))
+        instead = [_alternative(other, found) for other in alike[index] if _is_one(other, found)] if alike else []
+        parts.append(Part(effect, True, ci95, tuple(instead)))
     if forces:
         terms = tuple(term for effect, _ in forces for term in effect.terms)
         ci95 = {
@@ -199,8 +206,15 @@ def _explanation(
             for name, ends in own.items()
         }
         parts.append(Part(ResidualForce(terms), False, ci95))
-    return Explanation(tuple(parts))
+    others = {other.names: other.effects for sets in alike for other in sets if not _is_one(other, found)}
+    return Explanation(tuple(parts), others=tuple(others.values()))
 
 
-def _alternative(other: Found) -> Alternative:
-    return Alternative(other.effects[-1], tuple((effect, {}) for effect in other.effects))
+def _is_one(other: Found, found: Found) -> bool:
+    """Whether a set has one other effect than the one found, and not the same on each of several joints."""
+    return len(other.names - found.names) == 1
+
+
+def _alternative(other: Found, found: Found) -> Alternative:
+    (effect,) = other.without(found.names)[1]
+    return Alternative(effect, tuple((one, {}) for one in other.effects))

@@ -81,7 +81,7 @@ def sweep(
 
     Args:
         predictions: predictions of the simulator.
-        entries: the catalogue.
+        entries: the catalogue, without random effects.
         beside: effects that the simulator has already.
         advance: called after each entry.
     """
@@ -93,8 +93,6 @@ def sweep(
         advance()
         own = elements(entry.effect, simulation)
         parts = [alone.get((type(entry.effect), one)) for one in own]
-        if entry.effect.random:
-            continue
         if len(own) > 1 and all(parts) and not isinstance(entry.effect, JointRange):
             shared.append((entry, [part for part in parts if part is not None]))
             continue

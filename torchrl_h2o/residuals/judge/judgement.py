@@ -16,7 +16,7 @@ from torchrl_h2o.residuals.explanation import Alternative, Explanation, Tried, a
 from torchrl_h2o.residuals.judge.caveats import undetermined_values
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error, with_floor, with_horizons
 from torchrl_h2o.residuals.judge.run_errors import run_errors
-from torchrl_h2o.residuals.judge.separation import separated_by
+from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
 from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
@@ -70,6 +70,7 @@ class Judgement:
         runs: error of each run.
         verdict: what these figures say.
         failures: attempts that failed with an error, and why.
+        others: error and separating data of each other set of effects that explains the data as well.
         left_out: parts that were not computed because the time was up, in words.
     """
 
@@ -85,6 +86,7 @@ class Judgement:
     runs: tuple[RunError, ...]
     verdict: Verdict
     failures: tuple[str, ...] = ()
+    others: tuple[tuple[tuple[Effect, ...], float, str], ...] = ()
     left_out: tuple[str, ...] = ()
 
 
@@ -157,6 +159,7 @@ def _details(
     unknown = (math.nan,) * len(effects)
     errors_after = optional("errors of each effect", lambda: _errors_after(simulation, effects, measured), unknown)
     alternatives = optional("errors of alternatives", lambda: _all_alternatives(simulation, measured, explanation), ())
+    others = optional("other sets", lambda: _others(simulation, mended, measured, explanation), ())
     if error is not None:
         error = optional("errors ahead", partial(with_horizons, error, simulation, mended, measured, settings), error)
         error = optional("the floor", partial(with_floor, error, mended, measured), error)
@@ -171,6 +174,7 @@ def _details(
         "error": error,
         "errors_after": errors_after,
         "alternatives": alternatives,
+        "others": others,
         "windows": windows,
         "runs": runs,
         "trace": trace,
@@ -286,6 +290,17 @@ def _alternatives(
     alike = (effects[index], *(other.effect for other in others))
     where = separated_by(simulation, measured, alike, _without_noise(before), _without_noise(after))
     return Alternatives(alike, tuple(errors), where)
+
+
+def _others(
+    simulation: Simulation, mended: Simulation, measured: Measured, explanation: Explanation
+) -> tuple[tuple[tuple[Effect, ...], float, str], ...]:
+    """Each other set of effects with its error, and the data that would distinguish it from the effects found."""
+    others = []
+    for effects in explanation.others:
+        other = simulation.with_effects(*effects)
+        others.append((effects, overall_error(other, measured), difference_between((mended, other), measured)))
+    return tuple(others)
 
 
 def _two_sample(
