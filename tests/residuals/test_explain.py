@@ -28,11 +28,19 @@ class EndsBeforeAlternatives(LoopBar):
             raise self.error
 
 
-def explained(*truth, simulation=SIMULATION, catalogue=(GRAVITY, FRICTION), rows=2000, noise=0.0, bar=None):
+def explained(
+    *truth,
+    simulation=SIMULATION,
+    catalogue=(GRAVITY, FRICTION),
+    rows=2000,
+    noise=0.0,
+    bar=None,
+    so_far=lambda explanation: None,
+):
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     with bar or LoopBar(disable=True) as progress:
         evidence = Evidence(simulation, measured, undisturbed=measured, suspected=())
-        return explain(evidence, catalogue, progress=progress)
+        return explain(evidence, catalogue, progress=progress, so_far=lambda found, stage: so_far(found))
 
 
 @pytest.mark.slow
@@ -72,10 +80,15 @@ def test_an_error_in_the_search_leaves_what_was_found_before():
 
 
 def test_what_was_found_when_the_time_was_up_is_the_explanation():
+    handed = []
     bar = EndsBeforeAlternatives(OutOfTimeError(OTHERS))
-    explanation = explained(Gravity(1.3), rows=800, noise=0.002, bar=bar)
+    explanation = explained(Gravity(1.3), RIPPLE, rows=800, noise=0.002, bar=bar, so_far=handed.append)
     assert explanation.ended_in == OTHERS
-    assert [type(effect) for effect in explanation.effects] == [Gravity]
+    assert explanation.parts
+    assert [part.effect.describe().split(":")[0] for part in explanation.parts] == [
+        part.effect.describe().split(":")[0] for part in handed[-1].parts
+    ]
+    assert all(part.ci95 for part in explanation.parts)  # there was time for a last fit
     assert not explanation.failures
 
 

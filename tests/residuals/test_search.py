@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import double_pendulum, recorded
+from tests.residuals.pendulum import double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     ActionBias,
     ActionDelay,
     ActionGain,
+    ActionNoise,
     Armature,
     BodyMass,
     Gravity,
@@ -17,9 +18,11 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
     ResidualForce,
 )
+from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.search import known_set
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -73,9 +76,30 @@ def test_what_predicts_the_next_row_worse_is_not_added_where_the_motion_is_noisi
     assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less)
 
 
+@pytest.mark.parametrize("rows", [800, pytest.param(1600, marks=pytest.mark.slow)])
+def test_a_wave_is_one_term_beside_the_gravity_that_two_waves_and_a_spring_imitate(rows):
+    one_joint, wave = pendulum(), ResidualForce(("torque on elbow: 0.2 · sin(7 q)",))
+    measured = recorded(one_joint.with_effects(Gravity(1.3), wave), rows, noise=0.002)
+    catalogue = [entry for entry in one_joint.catalogue() if isinstance(entry.effect, Gravity | JointFrictionLoss)]
+    effects = search(one_joint, measured, catalogue, progress=LoopBar(disable=True)).effects
+    assert [type(effect) for effect in effects] == [Gravity, ResidualForce]
+    assert effects[0].parameters["scale"].value == pytest.approx(1.3, rel=0.01)
+    assert [term.coefficient for term in effects[1].parsed] == pytest.approx([0.2], rel=0.02)
+
+
+def test_a_search_goes_on_from_a_known_force_term_by_term():
+    gravity = entry_of(Gravity(1.1), CATALOGUE)
+    force = ResidualForce(("torque on elbow: 0.1 · t", "torque on elbow: 0.2 · sin(7 q)"))
+    known = known_set(CATALOGUE, [Gravity(1.1), force, BodyMass(2.0, "upper"), ActionNoise(0.1)])
+    assert known.entries[0] is gravity
+    assert [effect.describe() for effect in known.effects[1:]] == [
+        ResidualForce((term,)).describe() for term in force.terms
+    ]
+
+
 @pytest.mark.slow
 def test_a_force_outside_the_catalogue_stands_beside_its_effects():
-    ripple = ResidualForce("torque on shoulder: 0.1 · sin(6 q)")
+    ripple = ResidualForce(("torque on shoulder: 0.1 · sin(6 q)",))
     explanation = found(recorded(SIMULATION.with_effects(Gravity(1.2), ripple), 2500))
     gravity, force = explanation.parts
     assert (gravity.declared, force.declared) == (True, False)

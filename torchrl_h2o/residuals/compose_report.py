@@ -24,7 +24,7 @@ from torchrl_h2o.residuals.report.contents import (
     RejectedEffect,
 )
 from torchrl_h2o.residuals.report.document import Report
-from torchrl_h2o.residuals.report.words import UNDECLARED, effect_units, effect_words
+from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_units, effect_words
 from torchrl_h2o.residuals.search import stop_test
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -139,7 +139,7 @@ def _data_summary(measured: Measured) -> DataSummary:
 
 def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> tuple[RejectedEffect, ...]:
     """The effects that were tried and not put in, each with the reason."""
-    alike = {other.effect for part in explanation.parts for other in part.alike}
+    alike = {effect_name(other.effect) for part in explanation.parts for other in part.alike}
     reasons = {
         True: "explains the data as well as an effect that was put in",
         False: "explains less than an effect that was put in, or no more than chance",
@@ -149,7 +149,7 @@ def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> t
             tried.effect,
             error,
             math.exp(-max(tried.evidence, 0.0)),
-            reasons[tried.effect in alike],
+            reasons[effect_name(tried.effect) in alike],
             words(tried.effect),
             units(tried.effect),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -144,37 +144,42 @@ class Gains:
         """Evidence of the rows for an effect if it were there at its trial beside the present errors."""
         return -self._evidence(direction.change * self.inverse)
 
+    @cached_property
+    def _inverse(self) -> np.ndarray:
+        """Inverse curvature of the score by the variables of the present effects, (p, p)."""
+        gram = self.beside.T @ (self.weight[:, None] * self.beside)
+        return np.linalg.pinv(gram + np.diag(RIDGE * np.diag(gram) + 1e-12))
+
+    def readjusted(self, dropped: Collection[int], variables: Sequence[Variable]) -> tuple[np.ndarray, float]:
+        """Moves of all variables, (p), that take some effects to neutral, and the loss in nats if errors are linear.
+
+        A wave is neutral without its coefficient, whatever its frequency. The loss is infinite if an effect has no
+        value that can be moved to neutral, such as a limit that is never reached.
+        """
+        own = [i for i, one in enumerate(variables) if one.effect in dropped and math.isfinite(one.to_neutral)]
+        if {variables[index].effect for index in own} != set(dropped):
+            return np.zeros(len(variables)), math.inf
+        moves = np.array([variables[index].to_neutral for index in own])
+        pull = np.linalg.pinv(self._inverse[np.ix_(own, own)]) @ moves
+        return self._inverse[:, own] @ pull, float(moves @ pull)
+
     def least_needed(self, variables: Sequence[Variable]) -> list[tuple[int, float]]:
         """Present effects in the order in which they may be dropped, with the evidence for each beside the later ones.
 
         The others are readjusted; the errors are taken as linear in all variables.
         """
-        moves = np.array([one.to_neutral for one in variables])
-        gram = self.beside.T @ (self.weight[:, None] * self.beside)
-        inverse = np.linalg.pinv(gram + np.diag(RIDGE * np.diag(gram) + 1e-12))
-        of_effect: dict[int, list[int]] = {}
-        for index, one in enumerate(variables):
-            of_effect.setdefault(one.effect, []).append(index)
-        found: list[tuple[int, float]] = []
-        dropped: list[int] = []
-        before = np.zeros(len(self.white))
-        while of_effect:
-
-            def lost(effect: int, dropped: Sequence[int] = tuple(dropped)) -> float:
-                own = [*dropped, *of_effect[effect]]
-                with np.errstate(invalid="ignore"):
-                    loss = moves[own] @ np.linalg.pinv(inverse[np.ix_(own, own)]) @ moves[own]
-                return float(loss) if math.isfinite(loss) else math.inf
-
-            effect = min(of_effect, key=lost)
-            own = [*dropped, *of_effect[effect]]
-            if not np.isfinite(moves[own]).all():
-                found += [(other, math.inf) for other in of_effect]
-                break
-            change = self.beside @ (inverse[:, own] @ (np.linalg.pinv(inverse[np.ix_(own, own)]) @ moves[own]))
+        left, found, before = {one.effect for one in variables}, [], np.zeros(len(self.white))
+        while left:
+            dropped = [effect for effect, _ in found]
+            results = {effect: self.readjusted({*dropped, effect}, variables) for effect in left}
+            effect = min(left, key=lambda one: results[one][1])
+            moves, loss = results[effect]
+            if math.isinf(loss):
+                return [*found, *((other, math.inf) for other in left)]
+            change = self.beside @ moves
             found.append((effect, -self._evidence(change, before)))
-            dropped, before = own, change
-            del of_effect[effect]
+            before = change
+            left.remove(effect)
         return found
 
     def _free_of_present(self, directions: Sequence[Direction]) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,19 +28,18 @@ ONE_MORE = 1.0  # that evidence
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 
 
-def surprise_of(effects: Iterable[Effect]) -> int:
-    """How unusual effects are in all: the most unusual of each kind counts, because joints resemble each other.
+def kind_of(effect: Effect) -> Hashable:
+    """What effects on several joints have in common; a term of a force has nothing in common with others."""
+    return effect if isinstance(effect, ResidualForce) else type(effect)
 
-    Each term of a force that no effect of the catalogue describes counts by itself.
-    """
-    most: dict[type, int] = {}
-    forces = 0
+
+def surprise_of(effects: Iterable[Effect]) -> int:
+    """How unusual effects are in all: the most unusual of each kind counts, because joints resemble each other."""
+    most: dict[Hashable, int] = {}
     for effect in effects:
-        if isinstance(effect, ResidualForce):
-            forces += SURPRISE_OF_FORCE * len(effect.terms)
-        else:
-            most[type(effect)] = max(surprise(effect), most.get(type(effect), 0))
-    return sum(most.values()) + forces
+        own = SURPRISE_OF_FORCE * len(effect.terms) if isinstance(effect, ResidualForce) else surprise(effect)
+        most[kind_of(effect)] = max(own, most.get(kind_of(effect), 0))
+    return sum(most.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,20 +145,22 @@ class Ground:
                 break
         return found
 
-    def sketched(self, part: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+    def sketched(
+        self, part: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], most_steps: int = SKETCH
+    ) -> Found:
         """A set with its values fitted to predictions, such as rough ones, in a few steps."""
-        return self.found(entries, fit_set([part], entries, effects, most_steps=SKETCH).effects if entries else ())
+        return self.found(entries, fit_set([part], entries, effects, most_steps=most_steps).effects if entries else ())
 
     def needed(self, more: Found, less: Found) -> float:
         """Evidence that a larger set needs: a significant one, and more for unusual effects.
 
         What several joints have, such as friction, further ones have too: these need hardly any evidence.
         """
-        kinds = [type(effect) for effect in less.effects]
+        kinds = [kind_of(effect) for effect in less.effects]
         added = [
             effect for entry, effect in zip(more.entries, more.effects, strict=True) if entry.name not in less.names
         ]
-        if all(kinds.count(type(effect)) >= MANY for effect in added):
+        if all(kinds.count(kind_of(effect)) >= MANY for effect in added):
             return ONE_MORE
         return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(self.level)
 

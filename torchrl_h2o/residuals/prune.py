@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 
 from torchrl_h2o.effects import is_negligible
-from torchrl_h2o.residuals.ground import Found, Ground
+from torchrl_h2o.residuals.gains import Gains
+from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import ALIKE, gains_beside, is_preferred, most_usual, with_one_more
-from torchrl_h2o.residuals.refit import variables_of
+from torchrl_h2o.residuals.refit import Variable, variables_of, with_values
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
 
@@ -24,14 +26,15 @@ def prune(ground: Ground, found: Found) -> Found:
         found = ground.found(*found.without(idle))
     found = _without_needless_kinds(ground, found)
     while found.names - kept and len(kept) < MOST_KEPT:
-        estimates = [one for one in _estimates(ground.fit_part(found.effects), found) if one[0] not in kept]
+        linear = _Linear.about(ground, found)
+        estimates = [one for one in linear.estimates if one[0] not in kept]
         cost = {name: ground.needed(found, Found(*found.without({name}), found.scores)) for name, _ in estimates}
         weak = [name for name, estimate in estimates if estimate < 0.5 * cost[name]]
         if not weak and (open_ := [name for name, estimate in estimates if estimate < SURE * cost[name]]):
             weak = open_[:1]
         count = len(weak)
         while count:
-            fewer = _fewer(ground, found, weak[:count])
+            fewer = linear.without(ground, weak[:count])
             if fewer is not None and not ground.adds(found, fewer):
                 found = fewer
                 break
@@ -45,28 +48,51 @@ def prune(ground: Ground, found: Found) -> Found:
 
 def _without_needless_kinds(ground: Ground, found: Found) -> Found:
     """Drops an effect on all of its joints or motors if the rows for selection are predicted as well without it."""
-    for kind in dict.fromkeys(map(type, found.effects)):
-        same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if type(effect) is kind}
+    for kind in dict.fromkeys(map(kind_of, found.effects)):
+        same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if kind_of(effect) == kind}
         if len(same) > 1:
-            fewer = _fewer(ground, found, same)
+            fewer = _Linear.about(ground, found).without(ground, same)
             if fewer is not None and not ground.adds(found, fewer):
                 found = fewer
     return found
 
 
-def _fewer(ground: Ground, found: Found, dropped: Collection[str]) -> Found | None:
-    """The set without some effects; None if the model rejects the others without these."""
-    try:
-        return ground.sketched(ground.fit_part(found.effects), *found.without(dropped))
-    except ValueError:
-        return None
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """A set with the changes of the errors by its values.
 
+    Args:
+        found: the set.
+        part: predictions on the rows for fits.
+        variables: its values.
+        gains: the changes.
+    """
 
-def _estimates(part: Predictions, found: Found) -> list[tuple[str, float]]:
-    """Effects in the order in which they may be dropped, with the estimated evidence of the rows for fits for each."""
-    variables = variables_of(part, found.entries, found.effects)
-    estimates = gains_beside(part, found).least_needed(variables)
-    return [(found.entries[index].name, evidence) for index, evidence in estimates]
+    found: Found
+    part: Predictions
+    variables: Sequence[Variable]
+    gains: Gains
+
+    @classmethod
+    def about(cls, ground: Ground, found: Found) -> _Linear:
+        part = ground.fit_part(found.effects)
+        return cls(found, part, variables_of(part, found.entries, found.effects), gains_beside(part, found))
+
+    @property
+    def estimates(self) -> list[tuple[str, float]]:
+        """Effects in the order in which they may be dropped, with the estimated evidence for each."""
+        order = self.gains.least_needed(self.variables)
+        return [(self.found.entries[index].name, evidence) for index, evidence in order]
+
+    def without(self, ground: Ground, names: Collection[str]) -> Found | None:
+        """The set without some effects, fitted from readjusted values; None if the model rejects the others alone."""
+        dropped = [index for index, entry in enumerate(self.found.entries) if entry.name in names]
+        moves, _ = self.gains.readjusted(dropped, self.variables)
+        effects = with_values(self.found.effects, self.variables, moves)
+        try:
+            return ground.sketched(self.part, *replace(self.found, effects=effects).without(names), GROWN)
+        except ValueError:
+            return None
 
 
 def replaced(
@@ -74,14 +100,14 @@ def replaced(
 ) -> tuple[Found, list[list[Found]]]:
     """Replaces effects by better or more usual ones, and lists for each effect those that explain the data as well.
 
-    The same effect on each of several joints or motors stays.
+    The same effect on each of several joints or motors stays; terms of a force are replaced one by one.
     """
     alike: list[list[Found]] = []
     swaps = 0
     while len(alike) < len(found.entries):
         advance()
         entry, effect = found.entries[len(alike)], found.effects[len(alike)]
-        if sum(type(other) is type(effect) for other in found.effects) > 1:
+        if sum(kind_of(other) == kind_of(effect) for other in found.effects) > 1:
             alike.append([])
             continue
         fewer = ground.found(*found.without({entry.name}))
