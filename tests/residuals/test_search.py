@@ -20,6 +20,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import search
+from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.search import known_set
@@ -118,6 +119,11 @@ def test_what_was_tried_and_not_put_in_is_listed_by_its_evidence():
     evidence = [one.evidence for one in tried]
     assert evidence == sorted(evidence, reverse=True)
     assert not any(isinstance(one.effect, Gravity) for one in tried)
+
+
+@pytest.mark.parametrize(("evidence", "p_value"), [(-1e4, 1.0), (0.0, 1.0), (2.3, 0.1), (1e4, 0.0)])
+def test_the_p_value_of_what_was_tried_is_between_0_and_1(evidence, p_value):
+    assert Tried(CATALOGUE[0], CATALOGUE[0].starts[0], evidence).p_value == pytest.approx(p_value, abs=0.01)
 
 
 def test_effects_of_a_size_that_no_row_shows_are_listed_where_nothing_is_found():

@@ -148,7 +148,7 @@ def _rejected(explanation: Explanation, judgement: Judgement, words, units) -> t
         RejectedEffect(
             tried.effect,
             error,
-            math.exp(-max(tried.evidence, 0.0)),
+            tried.p_value,
             reasons[effect_name(tried.effect) in alike],
             words(tried.effect),
             units(tried.effect),

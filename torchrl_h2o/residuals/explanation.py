@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -53,6 +54,11 @@ class Tried:
     entry: CatalogueEntry
     effect: Effect
     evidence: float
+
+    @property
+    def p_value(self) -> float:
+        """Inverse of the likelihood ratio, which bounds the p-value of this evidence; at most 1."""
+        return math.exp(-max(self.evidence, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
