@@ -16,6 +16,7 @@ from torchrl_h2o.effects import (
     Gravity,
     JointDamping,
     JointFrictionLoss,
+    JointSpring,
     ResidualForce,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
@@ -35,8 +36,8 @@ EACH_JOINT = (
 )
 
 
-def found(measured, catalogue=CATALOGUE, known=()):
-    return search(SIMULATION, measured, catalogue, progress=LoopBar(disable=True), known=known)
+def found(measured, catalogue=CATALOGUE, **options):
+    return search(SIMULATION, measured, catalogue, progress=LoopBar(disable=True), **options)
 
 
 def values(effects):
@@ -108,14 +109,26 @@ def test_a_force_outside_the_catalogue_stands_beside_its_effects():
     assert force.effect.parameters["frequency_1"].value == pytest.approx(6.0, rel=0.02)
 
 
+def test_a_delay_that_hardly_shows_beside_the_noise_is_found():
+    explanation = found(recorded(SIMULATION.with_effects(ActionDelay(0.013, (0,))), 1200, noise=0.01))
+    assert values(explanation.effects) == pytest.approx({("ActionDelay", None): 0.013}, rel=0.15)
+
+
 def test_a_search_goes_on_from_known_effects():
-    truth = (Gravity(1.3), ActionDelay(0.013))
-    explanation = found(recorded(SIMULATION.with_effects(*truth), 1200), known=[Gravity(1.25)])
+    truth, first = (Gravity(1.3), ActionDelay(0.013)), []
+    measured = recorded(SIMULATION.with_effects(*truth), 1200)
+    explanation = found(measured, known=[Gravity(1.25)], so_far=first.append)
+    assert explanation.steps[0].put_in == ("all actuators late by 0.013 s",)
+    assert explanation.steps[0].dropped == ()
+    assert explanation.steps[0].evidence > 10.0 and explanation.steps[0].gain > 0.0
+    assert [type(effect) for effect in first[0].effects] == [Gravity, ActionDelay]
     assert values(explanation.effects) == pytest.approx(values(truth), rel=0.01)
 
 
 def test_what_was_tried_and_not_put_in_is_listed_by_its_evidence():
-    tried = found(recorded(SIMULATION.with_effects(Gravity(1.3)), 1200)).tried
+    catalogue = [e for e in SIMULATION.catalogue() if isinstance(e.effect, Gravity | JointSpring | Armature)]
+    tried = found(recorded(SIMULATION.with_effects(Gravity(1.3)), 800, noise=0.01), catalogue).tried
+    assert len(tried) > 1
     evidence = [one.evidence for one in tried]
     assert evidence == sorted(evidence, reverse=True)
     assert not any(isinstance(one.effect, Gravity) for one in tried)

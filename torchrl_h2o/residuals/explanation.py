@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Effect
+from torchrl_h2o.residuals.report.contents import SearchStep
 
 Interval = tuple[float, float]
 
@@ -70,6 +71,7 @@ class Explanation:
         tried: effects that were not put in, those of the most evidence first.
         others: other sets of effects that explain the data as well, with more than one other effect.
         unseen: effects of a usual size that the data could not have shown; only where nothing was found.
+        steps: the sets that the search passed through, in order, with what each gained.
         failures: attempts that failed with an error, and why.
         ended_in: stage in which the time for the search was up, or which did not begin for that; None if all ended.
     """
@@ -78,6 +80,7 @@ class Explanation:
     tried: tuple[Tried, ...] = ()
     others: tuple[tuple[Effect, ...], ...] = ()
     unseen: tuple[Effect, ...] = ()
+    steps: tuple[SearchStep, ...] = ()
     failures: tuple[str, ...] = ()
     ended_in: str | None = None
 

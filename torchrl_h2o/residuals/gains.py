@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchrl_h2o.effects import Armature, CatalogueEntry, Effect, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, weights, whitened
+from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, flat, weights, whitened
 from torchrl_h2o.residuals.score import FEWEST, Difference, Predictions, fitted_scales
 from torchrl_h2o.residuals.start_states import log_density
 from torchrl_h2o.residuals.sweep import Direction
@@ -19,6 +19,10 @@ from torchrl_h2o.residuals.sweep import Direction
 #: what every driven joint has, so that a machine may lack all of it
 OF_JOINTS = (JointFrictionLoss, JointDamping, Armature)
 START_SHARE = 0.02  # least share of a trial from which the values of every joint are fitted together
+RESCALED = np.logspace(-3.0, 3.0, 7)  # factors that are tried on the variance of what the simulator leaves unexplained
+GROUPS = 4  # groups of errors, each of which suggests a share of a candidate
+REFINED = 4  # refinements of the share of one candidate
+SLIGHT = 0.01  # gain of such a refinement, in nats a block, after which none follows
 LEAST_NATS = 2.0  # estimated gain of all blocks with which one of several joints or motors has an effect of its own
 
 
@@ -94,6 +98,8 @@ class Gains:
         share: shares of the errors in the score, (N).
         beside: changes by the values of the present effects, whitened, (N, p).
         block: index of the block of each error, (N).
+        group: index of the kind of windows, the horizon and the reading of each error, (N).
+        unexplained: share of the variance of each error that is fitted to the errors of its group, (N).
     """
 
     white: np.ndarray
@@ -101,13 +107,29 @@ class Gains:
     share: np.ndarray
     beside: np.ndarray
     block: np.ndarray
+    group: np.ndarray
+    unexplained: np.ndarray
 
     @classmethod
     def of(cls, predictions: Predictions, errors: Sequence[np.ndarray], beside: Sequence[np.ndarray]) -> Gains:
         """Prepares the gains for errors (as :meth:`Predictions.errors`), beside changes (N) of present effects."""
-        white, inverse, share = whitened(predictions, errors, fitted_scales(predictions, errors))
+        scales = fitted_scales(predictions, errors)
+        white, inverse, share = whitened(predictions, errors, scales)
         columns = np.stack([change * inverse for change in beside], 1) if beside else np.zeros((len(white), 0))
-        return cls(white, inverse, share, columns, block_of(predictions))
+        groups = _groups(errors)
+        fitted = flat([np.broadcast_to(scale, one.shape) for scale, one in zip(scales, errors, strict=True)])
+        return cls(white, inverse, share, columns, block_of(predictions), groups, fitted * inverse**2)
+
+    @cached_property
+    def _rescaled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Inverse roots of the variances that are tried, as a share of the present ones, (K, N), and their logarithms."""
+        root = 1.0 / np.sqrt(1.0 + (RESCALED[:, None] - 1.0) * self.unexplained)
+        return root, np.log(root)
+
+    @property
+    def num_blocks(self) -> int:
+        """Number of blocks."""
+        return int(self.block.max()) + 1
 
     @cached_property
     def weight(self) -> np.ndarray:
@@ -168,7 +190,7 @@ class Gains:
 
         The others are readjusted; the errors are taken as linear in all variables.
         """
-        left, found, before = {one.effect for one in variables}, [], np.zeros(len(self.white))
+        left, found, before = {one.effect for one in variables}, [], None
         while left:
             dropped = [effect for effect, _ in found]
             results = {effect: self.readjusted({*dropped, effect}, variables) for effect in left}
@@ -194,13 +216,34 @@ class Gains:
 
     def _alone(self, direction: Direction, column: np.ndarray) -> Lead | None:
         best = -(self.weight * self.white) @ column / max((self.weight * column) @ column, 1e-300)
-        low, high = direction.shares
-        shares = [
-            float(np.clip(share, low, high)) for share in (best, 2.0 * best, 0.5 * best, math.copysign(1.0, best))
-        ]
-        gains = [self._gain(share * column) for share in shares]
-        most = int(np.argmax(gains))
-        return self._lead((direction,), (shares[most],), shares[most] * column) if gains[most] > 0.0 else None
+        tried: dict[float, float] = {}
+
+        def gain(share: float) -> float:
+            share = float(np.clip(share, *direction.shares))
+            return tried.setdefault(share, self._gain(share * column))
+
+        for share in (best, math.copysign(1.0, best), *self._shares_of_groups(column)):
+            gain(share)
+        for _ in range(REFINED):
+            share = max(tried, key=lambda one: tried[one])
+            weight = self._weight_at(share * column)
+            better = -(weight * self.white) @ column / max((weight * column) @ column, 1e-300)
+            if gain(better) < tried[share] + SLIGHT * self.num_blocks:
+                break
+        share = max(tried, key=lambda one: tried[one])
+        return self._lead((direction,), (share,), share * column) if tried[share] > 0.0 else None
+
+    def _shares_of_groups(self, column: np.ndarray) -> np.ndarray:
+        """The shares that explain most of the errors of one group each, for the few groups with the largest gain."""
+
+        def sums(values: np.ndarray) -> np.ndarray:
+            return np.bincount(self.group, self.weight * values)
+
+        both, square, before = sums(self.white * column), sums(column**2), sums(self.white**2)
+        shares = -both / np.maximum(square, 1e-300)
+        left = np.maximum(before + shares * both, 1e-3 * before + 1e-300)
+        gains = np.bincount(self.group, self.share) * np.log(np.maximum(before, 1e-300) / left)
+        return shares[np.argsort(-gains)[:GROUPS]]
 
     def _together(self, directions: Sequence[Direction], columns: Sequence[np.ndarray]) -> Lead | None:
         """Directions of one kind, each with a share of its own, as far as they gain something."""
@@ -228,12 +271,39 @@ class Gains:
         return shares, gram
 
     def _lead(self, directions: tuple[Direction, ...], shares: tuple[float, ...], change: np.ndarray) -> Lead:
-        return Lead(directions, shares, self._gain(change) / (self.block.max() + 1), self._evidence(change))
+        return Lead(directions, shares, self._gain(change) / self.num_blocks, self._evidence(change))
 
     def _gain(self, change: np.ndarray) -> float:
-        return float((log_density(self.white + change) - log_density(self.white)) @ self.share)
+        return float((self._density(change) - log_density(self.white)) @ self.share)
 
-    def _evidence(self, change: np.ndarray, before: np.ndarray | float = 0.0) -> float:
-        by_error = (log_density(self.white + change) - log_density(self.white + before)) * self.share
-        difference = Difference(np.bincount(self.block, by_error))
+    def _evidence(self, change: np.ndarray, before: np.ndarray | None = None) -> float:
+        less = log_density(self.white) if before is None else self._density(before)
+        difference = Difference(np.bincount(self.block, (self._density(change) - less) * self.share))
         return difference.evidence if difference.acting >= FEWEST else float(difference.by_block.sum())
+
+    def _density(self, change: np.ndarray) -> np.ndarray:
+        """Log density of the errors after a change, (N), with the variance of each group that makes them likeliest."""
+        return self._likeliest(change)[0]
+
+    def _weight_at(self, change: np.ndarray) -> np.ndarray:
+        """Weights of the errors as in :attr:`weight`, after a change and with the variances that are likeliest then."""
+        root = self._likeliest(change)[1]
+        return self.share * weights((self.white + change) * root) * root**2
+
+    def _likeliest(self, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Log density of the errors after a change, and the inverse roots of the likeliest variances, each (N)."""
+        root, log_root = self._rescaled
+        density = log_density((self.white + change) * root) + log_root
+        likely = np.stack([np.bincount(self.group, one * self.share) for one in density])
+        choice = likely.argmax(0)[self.group], np.arange(len(self.group))
+        return density[choice], root[choice]
+
+
+def _groups(errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Index of the kind of windows, the horizon and the reading of each error, (N)."""
+    found, count = [], 0
+    for one in errors:
+        groups = np.arange(count, count + one[0].size).reshape(one[0].shape)
+        found.append(np.broadcast_to(groups, one.shape))
+        count += one[0].size
+    return flat(found)

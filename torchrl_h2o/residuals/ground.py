@@ -16,13 +16,14 @@ from torchrl_h2o.residuals.score import Difference, Model, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-ROUGH_STEPS = 2560  # physics steps that are simulated for each candidate of a sweep and in first fits
-ROUGH_ROWS = 1024  # rows beyond which these are not more
+ROUGH_WORK = 24_000  # physics steps times degrees of freedom that are simulated for each candidate of a sweep
+ROUGH_ROWS = 1024  # rows beyond which these are not more, unless that suffices for all
 FITTED = 3  # of these, the best whose values are fitted
 SKETCH = 3  # steps of such a fit
 GROWN = 5  # steps of the fit of a set after an effect was added
 REFITTED = 3  # fits of a set, each from the start states that the fit before gives
 NATS_OF_SURPRISE = 2.0  # evidence that an effect needs for each degree of surprise
+MATTERS = 0.01  # share of the errors of the simulator without effects, below which what is left is not explained
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
@@ -96,11 +97,23 @@ class Ground:
         measured: Measured,
         effects: Sequence[Effect] = (),
         level: float = DEFAULTS.level,
+        floor: np.ndarray | None = None,
     ) -> Ground:
-        """The ground near a set of effects."""
+        """The ground near a set of effects.
+
+        Args:
+            simulation: the simulator without effects.
+            measured: the data.
+            effects: the set.
+            level: significance level at which an effect is added.
+            floor: that of another ground; by default a share of the errors of the simulator without effects.
+        """
         model = Model.of(simulation.with_effects(*effects), measured)
+        if floor is None:
+            errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
+            floor = np.concatenate([(MATTERS * np.median(np.abs(error), axis=0)) ** 2 for error in errors])
         counts = model.fit.effective_counts(model.fit.errors())
-        base = Model(replace(model.fit, counts=counts), replace(model.selection, counts=counts))
+        base = Model(*(replace(part, counts=counts, floor=floor) for part in (model.fit, model.selection)))
         return cls(simulation, base, level, {tuple(effects): base})
 
     @property
@@ -122,11 +135,13 @@ class Ground:
         return self.model(effects).fit.of_simulation(self.simulation)
 
     def rough(self, effects: Sequence[Effect]) -> Predictions:
-        """As :meth:`fit_part` in some of the blocks, without the shortest windows."""
-        part = self.model(effects).fit
-        rows = min(ROUGH_ROWS, ROUGH_STEPS // self.simulation.frame_skip)
-        rough = part.starts.rough(max(8, rows // part.blocks.steps))
-        return Predictions(rough).of_simulation(self.simulation)
+        """As :meth:`fit_part`; for slow models in some of the blocks, without the shortest windows."""
+        part, blocks = self.model(effects).fit, self.base.fit.blocks
+        most = ROUGH_WORK // (self.simulation.frame_skip * self.simulation.model.nv)
+        if len(blocks.windows) * len(blocks) * blocks.steps <= most:
+            return part.of_simulation(self.simulation)
+        own = Predictions(part.starts.rough(max(8, min(ROUGH_ROWS, most) // blocks.steps)), floor=part.floor)
+        return replace(own, counts=own.effective_counts(own.errors())).of_simulation(self.simulation)
 
     def found(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its scores."""

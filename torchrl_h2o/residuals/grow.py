@@ -15,7 +15,7 @@ from torchrl_h2o.residuals.refit import slopes_of, variables_of
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
 
-TRIED = 8  # candidates of the largest estimated gain whose gain is then simulated
+TRIED = 16  # candidates of the largest estimated gain whose gain is then simulated
 ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
 MOST_REFUSED = 9  # candidates that are refused one after another before none is added
 MOST_TERMS = 6  # largest number of terms of a force outside the catalogue
@@ -28,10 +28,18 @@ def grow(
     ground: Ground,
     found: Found,
     directions: Sequence[Direction],
-    advance: Callable[[Found], object],
+    advance: Callable[[Found, Found], object],
     tried: dict[str, Tried],
 ) -> Found:
-    """Adds candidates one after another while the rows for selection are predicted better."""
+    """Adds candidates one after another while the rows for selection are predicted better.
+
+    Args:
+        ground: where sets are compared.
+        found: the set.
+        directions: the candidates.
+        advance: called with each better set and the one before.
+        tried: takes up each effect that was fitted, by name.
+    """
     refused: set[frozenset[str]] = set()
     among = max(1, len({one.entry.name for one in directions}))
     while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
@@ -44,8 +52,8 @@ def grow(
         if better:
             best = most_usual(better)
             many = len(best.entries) > len(found.entries) + 2
-            found, refused = ground.fitted(best.entries, best.effects), set()
-            advance(found)
+            before, found, refused = found, ground.fitted(best.entries, best.effects), set()
+            advance(found, before)
             if many:  # the errors now change with the candidates in other ways than at the sweep
                 break
         else:
@@ -61,7 +69,7 @@ def _remember(tried: dict[str, Tried], more: Found, less: Found) -> None:
 
 
 def with_force(
-    ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], advance: Callable[[Found], object]
+    ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], advance: Callable[[Found, Found], object]
 ) -> Found:
     """Adds terms of a force outside the catalogue while the rows for selection are predicted better."""
     for _ in range(MOST_TERMS):
@@ -79,8 +87,8 @@ def with_force(
         if not better:
             break
         best = most_usual(better)
-        found = ground.fitted(best.entries, best.effects)
-        advance(found)
+        before, found = found, ground.fitted(best.entries, best.effects)
+        advance(found, before)
     return found
 
 
@@ -103,7 +111,7 @@ def with_one_more(
     """
     rough = ground.rough(found.effects)
     gains = gains_beside(rough, found)
-    least = -0.5 * math.log(ground.level)  # what fewer rows must show; the rows for selection decide
+    least = -0.5 * math.log(ground.level) * len(rough.blocks) / len(ground.base.fit.blocks)
     leads = [
         lead
         for lead in best_of_each(gains.leads(directions))

@@ -39,10 +39,12 @@ class Predictions:
         starts: start states of the simulation without the added effects.
         counts: effective share of a window for each kind of windows and horizon, (h): neighbouring windows with
             similar errors count less; see :meth:`effective_counts`.
+        floor: variance of errors that are too small to matter, (H, n) for the horizons 1, 2, 4, ...; none by default.
     """
 
     starts: StartStates
     counts: tuple[np.ndarray, ...] = ()
+    floor: np.ndarray | None = None
 
     @cached_property
     def shares(self) -> tuple[np.ndarray, ...]:
@@ -129,8 +131,11 @@ class Predictions:
         observed = record.simulation.pipeline.observe_memoryless
         zeros, step = np.zeros(len(noise.sensor)), record.simulation.control_step
         gain = observed(zeros + 1.0, step) - observed(zeros, step)
+        floor = np.zeros((self.blocks.num_horizons, len(noise.sensor))) if self.floor is None else self.floor
         return [
-            gain**2 * (self.starts.spread_ahead(windows) + noise.sensor**2) + ROUNDING**2
+            gain**2 * (self.starts.spread_ahead(windows) + noise.sensor**2)
+            + ROUNDING**2
+            + floor[np.log2(windows.horizons).astype(int)]
             for windows in self.blocks.windows
         ]
 

@@ -21,7 +21,9 @@ from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.prune import prune, replaced
 from torchrl_h2o.residuals.refit import fit_set, interval
-from torchrl_h2o.residuals.score import Predictions
+from torchrl_h2o.residuals.report.contents import SearchStep
+from torchrl_h2o.residuals.report.words import effect_words
+from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, sweep
@@ -70,12 +72,16 @@ def search(
     tried: dict[str, Tried] = {}
     latest = [known_set(catalogue, known)]
 
-    def better(found: Found) -> None:
+    steps: list[SearchStep] = []
+
+    def better(found: Found, before: Found) -> None:
+        if found.names != before.names:
+            steps.append(_step(found, before, simulation))
         latest.append(found)
         if found.entries:
             progress.has_result()
         progress.show_found(found.entries)
-        so_far(_explanation(found))
+        so_far(replace(_explanation(found), steps=tuple(steps)))
 
     ended_in, unseen, alike = None, (), []
     progress.stage(EFFECTS)
@@ -92,7 +98,17 @@ def search(
         explanation, ended_in = _explanation(found), ended_in or str(end)
     left = [one for name, one in tried.items() if name not in found.names]
     left.sort(key=lambda one: -one.evidence)
-    return replace(explanation, tried=tuple(left), unseen=unseen, ended_in=ended_in)
+    return replace(explanation, tried=tuple(left), unseen=unseen, steps=tuple(steps), ended_in=ended_in)
+
+
+def _step(found: Found, before: Found, simulation: Simulation) -> SearchStep:
+    """A step of the search in words, with what it gained."""
+    difference = Difference(found.scores - before.scores)
+    put_in, dropped = (
+        tuple(effect_words(effect, simulation.names) for effect in one.without(other.names)[1])
+        for one, other in ((found, before), (before, found))
+    )
+    return SearchStep(put_in, dropped, difference.mean / len(simulation.state_map.names), difference.evidence)
 
 
 def known_set(catalogue: Sequence[CatalogueEntry], known: Sequence[Effect]) -> Found:
@@ -111,7 +127,7 @@ def _searched(
     found: Found,
     catalogue: Sequence[CatalogueEntry],
     progress: LoopBar,
-    better: Callable[[Found], object],
+    better: Callable[[Found, Found], object],
     tried: dict[str, Tried],
 ) -> tuple[Ground, list[list[Found]], tuple[Effect, ...]]:
     """Sweeps and grows, then drops and replaces, until nothing changes; hands each better set to ``better``."""
@@ -120,7 +136,7 @@ def _searched(
     measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
         if number:
-            ground = Ground.of(ground.simulation, measured, found.effects, ground.level)
+            ground = Ground.of(ground.simulation, measured, found.effects, ground.level, ground.base.fit.floor)
         found = ground.fitted(found.entries, found.effects)
         if number > 1:
             best = best_of_each(gains_beside(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
@@ -137,16 +153,16 @@ def _searched(
             progress.stage(FORCES)
             found = with_force(ground, found, every, better)
             if before and found.names != before:  # a force alone may explain what effects were found for
-                alone = with_force(ground, ground.found((), ()), every, lambda _: None)
+                alone = with_force(ground, ground.found((), ()), every, lambda *_: None)
                 if alone.entries and is_preferred(alone, found):
+                    better(alone, found)
                     found = alone
-                    better(found)
         if found.names == before:
             progress.stage(OTHERS)
-            found = prune(ground, found)
-            better(found)
-            found, alike = replaced(ground, found, directions, lambda: progress.closer(0.05))
-            better(found)
+            pruned = prune(ground, found)
+            better(pruned, found)
+            found, alike = replaced(ground, pruned, directions, lambda: progress.closer(0.05))
+            better(found, pruned)
             if found.names == before:
                 break
     return ground, alike, () if found.entries else unseen
@@ -180,7 +196,7 @@ def _unseen(
 def _with_intervals(ground: Ground, found: Found) -> tuple[Found, Sequence[Mapping[str, float]]]:
     """A set fitted to the rows for fits and for selection, and the half-widths of its intervals."""
     model = ground.model(found.effects)
-    parts = [part.of_simulation(ground.simulation) for part in (model.fit, model.selection)]
+    parts = [replace(part, floor=None).of_simulation(ground.simulation) for part in (model.fit, model.selection)]
     fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
     return replace(found, effects=fit.effects), fit.half_widths
 

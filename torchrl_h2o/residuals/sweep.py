@@ -27,6 +27,8 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 #: effects that act otherwise at each size, so that every trial is simulated
 NOT_LINEAR = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay)
+SMOOTH = (ActionDelay, ActionLag, ObservationDelay)  # of these, those whose errors are linear in a small size
+LEAST_FACTOR = 0.1  # least factor that a share of a trial stands for, if the trial is above it
 MOST_SHARE = 4.0  # largest move along a candidate's direction, in moves of its trial
 
 
@@ -55,7 +57,7 @@ class Direction:
         return bool(self.trial[name] > self.entry.effect.parameters[name].neutral)
 
     def effect(self, share: float) -> Effect:
-        """The effect at a share of the trial; powers of a factor. A limit that is never reached has only its trial."""
+        """The effect at a share of the trial. A limit that is never reached has only its trial."""
         values = {}
         for name, value in self.trial.items():
             parameter = self.entry.effect.parameters[name]
@@ -63,7 +65,8 @@ class Direction:
             if not math.isfinite(neutral):
                 values[name] = value
             elif neutral == 1.0 and value > 0.0:
-                values[name] = float(np.clip(value**share, low, high))
+                scaled = value**share if isinstance(self.entry.effect, NOT_LINEAR) else 1.0 + share * (value - 1.0)
+                values[name] = float(np.clip(max(scaled, min(value, LEAST_FACTOR)), low, high))
             else:
                 values[name] = float(np.clip(neutral + share * (value - neutral), low, high))
         return self.entry.effect.with_parameters(values)
@@ -96,12 +99,17 @@ def sweep(
         if len(own) > 1 and all(parts) and not isinstance(entry.effect, JointRange):
             shared.append((entry, [part for part in parts if part is not None]))
             continue
+        without_effect: set[tuple[bool, ...]] = set()
         for trial in _simulated_trials(entry):
+            if _side(entry, trial) in without_effect:  # a smaller trial has none, either
+                continue
             try:
                 change = flat(predictions.errors([*beside, entry.effect.with_parameters(trial)])) - before
             except ValueError:
                 continue
-            if np.abs(change).max() > 0.0:
+            if np.abs(change).max() == 0.0:
+                without_effect.add(_side(entry, trial))
+            else:
                 shares = _shares(entry, trial, simulation, beside)
                 single = len(own) == 1 and len(trial) == 1 and not isinstance(entry.effect, JointRange)
                 direction = Direction(entry, trial, change.astype(np.float32), shares, min(own) if single else None)
@@ -109,7 +117,7 @@ def sweep(
     for entry, parts in shared:
         if directions := _together(entry, [found.get(part.name, []) for part in parts]):
             found[entry.name] = directions
-    return [direction for directions in found.values() for direction in directions]
+    return [direction for directions in found.values() for direction in reversed(directions)]
 
 
 def _alone(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tuple[type, int], CatalogueEntry]:
@@ -123,15 +131,14 @@ def _alone(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tu
 
 
 def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
-    """The trials to simulate: all if the errors are not linear; otherwise the least factor on either side of 1, or the
-    last trial along each line through the neutral values."""
-    if isinstance(entry.effect, NOT_LINEAR):
-        return list(entry.trials)
+    """The trials to simulate, larger ones first: one along each line through the neutral values, or, where the errors
+    are not linear in the size, all. The least of three lags or delays is left out, because small ones are linear."""
     neutral = {name: parameter.neutral for name, parameter in entry.effect.parameters.items()}
+    by_size = sorted(entry.trials, key=lambda trial: -_size(entry, trial))
+    if isinstance(entry.effect, NOT_LINEAR):
+        return by_size[:-1] if isinstance(entry.effect, SMOOTH) and len(by_size) > 2 else by_size
     if len(entry.fitted) == 1 and neutral[entry.fitted[0]] == 1.0:
-        (name,) = entry.fitted
-        by_size = sorted(entry.trials, key=lambda trial: -abs(math.log(trial[name])))
-        return list({trial[name] > 1.0: trial for trial in by_size}.values())
+        return by_size[-1:]
     lines = {}
     for trial in entry.trials:
         moves = np.array([value - neutral[name] for name, value in trial.items()])
@@ -140,6 +147,20 @@ def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
         if largest > 0.0 or line not in lines:  # the opposite direction is the same line
             lines[line] = trial
     return list(lines.values())
+
+
+def _size(entry: CatalogueEntry, trial: Mapping[str, float]) -> float:
+    """How far a trial is from neutral: that of a factor by its logarithm, that of a limit by its inverse."""
+    (name, value), *_ = trial.items()
+    neutral = entry.effect.parameters[name].neutral
+    if not math.isfinite(neutral):
+        return 1.0 / max(abs(value), 1e-300)
+    return abs(math.log(value)) if neutral == 1.0 and value > 0.0 else abs(value - neutral)
+
+
+def _side(entry: CatalogueEntry, trial: Mapping[str, float]) -> tuple[bool, ...]:
+    """On which side of the neutral values a trial is."""
+    return tuple(value > entry.effect.parameters[name].neutral for name, value in trial.items())
 
 
 def _together(entry: CatalogueEntry, parts: Sequence[Sequence[Direction]]) -> list[Direction]:

@@ -11,6 +11,7 @@ from torchrl_h2o.residuals.report.contents import (
     IndistinguishableGroup,
     Interval,
     RejectedEffect,
+    SearchStep,
     TwoSample,
 )
 from torchrl_h2o.residuals.report.document import Report
@@ -44,6 +45,10 @@ def full_report() -> Report:
         ),
         two_sample=TwoSample(0.93, 0.52),
         unexplained_intervals=(Interval(14.2, 14.9, 70, 38.0, "a push from outside"),),
+        steps=(
+            SearchStep(("gravity × 0.5",), (), 0.71, 28.4),
+            SearchStep((mass.words, friction.words), ("dry friction of joint wrist + 0.02 N·m",), 0.082, 9.6),
+        ),
         stop_test="a permutation test of the held-out residual, at 1 %",
         wall_s=84.2,
         trace=trace(),
@@ -151,6 +156,7 @@ def renamed(report: Report, text: str) -> Report:
         rejected=tuple(dataclasses.replace(rejected, reason=text) for rejected in report.rejected),
         indistinguishable=tuple(dataclasses.replace(g, separated_by=text) for g in report.indistinguishable),
         unexplained_intervals=tuple(dataclasses.replace(i, set_aside=text) for i in report.unexplained_intervals),
+        steps=tuple(dataclasses.replace(step, put_in=(text,), dropped=(text,)) for step in report.steps),
         stop_test=text,
         trace=dataclasses.replace(report.trace, names=names, units=(text,) * len(names)),
     )

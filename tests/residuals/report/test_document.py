@@ -218,7 +218,7 @@ def test_the_file_holds_what_a_reader_of_it_looks_for():
         *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "two_sample"),
         *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "made_by", "trace"),
         *("windows", "runs", "mended_model", "verdict", "failures", "unfinished", "ended_in", "left_out"),
-        *("audit", "others"),
+        *("audit", "others", "steps"),
     }
     assert {"name", "declared", "parameters", "error_after"} <= set(entries["effects"][0])
     assert entries["effects"][2]["name"] == "JointFrictionLoss[elbow]"

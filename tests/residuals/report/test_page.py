@@ -85,6 +85,12 @@ def test_the_page_names_every_effect_that_was_tried(full):
         assert "actuators 0 × 0.83" in full.text
 
 
+def test_the_page_shows_what_each_step_of_the_search_put_in_and_gained(full):
+    for step in full_report().steps:
+        assert all(words in full.text for words in (*step.put_in, *step.dropped))
+        assert f"{step.gain:.2g}" in full.text
+
+
 def test_the_page_gives_values_with_units_and_intervals(full):
     assert "torque 0.0412 N·m between 0.0391 and 0.0433 N·m" in full.text
     assert "scale 0.5001 between 0.4991 and 0.5012" in full.text

@@ -89,6 +89,23 @@ class RejectedEffect:
 
 
 @dataclass(frozen=True)
+class SearchStep:
+    """A step of the search to a set of effects that predicts the data better, or as well and is more usual.
+
+    Args:
+        put_in: effects that were put in, in words.
+        dropped: effects that were dropped, in words.
+        gain: gain of the log density of the rows for fits and for selection, in nats for each reading.
+        evidence: logarithm of the likelihood ratio for a gain above 0, paired over blocks of rows, in nats.
+    """
+
+    put_in: tuple[str, ...]
+    dropped: tuple[str, ...]
+    gain: float
+    evidence: float
+
+
+@dataclass(frozen=True)
 class IndistinguishableGroup:
     """Effects that these data cannot tell apart.
 
@@ -229,6 +246,7 @@ class ReportContents:
         others: other sets of effects that explain the data as well, the most usual ones first.
         two_sample: AUC of a classifier of measured against simulated transitions.
         unexplained_intervals: intervals that were excluded as disturbed.
+        steps: the steps of the search, in order.
         stop_test: description of the test by which the search stopped.
         wall_s: duration in s; None if not timed.
         made_by: commit, versions, CPU seconds and machine, see :func:`~torchrl_h2o.provenance.provenance`.
@@ -258,6 +276,7 @@ class ReportContents:
     others: tuple[OtherExplanation, ...] = ()
     two_sample: TwoSample = TwoSample()
     unexplained_intervals: tuple[Interval, ...] = ()
+    steps: tuple[SearchStep, ...] = ()
     stop_test: str = ""
     wall_s: float | None = None
     made_by: Mapping[str, Any] = field(default_factory=dict)

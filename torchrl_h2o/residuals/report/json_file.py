@@ -22,6 +22,7 @@ from torchrl_h2o.residuals.report.contents import (
     OtherExplanation,
     RejectedEffect,
     ReportContents,
+    SearchStep,
     TwoSample,
     Verdict,
 )
@@ -127,6 +128,7 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "two_sample": dataclasses.asdict(report.two_sample),
             "unexplained_intervals": [dataclasses.asdict(interval) for interval in report.unexplained_intervals],
             "data": dataclasses.asdict(report.data),
+            "steps": [dataclasses.asdict(step) for step in report.steps],
             "stop_test": report.stop_test,
             "conclusion": report.conclusion,
             "wall_s": report.wall_s,
@@ -164,6 +166,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "two_sample": _read(TwoSample, entries["two_sample"]),
         "unexplained_intervals": tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
         "data": _read(DataSummary, entries["data"]),
+        "steps": tuple(_step(entry) for entry in entries.get("steps", ())),
         "stop_test": entries["stop_test"],
         "conclusion": entries["conclusion"],
         "wall_s": entries["wall_s"],
@@ -288,6 +291,10 @@ def _other(entry: Mapping[str, Any]) -> OtherExplanation:
 def _verdict(entry: Mapping[str, Any]) -> Verdict:
     lists = {name: tuple(entry.get(name, ())) for name in ("reasons", "caveats", "undetectable")}
     return _read(Verdict, entry, **lists)
+
+
+def _step(entry: Mapping[str, Any]) -> SearchStep:
+    return _read(SearchStep, entry, put_in=tuple(entry["put_in"]), dropped=tuple(entry["dropped"]))
 
 
 def _window(entry: Mapping[str, Any]) -> ShownWindow:
