@@ -120,7 +120,8 @@ def test_a_search_goes_on_from_known_effects():
     explanation = found(measured, known=[Gravity(1.25)], so_far=first.append)
     assert explanation.steps[0].put_in == ("all actuators late by 0.013 s",)
     assert explanation.steps[0].dropped == ()
-    assert explanation.steps[0].evidence > 10.0 and explanation.steps[0].gain > 0.0
+    assert explanation.steps[0].evidence > 10.0
+    assert explanation.steps[0].gain > 0.0
     assert [type(effect) for effect in first[0].effects] == [Gravity, ActionDelay]
     assert values(explanation.effects) == pytest.approx(values(truth), rel=0.01)
 

@@ -122,7 +122,7 @@ class Gains:
 
     @cached_property
     def _rescaled(self) -> tuple[np.ndarray, np.ndarray]:
-        """Inverse roots of the variances that are tried, as a share of the present ones, (K, N), and their logarithms."""
+        """Inverse roots of the variances that are tried, in those at hand, (K, N), and their logarithms."""
         root = 1.0 / np.sqrt(1.0 + (RESCALED[:, None] - 1.0) * self.unexplained)
         return root, np.log(root)
 
