@@ -16,7 +16,7 @@ from torchrl_h2o.effects import (
     Gravity,
     JointFrictionLoss,
 )
-from torchrl_h2o.residuals import LoopSettings, Report, Simulation, Split, close_the_loop, residuals
+from torchrl_h2o.residuals import Report, Simulation, Split, close_the_loop, residuals
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
@@ -24,12 +24,8 @@ FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1
 ROWS = 5000
 
 
-# the classifier has its own tests; here it only has to run
-SETTINGS = LoopSettings(classifier_updates=20)
-
-
 def closed(measured, simulation=SIMULATION, catalogue=None, **kwargs):
-    return close_the_loop(simulation, measured, catalogue, progress=False, settings=SETTINGS, **kwargs)
+    return close_the_loop(simulation, measured, catalogue, progress=False, **kwargs)
 
 
 @pytest.mark.slow
@@ -190,9 +186,9 @@ def test_an_argument_that_cannot_be_used_is_named(arguments, said):
 
 def test_a_progress_bar_is_shown_only_if_asked(capsys):
     measured = recorded(SIMULATION.with_effects(Gravity(1.3)), 300)
-    close_the_loop(SIMULATION, measured, [GRAVITY], progress=False, settings=SETTINGS)
+    close_the_loop(SIMULATION, measured, [GRAVITY], progress=False)
     quiet = capsys.readouterr()
-    close_the_loop(SIMULATION, measured, [GRAVITY], progress=True, settings=SETTINGS)
+    close_the_loop(SIMULATION, measured, [GRAVITY], progress=True)
     shown = capsys.readouterr()
     assert "closing the loop" not in quiet.out + quiet.err
     assert quiet.out == shown.out

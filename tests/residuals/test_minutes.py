@@ -6,7 +6,7 @@ import pytest
 
 from tests.residuals.pendulum import pendulum, recorded
 from torchrl_h2o.effects import CatalogueEntry, Gravity, JointFrictionLoss
-from torchrl_h2o.residuals import LoopSettings, Report, close_the_loop, explain, gather_evidence
+from torchrl_h2o.residuals import Report, close_the_loop, explain, gather_evidence
 from torchrl_h2o.residuals.compose_report import compose_report
 from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.progress import REPORT, LoopBar
@@ -14,7 +14,6 @@ from torchrl_h2o.residuals.report.contents import UNDECIDED, Verdict
 
 SIMULATION = pendulum()
 GRAVITY = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
-QUICK = LoopSettings(classifier_updates=20)
 FRICTION = CatalogueEntry(JointFrictionLoss(), ({"torque": 0.01}, {"torque": 0.1}))
 
 
@@ -35,9 +34,7 @@ def closed_within(seconds, measured, catalogue=(GRAVITY, FRICTION), evaluation=0
         evidence = gather_evidence(replace(SIMULATION, check=tick), measured)
         explanation = explain(evidence, catalogue, progress=bar)
         bar.stage(REPORT)
-        report = compose_report(
-            evidence, explanation, judge(evidence, explanation, catalogue, progress=bar, settings=QUICK)
-        )
+        report = compose_report(evidence, explanation, judge(evidence, explanation, catalogue, progress=bar))
     return report, now
 
 

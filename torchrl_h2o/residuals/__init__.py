@@ -4,7 +4,6 @@ from torchrl_h2o.residuals.close_the_loop import close_the_loop, explain
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.floor import explainable_floor
-from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -35,5 +34,4 @@ __all__ = [
     "residuals",
     "search",
     "simulate_transitions",
-    "two_sample_auc",
 ]

@@ -57,7 +57,7 @@ def close_the_loop(
         source: name of the data in the report.
         held_out: share of the transitions, taken from the end, on which errors are reported, or the indices of the
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
-        seed: seed for the choice of screened windows, the synthetic noise and the classifiers.
+        seed: seed for the synthetic noise and the network that learns from what is left.
         progress: whether to show a progress bar.
         minutes: time for all of it, more than 0: the search ends early enough for its result to be fitted and judged,
             and what could not be judged in time is named in the report. None for as long as it takes.
@@ -81,8 +81,7 @@ def close_the_loop(
         >>> measured = GymEnv("InvertedPendulum-v5").rollout(300, break_when_any_done=False)
         >>> simulator = TransformedEnv(GymEnv("InvertedPendulum-v5"), DynamicsGap(Gravity(2.0)))
         >>> gravity = CatalogueEntry(Gravity(), ({"scale": 0.8}, {"scale": 1.25}))
-        >>> quick = LoopSettings(classifier_updates=50)
-        >>> report = close_the_loop(simulator, measured, [gravity], progress=False, settings=quick)
+        >>> report = close_the_loop(simulator, measured, [gravity], progress=False)
         >>> [effect.describe() for effect in report.effects]
         ['gravity × 0.5']
     """

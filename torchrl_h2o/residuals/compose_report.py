@@ -68,7 +68,7 @@ def compose_report(
             )
             for group in judgement.alternatives
         ),
-        two_sample=judgement.two_sample,
+        predictions=judgement.predictions,
         unexplained_intervals=_intervals(judgement),
         steps=explanation.steps,
         stop_test=stop_test(settings.level),

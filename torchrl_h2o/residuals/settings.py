@@ -24,8 +24,6 @@ class LoopSettings:
     """Times ahead of which the verdict takes the longest that the data allow, in s, ascending."""
     max_windows: int = 3500
     """Largest number of windows in a judgement; more are slower and hardly more precise."""
-    classifier_updates: int = 600
-    """Updates of the discriminators in the two-sample test."""
 
 
 DEFAULTS = LoopSettings()

@@ -163,7 +163,7 @@ def summary_of_mending(directory: Path) -> dict[str, Any]:
     entries = report.to_json()
     error = entries["error"] and {key: entries["error"][key] for key in ("metric", "unit", "before", "after", "floor")}
     effects = [{key: effect[key] for key in ("name", "words", "parameters")} for effect in entries["effects"]]
-    kept = {key: entries[key] for key in ("sentence", "conclusion", "two_sample", "data", "wall_s")}
+    kept = {key: entries[key] for key in ("sentence", "conclusion", "data", "wall_s")}
     return {"mended": {**kept, "recommended": report.recommended, "effects": effects, "error": error}}
 
 

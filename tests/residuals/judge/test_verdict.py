@@ -20,25 +20,39 @@ from torchrl_h2o.effects import (
     ObservationGain,
 )
 from torchrl_h2o.residuals.judge.held_out_error import error_summary
+from torchrl_h2o.residuals.judge.prediction_table import Predicted, predicted
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED,
     EXPLAINED_IN_PART,
     NOT_EXPLAINED,
     NOTHING_MISSING,
-    TwoSample,
     Verdict,
 )
+from torchrl_h2o.residuals.settings import DEFAULTS
 
 SIMULATION = pendulum()
 
 
-def verdict(truth, found=(), noise=0.01, rows=2000):
-    """The verdict where a classifier cannot tell measured from simulated transitions."""
+def verdict(truth, found=(), noise=0.01, rows=2000, steps=None):
+    """The verdict, without a table of predictions or with that some steps ahead."""
     measured = recorded(SIMULATION.with_effects(*truth), rows, noise=noise)
     mended = SIMULATION.with_effects(*found)
     error = error_summary(SIMULATION, mended, measured)
-    return reach_verdict(SIMULATION, mended, measured, found, error, TwoSample(None, 0.5))
+    predictions = None if steps is None else predicted(SIMULATION, mended, measured, steps)
+    return reach_verdict(SIMULATION, mended, measured, found, error, predictions)
+
+
+def learning(left, guess=100.0):
+    """Predictions where a network leaves a share of the mended simulator's error, and the guess has a multiple."""
+    error = 0.2 + 0.01 * np.random.default_rng(0).random((1, 300))
+    losses = {
+        "as_it_is": 2.0 * error,
+        "mended": error,
+        "velocities_stay": guess * error,
+        "mended_and_network": left * error,
+    }
+    return Predicted(("total",), 0.1, losses, DEFAULTS)
 
 
 @cache
@@ -80,12 +94,12 @@ def test_half_an_explanation_is_called_that():
 
 
 @pytest.mark.parametrize(("left", "kind"), [(0.1, EXPLAINED_IN_PART), (0.001, EXPLAINED)])
-def test_a_classifier_that_sees_a_difference_counts_unless_all_errors_nearly_vanish(left, kind):
+def test_what_a_network_learns_counts_unless_all_errors_nearly_vanish(left, kind):
     """The sentence's quantity alone may be right by chance, such as the pitch of a robot with a larger wheel."""
     found, measured, error = right_gravity()
     head = replace(error.headline, after=0.001 * error.headline.before)
     error = replace(error, headline=head, after=left * error.before)
-    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.94))
+    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, learning(0.5))
     assert reached.kind == kind
 
 
@@ -93,7 +107,9 @@ def test_a_small_share_of_an_absurd_error_is_no_small_error():
     """A simulator without the rotor of a light link is wrong by turns; what is left may still exceed the motion."""
     found, measured, error = right_gravity()
     error = replace(error, headline=replace(error.headline, before=1e3), before=1e3 * error.before)
-    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.99, 0.8))
+    reached = reach_verdict(
+        SIMULATION, SIMULATION.with_effects(*found), measured, found, error, learning(0.5, guess=1.0)
+    )
     assert reached.kind == EXPLAINED_IN_PART
 
 
@@ -117,7 +133,7 @@ def test_effects_that_raise_the_error_of_the_sentence_are_not_recommended(factor
     """No other test sees a fault here: the effect is right."""
     found, measured, error = right_gravity()
     error = replace(error, headline=replace(error.headline, after=factor * error.headline.before))
-    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, TwoSample(0.9, 0.5))
+    reached = reach_verdict(SIMULATION, SIMULATION.with_effects(*found), measured, found, error, None)
     assert reached.recommended == recommended
     assert any("raise the error of elbow" in reason for reason in reached.reasons) != recommended
 
@@ -137,11 +153,11 @@ def test_a_value_beyond_belief_is_not_recommended():
 
 def test_a_joint_that_hardly_moves_explains_no_friction():
     """The joint is slow because of its damping. A rotor of 30 kg·m² keeps it slow too, and lowers all errors."""
-    frozen = verdict((JointDamping(3.0),), (Armature(30.0),), noise=0.0)
+    frozen = verdict((JointDamping(3.0),), (Armature(30.0),), noise=0.0, steps=10)
     assert (frozen.kind, frozen.recommended) == (NOT_EXPLAINED, False)
     (reason,) = [reason for reason in frozen.reasons if "every velocity stays as it is" in reason]
-    assert "elbow 100 ms ahead: " in reason
-    assert verdict((JointDamping(3.0),), (JointDamping(3.0),), noise=0.0).kind == EXPLAINED
+    assert "200 ms ahead, " in reason
+    assert verdict((JointDamping(3.0),), (JointDamping(3.0),), noise=0.0, steps=10).kind == EXPLAINED
 
 
 @pytest.mark.parametrize(("delay", "named"), [(1.0, True), (0.9995, True), (0.9, False), (0.02, False)])
@@ -162,17 +178,14 @@ def test_an_unknown_kind_is_refused():
 
 
 def test_action_noise_that_stands_in_for_another_cause_is_not_recommended():
-    """Noise lowers no error, so it is judged by the classifier."""
     measured, found = recorded(SIMULATION.with_effects(JointFrictionLoss(0.1)), 3000, noise=0.01), (ActionNoise(0.2),)
     error = error_summary(SIMULATION, SIMULATION, measured)
-    worse, better, neither_tells = (
-        reach_verdict(SIMULATION, SIMULATION, measured, found, error, TwoSample(before, after))
-        for before, after in ((0.7, 0.75), (0.9, 0.75), (0.55, 0.6))
+    stands_in, noise_alone = (
+        reach_verdict(SIMULATION, SIMULATION, measured, found, error, learning(left)) for left in (0.6, 0.95)
     )
-    assert (worse.kind, worse.recommended) == (NOT_EXPLAINED, False)
-    assert "no more like the measured ones (AUC 0.7 → 0.75)" in worse.reasons[0]
-    assert better.recommended
-    assert neither_tells.recommended
+    assert (stands_in.kind, stands_in.recommended) == (NOT_EXPLAINED, False)
+    assert "a small network removes 40%" in stands_in.reasons[0]
+    assert noise_alone.recommended
 
 
 @pytest.mark.slow
@@ -205,7 +218,7 @@ def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques
     def of(*found):
         mended = simulation.with_effects(*found)
         error = error_summary(simulation, mended, noisy)
-        return reach_verdict(simulation, mended, noisy, found, error, TwoSample(None, 0.8))
+        return reach_verdict(simulation, mended, noisy, found, error, None)
 
     assert of(*friction).recommended
     rotor = of(Armature(0.1, "elbow"))
@@ -219,7 +232,7 @@ def test_effects_whose_value_the_data_leave_open_are_not_recommended():
     mended = SIMULATION.with_effects(effect)
     error = error_summary(SIMULATION, mended, measured)
     plain, left_open = (
-        reach_verdict(SIMULATION, mended, measured, (effect,), error, TwoSample(0.9, 0.5), undetermined=reasons)
+        reach_verdict(SIMULATION, mended, measured, (effect,), error, None, undetermined=reasons)
         for reasons in ((), ("'friction' is not determined by the data",))
     )
     assert plain.recommended

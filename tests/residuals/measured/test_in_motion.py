@@ -8,7 +8,7 @@ import pytest
 from tests.residuals.pendulum import pendulum, recorded, three_parts
 from torchrl_h2o.effects import JointDamping
 from torchrl_h2o.residuals import Split
-from torchrl_h2o.residuals.measured.constant_velocity import errors_ahead, explains_motion
+from torchrl_h2o.residuals.judge.prediction_table import predicted
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.moving_rows import moving_rows
 
@@ -68,7 +68,6 @@ def test_all_windows_are_kept_if_too_few_move():
 def test_a_right_effect_explains_the_motion_of_a_log_that_mostly_rests():
     """At rest the guess that velocities stay as they are is exact; so most windows would speak against any effect."""
     log, still = resting_for(0.7, rows=3000)
-    errors = errors_ahead(DAMPED, log, Split.REPORT)
-    moving = errors_ahead(DAMPED, replace(log, usable=~still), Split.REPORT)
-    assert explains_motion(errors, 0.8)
-    assert errors[0].guessed == pytest.approx(moving[0].guessed, rel=0.2)
+    total, moving = (predicted(DAMPED, DAMPED, data, 10).table.rows[0] for data in (log, replace(log, usable=~still)))
+    assert total.mended.error < 0.8 * total.velocities_stay.error
+    assert total.velocities_stay.error == pytest.approx(moving.velocities_stay.error, rel=0.2)

@@ -12,10 +12,16 @@ from torchrl_h2o.residuals.report.contents import (
     Interval,
     RejectedEffect,
     SearchStep,
-    TwoSample,
 )
 from torchrl_h2o.residuals.report.document import Report
-from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HorizonError
+from torchrl_h2o.residuals.report.errors import (
+    DimensionError,
+    ErrorSummary,
+    HorizonError,
+    PredictedRow,
+    Prediction,
+    PredictionTable,
+)
 from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow, WindowQuantity
@@ -43,7 +49,7 @@ def full_report() -> Report:
                 (BodyMass(1.21, "pole"), ActionGain(0.83, (0,))), (0.006, 0.0061), "motion without any torque"
             ),
         ),
-        two_sample=TwoSample(0.93, 0.52),
+        predictions=predictions(),
         unexplained_intervals=(Interval(14.2, 14.9, 70, 38.0, "a push from outside"),),
         steps=(
             SearchStep(("gravity × 0.5",), (), 0.71, 28.4),
@@ -53,6 +59,12 @@ def full_report() -> Report:
         wall_s=84.2,
         trace=trace(),
     )
+
+
+def predictions() -> PredictionTable:
+    """In total and of one joint."""
+    cells = [Prediction(error, 0.9 * error, 1.1 * error) for error in (0.873, 0.0712, 0.652, 0.0698)]
+    return PredictionTable(0.1, tuple(PredictedRow(name, *cells) for name in ("total", "elbow")))
 
 
 def few_pictures(report: Report) -> Report:
@@ -129,7 +141,7 @@ def narrow(whole: ResidualTrace, columns: int) -> ResidualTrace:
 def nothing_missing() -> Report:
     """Noise only: the error equals its floor."""
     summary = ErrorSummary("held-out one-step RMSE", "rad/s", 0.0041, 0.0041, 0.004)
-    return Report(simulator="HalfCheetah-v5", data=DATA, error=summary, two_sample=TwoSample(0.5, 0.5))
+    return Report(simulator="HalfCheetah-v5", data=DATA, error=summary)
 
 
 def no_conclusion() -> Report:

@@ -40,11 +40,10 @@ from torchrl_h2o.residuals.report.contents import (
     FoundEffect,
     IndistinguishableGroup,
     RejectedEffect,
-    TwoSample,
     Verdict,
 )
 from torchrl_h2o.residuals.report.document import Report
-from torchrl_h2o.residuals.report.errors import ErrorSummary
+from torchrl_h2o.residuals.report.errors import ErrorSummary, PredictedRow, Prediction, PredictionTable
 from torchrl_h2o.residuals.report.words import effect_units, effect_words, interval
 
 NUMBERS = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf])
@@ -187,7 +186,7 @@ def test_the_file_is_strict_json_and_reads_back_what_it_was_given(number, option
         rejected=(RejectedEffect(paper_gap("soft_feet"), number, optional, "diverges"),),
         indistinguishable=(IndistinguishableGroup((Gravity(2.0), BodyMass(1.5)), (number, low), "more data"),),
         error=ErrorSummary("RMSE", "1", low, number, optional, (dimension,), (horizon,)),
-        two_sample=TwoSample(optional, None),
+        predictions=PredictionTable(0.1, (PredictedRow("total", *[Prediction(number, low, number)] * 4),)),
         wall_s=optional,
     )
     text = json.dumps(report.to_json(), allow_nan=False)
@@ -215,7 +214,7 @@ def expected(value):
 def test_the_file_holds_what_a_reader_of_it_looks_for():
     entries = full_report().to_json()
     assert set(entries) == {
-        *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "two_sample"),
+        *("sentence", "simulator", "effects", "rejected", "indistinguishable", "error", "predictions"),
         *("unexplained_intervals", "data", "stop_test", "conclusion", "wall_s", "made_by", "trace"),
         *("windows", "runs", "mended_model", "verdict", "failures", "unfinished", "ended_in", "left_out"),
         *("audit", "others", "steps"),
@@ -225,7 +224,7 @@ def test_the_file_holds_what_a_reader_of_it_looks_for():
     assert entries["effects"][2]["declared"] is False
     assert entries["effects"][2]["parameters"] == {"torque": {"value": 0.0412, "unit": "N·m", "ci95": [0.0391, 0.0433]}}
     assert {"metric", "before", "after", "floor", "per_dimension", "horizons"} <= set(entries["error"])
-    assert set(entries["two_sample"]) == {"auc_before", "auc_after"}
+    assert set(entries["predictions"]) == {"seconds", "rows"}
     assert {"source", "transitions", "held_out"} <= set(entries["data"])
 
 

@@ -22,8 +22,14 @@ from tests.residuals.report.made_up_reports import (
 )
 from torchrl_h2o.effects import Gravity, JointForce, Payload
 from torchrl_h2o.residuals.report import plots
-from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, RejectedEffect, TwoSample
-from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect, RejectedEffect
+from torchrl_h2o.residuals.report.errors import (
+    DimensionError,
+    ErrorSummary,
+    PredictedRow,
+    Prediction,
+    PredictionTable,
+)
 from torchrl_h2o.residuals.report.page import report_page
 from torchrl_h2o.residuals.report.words import effect_units, effect_words
 
@@ -91,6 +97,12 @@ def test_the_page_shows_what_each_step_of_the_search_put_in_and_gained(full):
         assert f"{step.gain:.2g}" in full.text
 
 
+def test_the_page_compares_the_predictions_with_their_intervals(full):
+    assert "velocities stay" in full.text
+    assert "0.873 0.79 to 0.96" in full.text
+    assert "0.0698 0.063 to 0.077" in full.text
+
+
 def test_the_page_gives_values_with_units_and_intervals(full):
     assert "torque 0.0412 N·m between 0.0391 and 0.0433 N·m" in full.text
     assert "scale 0.5001 between 0.4991 and 0.5012" in full.text
@@ -99,7 +111,7 @@ def test_the_page_gives_values_with_units_and_intervals(full):
 
 def test_the_page_tells_of_the_data_and_of_the_test(full):
     report = full_report()
-    for text in ("swing_up.csv", "5000", "1500", "left out: a gap in time", report.stop_test, "84.2 s", "0.93", "0.52"):
+    for text in ("swing_up.csv", "5000", "1500", "left out: a gap in time", report.stop_test, "84.2 s"):
         assert text in full.text
     assert "14.2 s 14.9 s 70 38 a push from outside" in full.text
 
@@ -209,7 +221,7 @@ def test_numbers_that_are_not_known_are_dashes_on_the_page():
         few_pictures(full_report()),
         error=ErrorSummary("RMSE", "1", math.nan, math.nan, math.nan, dimensions),
         found=(FoundEffect(Gravity(2.0), True, {}, math.nan),),
-        two_sample=TwoSample(None, math.nan),
+        predictions=PredictionTable(0.1, (PredictedRow("total", *[Prediction(math.nan, math.nan, math.inf)] * 4),)),
         wall_s=None,
     )
     text = Page(report_page(report)).text

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.constant_velocity import HEADLINE_SECONDS, HEADLINE_WINDOWS
 from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
@@ -13,6 +12,8 @@ from torchrl_h2o.residuals.measured.transitions import Measured, thinned
 from torchrl_h2o.residuals.report.errors import HeadlineError
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+HEADLINE_SECONDS = (0.1, 0.2, 0.5, 1.0)  # times ahead, in s, from which that of the report's sentence is chosen
+HEADLINE_WINDOWS = 8  # smallest number of held-out windows for such a time
 HEADLINE_LEAST = 1.5  # median error over that by noise alone from which a quantity may be the sentence's
 HEADLINE_STANDS_OUT = 3.0  # median error over the median error by sensor noise at which the sentence's time is chosen
 NOISE_WINDOWS = 100  # largest number of windows by which that time is chosen

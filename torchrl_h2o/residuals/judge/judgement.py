@@ -1,4 +1,4 @@
-"""Judges an explanation on held-out data: errors, alternatives, the two-sample test, remaining disturbances."""
+"""Judges an explanation on held-out data: errors, predictions, alternatives, remaining disturbances."""
 
 from __future__ import annotations
 
@@ -15,18 +15,17 @@ from torchrl_h2o.residuals.evidence import Evidence
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Tried, adds_noise
 from torchrl_h2o.residuals.judge.caveats import undetermined_values
 from torchrl_h2o.residuals.judge.held_out_error import error_summary, overall_error, with_floor, with_horizons
+from torchrl_h2o.residuals.judge.prediction_table import Predicted, predicted
 from torchrl_h2o.residuals.judge.run_errors import run_errors
 from torchrl_h2o.residuals.judge.separation import difference_between, separated_by
 from torchrl_h2o.residuals.judge.shown_windows import shown_windows
-from torchrl_h2o.residuals.judge.two_sample import two_sample_auc
 from torchrl_h2o.residuals.judge.verdict import reach_verdict
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, still_outside, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.progress import REPORT, LoopBar, OutOfTimeError
-from torchrl_h2o.residuals.report.contents import NOT_EXPLAINED, NOTHING_MISSING, UNDECIDED, TwoSample, Verdict
-from torchrl_h2o.residuals.report.errors import ErrorSummary
+from torchrl_h2o.residuals.report.contents import NOT_EXPLAINED, NOTHING_MISSING, UNDECIDED, Verdict
+from torchrl_h2o.residuals.report.errors import ErrorSummary, PredictionTable
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
@@ -64,7 +63,7 @@ class Judgement:
         errors_after: for each part, the error with the effects up to and including it.
         rejected: attempts that are not part of the explanation, and the error with each of them alone.
         alternatives: an entry for each part that has alternatives.
-        two_sample: AUC of a classifier before and after.
+        predictions: how well the held-out motion is predicted, in total and by joint; None without enough windows.
         trace: the residual over time; None if there was no time.
         windows: worst, median and best window, measured against simulated.
         runs: error of each run.
@@ -80,7 +79,7 @@ class Judgement:
     errors_after: tuple[float, ...]
     rejected: tuple[tuple[Tried, float], ...]
     alternatives: tuple[Alternatives, ...]
-    two_sample: TwoSample
+    predictions: PredictionTable | None
     trace: ResidualTrace | None
     windows: tuple[ShownWindow, ...]
     runs: tuple[RunError, ...]
@@ -107,8 +106,8 @@ def judge(
         catalogue: the effects that were tried; where nothing is missing, the verdict names those of a usual size that
             the data could not have shown.
         progress: the time for the report; what it does not allow is left out and named in ``left_out``.
-        seed: seed of the classifiers.
-        settings: horizons, significance level and the classifier's updates.
+        seed: seed of the network that learns from what is left.
+        settings: horizons and significance level.
 
     Returns:
         The held-out figures and the verdict.
@@ -118,13 +117,15 @@ def judge(
     disturbed = optional("disturbances", lambda: _remaining_disturbances(evidence, explanation), [])
     measured = without_intervals(evidence.measured, disturbed)
     error = optional("the errors", lambda: error_summary(simulation, mended, measured), None)
-    sampled = simulation.with_effects(*effects)  # random effects are drawn in the two-sample test
-    two_sample = optional(
-        "the two-sample test", lambda: _two_sample(simulation, sampled, measured, seed, settings), TwoSample()
+    steps = _shown_steps(error, simulation)
+    predictions = optional(
+        "the table of predictions",
+        lambda: None if steps is None else predicted(simulation, mended, measured, steps, seed, settings),
+        None,
     )
     verdict = optional(
         "the verdict",
-        lambda: _verdict(simulation, mended, measured, explanation, error, two_sample, settings),
+        lambda: _verdict(simulation, mended, measured, explanation, error, predictions, settings),
         Verdict(UNDECIDED, ("the time was up before a verdict was reached",), recommended=False),
     )
     if verdict.kind == NOTHING_MISSING and (explanation.ended_in is not None or progress.left_out):
@@ -138,7 +139,7 @@ def judge(
     return Judgement(
         measured=measured,
         disturbed=tuple(disturbed),
-        two_sample=two_sample,
+        predictions=None if predictions is None else predictions.table,
         verdict=verdict,
         left_out=tuple(progress.left_out),
         **details,
@@ -189,14 +190,14 @@ def _verdict(
     measured: Measured,
     explanation: Explanation,
     error: ErrorSummary | None,
-    two_sample: TwoSample,
+    predictions: Predicted | None,
     settings: LoopSettings,
 ) -> Verdict:
     if error is None:
         raise OutOfTimeError(REPORT)  # the verdict is read from the errors
     undetermined = undetermined_values(explanation.parts, simulation.names)
     effects = explanation.effects
-    return reach_verdict(simulation, mended, measured, effects, error, two_sample, settings, undetermined)
+    return reach_verdict(simulation, mended, measured, effects, error, predictions, settings, undetermined)
 
 
 def _errors_after(simulation: Simulation, effects: tuple[Effect, ...], measured: Measured) -> tuple[float, ...]:
@@ -301,18 +302,6 @@ def _others(
         other = simulation.with_effects(*effects)
         others.append((effects, overall_error(other, measured), difference_between((mended, other), measured)))
     return tuple(others)
-
-
-def _two_sample(
-    simulation: Simulation, mended: Simulation, measured: Measured, seed: int, settings: LoopSettings
-) -> TwoSample:
-    sensor_std = sensor_noise(mended, measured)
-    return TwoSample(
-        *(
-            two_sample_auc(which, measured, sensor_std=sensor_std, seed=seed, settings=settings)
-            for which in (simulation, mended)
-        )
-    )
 
 
 def _residual_trace(simulation: Simulation, mended: Simulation, measured: Measured) -> ResidualTrace:

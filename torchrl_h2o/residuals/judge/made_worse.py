@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.measured.constant_velocity import NEGLIGIBLE_ERROR
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.significance import WORST, p_value_of_losses
@@ -15,6 +14,7 @@ from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 FAR_WINDOWS = 8  # smallest number of windows by which the error far ahead is judged
+NEGLIGIBLE_ERROR = 0.001  # median error, in spreads, below which a rise does not count
 WORSE = 1.1  # factor on the median error of a quantity above which the effects make it worse
 
 

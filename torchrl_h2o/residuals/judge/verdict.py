@@ -9,11 +9,10 @@ from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect, JointRange, selection
 from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios, short_delays
-from torchrl_h2o.residuals.judge.constant_velocity import no_better_than_constant_velocity
-from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, made_worse
+from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, NEGLIGIBLE_ERROR, made_worse
 from torchrl_h2o.residuals.judge.needs_more_force import force_in_vain, needs_more_force
+from torchrl_h2o.residuals.judge.prediction_table import Predicted
 from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
-from torchrl_h2o.residuals.measured.constant_velocity import NEGLIGIBLE_ERROR, errors_ahead
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
@@ -27,7 +26,6 @@ from torchrl_h2o.residuals.report.contents import (
     EXPLAINED_IN_PART,
     NOT_EXPLAINED,
     NOTHING_MISSING,
-    TwoSample,
     Verdict,
 )
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
@@ -36,8 +34,6 @@ from torchrl_h2o.residuals.report.words import duration, effect_words, number, q
 from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-# held-out AUC above which a classifier tells measured from simulated; noise and contacts alone give up to 0.56
-TELLING_AUC = 0.65
 AUTOCORRELATION = 0.2  # rank correlation of successive residuals above which they are not noise
 # median error far ahead, in multiples of the median error by sensor noise, above which something is missing
 FAR_RATIO = 2.0
@@ -45,10 +41,7 @@ FAR_NEGLIGIBLE = 0.01  # median error far ahead, in spreads, that is negligible 
 SMALL_REMAINDER = 0.02  # share of the error ahead below which the remaining error is not reported as a missing effect
 # factor by which effects on a joint may raise its missing force and still count as explaining the forces
 OWN_FORCE = 1.2
-# AUC with the effects above which an explanation is not recommended, unless it lowers the error much
-AUC_NEAR_ONE = 0.95
 RAISED = 1.1  # factor by which effects may raise the error in the report's sentence; beyond it they are not recommended
-MUCH_LOWER = 0.5  # share of the error ahead below which an explanation counts in spite of an AUC near one
 EXTREME_FACTOR = 20.0  # factor on a property of the model beyond which the value is reported as implausible
 BLOCKS = 10  # blocks of the report's data in which the largest residual is looked for
 
@@ -59,15 +52,15 @@ def reach_verdict(
     measured: Measured,
     effects: Sequence[Effect],
     error: ErrorSummary,
-    two_sample: TwoSample,
+    predictions: Predicted | None,
     settings: LoopSettings = DEFAULTS,
     undetermined: Sequence[str] = (),
 ) -> Verdict:
     """Reaches a verdict from the part of the data that neither a fit nor a choice has used.
 
-    Nothing is missing if there are no effects and neither a classifier, nor the autocorrelation of the residuals, nor
-    the error far ahead shows a difference. Otherwise the effects explain what is missing wholly, in part or not at all.
-    Effects that raise the error of the report's sentence explain nothing.
+    Nothing is missing if there are no effects and neither a network that learns from what is left, nor the
+    autocorrelation of the residuals, nor the error far ahead shows a difference. Otherwise the effects explain what is
+    missing wholly, in part or not at all. Effects that raise the error of the report's sentence explain nothing.
 
     Args:
         simulation: the simulator before effects are put in.
@@ -75,18 +68,18 @@ def reach_verdict(
         measured: the data.
         effects: the effects.
         error: errors before and after.
-        two_sample: AUC of the classifier before and after.
+        predictions: how well the held-out motion is predicted; None if the data hold too few windows.
         settings: thresholds.
         undetermined: reasons against effects whose value the data leave open.
     """
     with_noise = simulation.with_effects(*effects)
-    signs = signs_of_something_missing(with_noise, measured, error, two_sample, settings)
+    signs = signs_of_something_missing(with_noise, measured, error, predictions, settings)
     if not effects:
         if not signs:
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured))
-    against = reasons_against(simulation, mended, measured, effects, error, two_sample, settings)
-    of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects)
+    against = reasons_against(simulation, mended, measured, effects, error, predictions, settings)
+    of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects, predictions)
     against, signs = (*against, *undetermined, *of_forces), (*signs, *of_motion)
     raised = False
     if (head := error.headline) is not None:
@@ -101,7 +94,7 @@ def reach_verdict(
         *friction_beside_noise(simulation, mended, effects),
         *only_ratios(simulation, effects),
     )
-    if raised or (signs and not _leaves_little(mended, measured, error, two_sample)):
+    if raised or (signs and not _leaves_little(error, predictions)):
         where = where_most(mended, measured)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
         return Verdict(kind, (*against, *signs), recommended=not against, where=where, caveats=caveats)
@@ -119,37 +112,32 @@ def _raises(
     return bool(_acting(effects)) and head.after > max(RAISED * head.before, NEGLIGIBLE_ERROR * spread)
 
 
-def _leaves_little(mended: Simulation, measured: Measured, error: ErrorSummary, two_sample: TwoSample) -> bool:
-    """Whether hardly an error of the sentence's quantity is left, and of all quantities if a classifier sees one.
+def _leaves_little(error: ErrorSummary, predictions: Predicted | None) -> bool:
+    """Whether hardly an error of the sentence's quantity is left, and of all quantities if a network learns from it.
 
     If it does, the error must also be small beside that of the guess that every velocity stays as it is. A simulator
     without the rotor of a light link is wrong by turns, and a hundredth of that says little.
     """
-    head, auc = error.headline, two_sample.auc_after
+    head = error.headline
     if head is None or head.after >= SMALL_REMAINDER * head.before:
         return False
-    if auc is None or auc <= TELLING_AUC:
+    if predictions is None or not predictions.learnt():
         return True
     if error.after >= SMALL_REMAINDER * error.before:
         return False
-    steps, index = max(1, round(head.seconds / mended.control_step)), mended.state_map.names.index(head.name)
-    ahead = [one for one in errors_ahead(mended, measured, Split.REPORT) if one.steps == steps]
-    by_guess = [one.guessed[index] for one in ahead if np.isfinite(one.guessed[index])]
-    return not by_guess or bool(head.after < SMALL_REMAINDER * by_guess[0])
+    total = predictions.table.rows[0]
+    return total.mended.error < SMALL_REMAINDER * total.velocities_stay.error
 
 
 def signs_of_something_missing(
     simulation: Simulation,
     measured: Measured,
     error: ErrorSummary,
-    two_sample: TwoSample,
+    predictions: Predicted | None,
     settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """The tests by which a simulation with all effects still differs from the data, each in words with its figure."""
-    signs = []
-    auc = two_sample.auc_after
-    if auc is not None and auc > TELLING_AUC:
-        signs.append(f"a classifier tells measured from simulated transitions (AUC {number(auc, 2)})")
+    signs = [] if predictions is None else [*predictions.learnt()]
     correlations = {d.name: d.autocorrelation for d in error.per_dimension if d.autocorrelation is not None}
     high = {name: value for name, value in correlations.items() if np.isfinite(value) and value > AUTOCORRELATION}
     if high:
@@ -193,7 +181,7 @@ def reasons_against(
     measured: Measured,
     effects: Sequence[Effect],
     error: ErrorSummary,
-    two_sample: TwoSample,
+    predictions: Predicted | None,
     settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """Reasons against putting effects into a simulator for training; empty if there are none."""
@@ -201,16 +189,8 @@ def reasons_against(
     acting = _acting(effects)
     if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
-    head, auc = error.headline, two_sample.auc_after
-    auc_before = two_sample.auc_before
-    if not acting and auc_before is not None and auc is not None and auc > max(TELLING_AUC, auc_before):
-        before, after = (number(value, 2) for value in (auc_before, auc))
-        reasons.append(
-            f"the noise found makes simulated transitions no more like the measured ones (AUC {before} → {after})"
-        )
-    halved = head is not None and head.after < MUCH_LOWER * head.before
-    if auc is not None and auc > AUC_NEAR_ONE and not halved:
-        reasons.append(f"a classifier still tells nearly every transition (AUC {number(auc, 2)})")
+    if not acting and predictions is not None and (learnt := predictions.learnt()):
+        reasons.append(f"the noise found stands for something that can be predicted: {learnt[0]}")
     names = simulation.names
     reasons += [f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect))]
     return tuple(reasons)
@@ -226,6 +206,7 @@ def _by_motion_and_forces(
     mended: Simulation,
     measured: Measured,
     effects: Sequence[Effect],
+    predictions: Predicted | None,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Signs of something missing, and reasons against effects, by the motion and by the forces that it needs.
 
@@ -234,7 +215,7 @@ def _by_motion_and_forces(
     """
     if not (acting := _acting(effects)):
         return (), ()
-    hardly = no_better_than_constant_velocity(mended, measured, acting)
+    hardly = () if predictions is None else predictions.hardly_better(mended, acting)
     forces = missing_forces(simulation, mended, measured, Split.REPORT)
     if forces is None:
         return (), hardly

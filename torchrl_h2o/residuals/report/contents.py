@@ -7,7 +7,7 @@ from typing import Any
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS
-from torchrl_h2o.residuals.report.errors import ErrorSummary
+from torchrl_h2o.residuals.report.errors import ErrorSummary, PredictionTable
 from torchrl_h2o.residuals.report.mended_model import MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
@@ -196,14 +196,6 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class TwoSample:
-    """Held-out AUC of a classifier of measured against simulated transitions; 0.5 if the gap is undetectable."""
-
-    auc_before: float | None = None
-    auc_after: float | None = None
-
-
-@dataclass(frozen=True)
 class Interval:
     """An interval of the data that no effect explains and that was excluded from fits and errors.
 
@@ -244,7 +236,7 @@ class ReportContents:
         rejected: effects that were fitted and not put in.
         indistinguishable: effects that these data cannot tell apart.
         others: other sets of effects that explain the data as well, the most usual ones first.
-        two_sample: AUC of a classifier of measured against simulated transitions.
+        predictions: how well the held-out motion is predicted, in total and by joint; None if not computed.
         unexplained_intervals: intervals that were excluded as disturbed.
         steps: the steps of the search, in order.
         stop_test: description of the test by which the search stopped.
@@ -274,7 +266,7 @@ class ReportContents:
     rejected: tuple[RejectedEffect, ...] = ()
     indistinguishable: tuple[IndistinguishableGroup, ...] = ()
     others: tuple[OtherExplanation, ...] = ()
-    two_sample: TwoSample = TwoSample()
+    predictions: PredictionTable | None = None
     unexplained_intervals: tuple[Interval, ...] = ()
     steps: tuple[SearchStep, ...] = ()
     stop_test: str = ""

@@ -78,3 +78,44 @@ class ErrorSummary:
     per_dimension: tuple[DimensionError, ...] = ()
     horizons: tuple[HorizonError, ...] = ()
     headline: HeadlineError | None = None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Mean absolute error in spreads of the readings, with its 95 % interval."""
+
+    error: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class PredictedRow:
+    """How well the motion of one joint, or all of it, is predicted.
+
+    Args:
+        name: ``"total"``, or name of the joint.
+        as_it_is: by the simulator without the effects.
+        mended: by the simulator with them.
+        velocities_stay: by the guess that every velocity stays as it is.
+        mended_and_network: by the simulator with the effects and a small network, trained on what it leaves.
+    """
+
+    name: str
+    as_it_is: Prediction
+    mended: Prediction
+    velocities_stay: Prediction
+    mended_and_network: Prediction
+
+
+@dataclass(frozen=True)
+class PredictionTable:
+    """How well held-out motion is predicted some time ahead; the intervals hold the scatter between blocks of rows.
+
+    Args:
+        seconds: how far ahead, in s.
+        rows: in total, and by joint.
+    """
+
+    seconds: float
+    rows: tuple[PredictedRow, ...]

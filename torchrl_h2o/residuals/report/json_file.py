@@ -23,10 +23,17 @@ from torchrl_h2o.residuals.report.contents import (
     RejectedEffect,
     ReportContents,
     SearchStep,
-    TwoSample,
     Verdict,
 )
-from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HeadlineError, HorizonError
+from torchrl_h2o.residuals.report.errors import (
+    DimensionError,
+    ErrorSummary,
+    HeadlineError,
+    HorizonError,
+    PredictedRow,
+    Prediction,
+    PredictionTable,
+)
 from torchrl_h2o.residuals.report.mended_model import REMEDY, LeftOut, MendedModel
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.sentence import sentence
@@ -125,7 +132,7 @@ def report_to_json(report: ReportContents) -> dict[str, Any]:
             "unfinished": report.unfinished,
             "ended_in": report.ended_in,
             "left_out": report.left_out,
-            "two_sample": dataclasses.asdict(report.two_sample),
+            "predictions": None if report.predictions is None else dataclasses.asdict(report.predictions),
             "unexplained_intervals": [dataclasses.asdict(interval) for interval in report.unexplained_intervals],
             "data": dataclasses.asdict(report.data),
             "steps": [dataclasses.asdict(step) for step in report.steps],
@@ -163,7 +170,7 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
         "unfinished": entries.get("unfinished"),
         "ended_in": entries.get("ended_in"),
         "left_out": tuple(entries.get("left_out", ())),
-        "two_sample": _read(TwoSample, entries["two_sample"]),
+        "predictions": None if entries.get("predictions") is None else _predictions(entries["predictions"]),
         "unexplained_intervals": tuple(_read(Interval, entry) for entry in entries["unexplained_intervals"]),
         "data": _read(DataSummary, entries["data"]),
         "steps": tuple(_step(entry) for entry in entries.get("steps", ())),
@@ -295,6 +302,14 @@ def _verdict(entry: Mapping[str, Any]) -> Verdict:
 
 def _step(entry: Mapping[str, Any]) -> SearchStep:
     return _read(SearchStep, entry, put_in=tuple(entry["put_in"]), dropped=tuple(entry["dropped"]))
+
+
+def _predictions(entry: Mapping[str, Any]) -> PredictionTable:
+    rows = (
+        PredictedRow(row["name"], **{name: _read(Prediction, cell) for name, cell in row.items() if name != "name"})
+        for row in entry["rows"]
+    )
+    return PredictionTable(entry["seconds"], tuple(rows))
 
 
 def _window(entry: Mapping[str, Any]) -> ShownWindow:
