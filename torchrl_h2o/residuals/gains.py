@@ -215,25 +215,26 @@ class Gains:
         return found
 
     def _alone(self, direction: Direction, column: np.ndarray) -> Lead | None:
-        best = -(self.weight * self.white) @ column / max((self.weight * column) @ column, 1e-300)
-        tried: dict[float, float] = {}
+        def least_squares(weight: np.ndarray) -> float:
+            return float(-(weight * self.white) @ column / max((weight * column) @ column, 1e-300))
+
+        gains: dict[float, float] = {}
 
         def gain(share: float) -> float:
             share = float(np.clip(share, *direction.shares))
-            return tried.setdefault(share, self._gain(share * column))
+            return gains.setdefault(share, self._gain(share * column))
 
-        for share in (best, math.copysign(1.0, best), *self._shares_of_groups(column)):
+        first = least_squares(self.weight)
+        for share in (first, math.copysign(1.0, first), *self._shares_of_groups(column)):
             gain(share)
         for _ in range(REFINED):
-            share = max(tried, key=lambda one: tried[one])
-            weight = self._weight_at(share * column)
-            better = -(weight * self.white) @ column / max((weight * column) @ column, 1e-300)
-            if gain(better) < tried[share] + SLIGHT * self.num_blocks:
+            best = max(gains, key=gains.__getitem__)
+            if gain(least_squares(self._weight_at(best * column))) < gains[best] + SLIGHT * self.num_blocks:
                 break
-        share = max(tried, key=lambda one: tried[one])
-        return self._lead((direction,), (share,), share * column) if tried[share] > 0.0 else None
+        best = max(gains, key=gains.__getitem__)
+        return self._lead((direction,), (best,), best * column) if gains[best] > 0.0 else None
 
-    def _shares_of_groups(self, column: np.ndarray) -> np.ndarray:
+    def _shares_of_groups(self, column: np.ndarray) -> list[float]:
         """The shares that explain most of the errors of one group each, for the few groups with the largest gain."""
 
         def sums(values: np.ndarray) -> np.ndarray:
@@ -243,7 +244,7 @@ class Gains:
         shares = -both / np.maximum(square, 1e-300)
         left = np.maximum(before + shares * both, 1e-3 * before + 1e-300)
         gains = np.bincount(self.group, self.share) * np.log(np.maximum(before, 1e-300) / left)
-        return shares[np.argsort(-gains)[:GROUPS]]
+        return shares[np.argsort(-gains)[:GROUPS]].tolist()
 
     def _together(self, directions: Sequence[Direction], columns: Sequence[np.ndarray]) -> Lead | None:
         """Directions of one kind, each with a share of its own, as far as they gain something."""

@@ -15,6 +15,7 @@ from torchrl_h2o.residuals.refit import fit_set
 from torchrl_h2o.residuals.score import Difference, Model, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.start_states import ROUNDING
 
 ROUGH_WORK = 24_000  # physics steps times degrees of freedom that are simulated for each candidate of a sweep
 ROUGH_ROWS = 1024  # rows beyond which these are not more, unless that suffices for all
@@ -24,6 +25,7 @@ GROWN = 5  # steps of the fit of a set after an effect was added
 REFITTED = 3  # fits of a set, each from the start states that the fit before gives
 NATS_OF_SURPRISE = 2.0  # evidence that an effect needs for each degree of surprise
 MATTERS = 0.03  # share of the errors of the simulator without effects, below which what is left is not explained
+NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
@@ -113,7 +115,8 @@ class Ground:
             errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
             floor = np.concatenate([(MATTERS * np.median(np.abs(error), axis=0)) ** 2 for error in errors])
         counts = model.fit.effective_counts(model.fit.errors())
-        base = Model(*(replace(part, counts=counts, floor=floor) for part in (model.fit, model.selection)))
+        fit, selection = (replace(part, counts=counts, floor=floor) for part in (model.fit, model.selection))
+        base = Model(fit, selection)
         return cls(simulation, base, level, {tuple(effects): base})
 
     @property
@@ -147,6 +150,12 @@ class Ground:
         """A set with its scores."""
         model = self.model(effects)
         return Found(tuple(entries), tuple(effects), model.scores(), model.one_step_ahead())
+
+    def leaves_little(self, found: Found) -> bool:
+        """Whether all errors left are too small to matter, at all horizons; see ``MATTERS``."""
+        part = self.model(found.effects).fit
+        usual = np.concatenate([np.median(np.abs(error), axis=0) for error in part.errors()])
+        return bool(found.entries) and bool((usual**2 <= self.base.fit.floor + (NEARLY_NONE * ROUNDING) ** 2).all())
 
     def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its values fitted from the present ones."""
@@ -196,4 +205,4 @@ class Ground:
             return False
         if more.one_step is None or less.one_step is None:
             return True
-        return Difference(more.one_step - less.one_step).evidence > 0.5 * min(needed, -math.log(self.level))
+        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))

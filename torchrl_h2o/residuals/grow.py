@@ -54,7 +54,7 @@ def grow(
             many = len(best.entries) > len(found.entries) + 2
             before, found, refused = found, ground.fitted(best.entries, best.effects), set()
             advance(found, before)
-            if many:  # the errors now change with the candidates in other ways than at the sweep
+            if many or ground.leaves_little(found):  # after many, the candidates change the errors in other ways
                 break
         else:
             refused |= {one.names - found.names for one in fitted}
@@ -99,6 +99,7 @@ def with_one_more(
     passed_over: Collection[frozenset[str]] = (),
     *,
     joints_together: bool = False,
+    least_gain: float = 0.0,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps.
 
@@ -108,6 +109,7 @@ def with_one_more(
         directions: the candidates.
         passed_over: names of the entries of candidates that are not tried.
         joints_together: whether friction, damping and rotors of all joints together are a candidate.
+        least_gain: estimated gain, in nats a block, below which a candidate is not tried.
     """
     rough = ground.rough(found.effects)
     gains = gains_beside(rough, found)
@@ -115,7 +117,10 @@ def with_one_more(
     leads = [
         lead
         for lead in best_of_each(gains.leads(directions))
-        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > least
+        if lead.names not in passed_over
+        and not lead.names <= found.names
+        and lead.evidence > least
+        and lead.gain > least_gain
     ]
     sets = [[lead.beside(found.entries, found.effects, factor) for factor in lead.factors] for lead in leads[:TRIED]]
     best = _best_simulated(rough, sets)

@@ -135,21 +135,23 @@ def _searched(
     entries, directions, alike, unseen = every, [], [], ()
     measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
-        if number:
-            ground = Ground.of(ground.simulation, measured, found.effects, ground.level, ground.base.fit.floor)
-        found = ground.fitted(found.entries, found.effects)
-        if number > 1:
-            best = best_of_each(gains_beside(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
-            chosen = found.names.union(*(lead.names for lead in best))
-            entries = [entry for entry in every if entry.name in chosen]
-        closer = partial(progress.closer, 0.5 / max(1, len(entries)))
-        rough = ground.rough(found.effects)
-        directions = sweep(rough, entries, found.effects, closer)
-        if not number and not found.entries:
-            unseen = _unseen(ground, rough, every, directions)
-        before, alike = found.names, []  # alternatives belong to one set
-        found = grow(ground, found, directions, better, tried)
-        if found.names == before:
+        if explained := number > 0 and ground.leaves_little(found):
+            before, alike = found.names, []
+        else:
+            if number:
+                ground = Ground.of(ground.simulation, measured, found.effects, ground.level, ground.base.fit.floor)
+            found = ground.fitted(found.entries, found.effects)
+            if number > 1:
+                best = best_of_each(gains_beside(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
+                chosen = found.names.union(*(lead.names for lead in best))
+                entries = [entry for entry in every if entry.name in chosen]
+            rough = ground.rough(found.effects)
+            directions = sweep(rough, entries, found.effects, partial(progress.closer, 0.5 / max(1, len(entries))))
+            if not number and not found.entries:
+                unseen = _unseen(ground, rough, every, directions)
+            before, alike = found.names, []  # alternatives belong to one set
+            found = grow(ground, found, directions, better, tried)
+        if found.names == before and not explained:
             progress.stage(FORCES)
             found = with_force(ground, found, every, better)
             if before and found.names != before:  # a force alone may explain what effects were found for

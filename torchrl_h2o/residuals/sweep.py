@@ -134,7 +134,7 @@ def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
     """The trials to simulate, larger ones first: one along each line through the neutral values, or, where the errors
     are not linear in the size, all. The least of three lags or delays is left out, because small ones are linear."""
     neutral = {name: parameter.neutral for name, parameter in entry.effect.parameters.items()}
-    by_size = sorted(entry.trials, key=lambda trial: -_size(entry, trial))
+    by_size: list[Mapping[str, float]] = sorted(entry.trials, key=lambda trial: -_size(entry, trial))
     if isinstance(entry.effect, NOT_LINEAR):
         return by_size[:-1] if isinstance(entry.effect, SMOOTH) and len(by_size) > 2 else by_size
     if len(entry.fitted) == 1 and neutral[entry.fitted[0]] == 1.0:
