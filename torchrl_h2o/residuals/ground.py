@@ -153,9 +153,12 @@ class Ground:
 
     def leaves_little(self, found: Found) -> bool:
         """Whether all errors left are too small to matter, at all horizons; see ``MATTERS``."""
-        part = self.model(found.effects).fit
-        usual = np.concatenate([np.median(np.abs(error), axis=0) for error in part.errors()])
-        return bool(found.entries) and bool((usual**2 <= self.base.fit.floor + (NEARLY_NONE * ROUNDING) ** 2).all())
+        floor = self.base.fit.floor
+        if floor is None or not found.entries:
+            return False
+        errors = self.model(found.effects).fit.errors()
+        usual = np.concatenate([np.median(np.abs(error), axis=0) for error in errors])
+        return bool((usual**2 <= floor + (NEARLY_NONE * ROUNDING) ** 2).all())
 
     def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its values fitted from the present ones."""

@@ -108,7 +108,7 @@ def test_a_small_share_of_an_absurd_error_is_no_small_error():
     found, measured, error = right_gravity()
     error = replace(error, headline=replace(error.headline, before=1e3), before=1e3 * error.before)
     reached = reach_verdict(
-        SIMULATION, SIMULATION.with_effects(*found), measured, found, error, learning(0.5, guess=1.0)
+        SIMULATION, SIMULATION.with_effects(*found), measured, found, error, learning(0.5, guess=2.0)
     )
     assert reached.kind == EXPLAINED_IN_PART
 
@@ -208,7 +208,7 @@ def test_a_mass_far_from_the_model_s_gets_a_caveat():
 
 
 @pytest.mark.slow
-def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques_spoil_the_motion():
+def test_friction_is_recommended_although_noisy_torques_spoil_the_motion():
     """The noise is on the logged torques alone. A rotor that hides it is not recommended."""
     simulation, friction = double_pendulum(), (JointFrictionLoss(0.15, "shoulder"), JointFrictionLoss(0.08, "elbow"))
     data = recorded(simulation.with_effects(*friction), 3000, noise=0.002)
@@ -218,12 +218,12 @@ def test_friction_that_explains_the_forces_is_recommended_although_noisy_torques
     def of(*found):
         mended = simulation.with_effects(*found)
         error = error_summary(simulation, mended, noisy)
-        return reach_verdict(simulation, mended, noisy, found, error, None)
+        return reach_verdict(simulation, mended, noisy, found, error, predicted(simulation, mended, noisy, 20))
 
     assert of(*friction).recommended
     rotor = of(Armature(0.1, "elbow"))
     assert not rotor.recommended
-    assert any("is missing in the measured motion of elbow" in reason for reason in rotor.reasons)
+    assert any("hardly better than by the guess" in reason for reason in rotor.reasons)
 
 
 def test_effects_whose_value_the_data_leave_open_are_not_recommended():

@@ -95,6 +95,8 @@ class Predicted:
         Returns:
             One clause about all motion, or about the effects on joints that are all predicted so; or nothing.
         """
+        if not effects:
+            return ()
         mended, stays = (dict(zip(self.names, self.losses[which].mean(1), strict=True)) for which in _COMPARED)
         shares = {name: mended[name] / max(stays[name], NEGLIGIBLE) for name in self.names}
         worst = TOTAL

@@ -7,20 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import mannwhitneyu
 
-from torchrl_h2o.effects import Effect, JointRange, selection
+from torchrl_h2o.effects import Effect, JointRange
 from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios, short_delays
 from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, NEGLIGIBLE_ERROR, made_worse
-from torchrl_h2o.residuals.judge.needs_more_force import force_in_vain, needs_more_force
 from torchrl_h2o.residuals.judge.prediction_table import Predicted
 from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.initial_states import estimate_states
-from torchrl_h2o.residuals.measured.missing_force import LESS_FORCE, MissingForces, missing_forces
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.significance import WORST, p_value_of_losses
-from torchrl_h2o.residuals.measured.transitions import Measured, Split
+from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED,
     EXPLAINED_IN_PART,
@@ -39,8 +37,6 @@ AUTOCORRELATION = 0.2  # rank correlation of successive residuals above which th
 FAR_RATIO = 2.0
 FAR_NEGLIGIBLE = 0.01  # median error far ahead, in spreads, that is negligible without sensor noise
 SMALL_REMAINDER = 0.02  # share of the error ahead below which the remaining error is not reported as a missing effect
-# factor by which effects on a joint may raise its missing force and still count as explaining the forces
-OWN_FORCE = 1.2
 RAISED = 1.1  # factor by which effects may raise the error in the report's sentence; beyond it they are not recommended
 EXTREME_FACTOR = 20.0  # factor on a property of the model beyond which the value is reported as implausible
 BLOCKS = 10  # blocks of the report's data in which the largest residual is looked for
@@ -79,8 +75,8 @@ def reach_verdict(
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured))
     against = reasons_against(simulation, mended, measured, effects, error, predictions, settings)
-    of_motion, of_forces = _by_motion_and_forces(simulation, mended, measured, effects, predictions)
-    against, signs = (*against, *undetermined, *of_forces), (*signs, *of_motion)
+    hardly = () if predictions is None else predictions.hardly_better(mended, _acting(effects))
+    against = (*against, *undetermined, *hardly)
     raised = False
     if (head := error.headline) is not None:
         steps = max(1, round(head.seconds / simulation.control_step))
@@ -199,41 +195,6 @@ def reasons_against(
 def _acting(effects: Sequence[Effect]) -> list[Effect]:
     """The effects that change the motion; noise does not."""
     return [effect for effect in effects if not effect.random]
-
-
-def _by_motion_and_forces(
-    simulation: Simulation,
-    mended: Simulation,
-    measured: Measured,
-    effects: Sequence[Effect],
-    predictions: Predicted | None,
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Signs of something missing, and reasons against effects, by the motion and by the forces that it needs.
-
-    Effects that predict the motion no better than the guess of constant velocities are not used, unless they explain
-    the missing forces: where torques are noisy, right effects may not predict the motion of light links.
-    """
-    if not (acting := _acting(effects)):
-        return (), ()
-    hardly = () if predictions is None else predictions.hardly_better(mended, acting)
-    forces = missing_forces(simulation, mended, measured, Split.REPORT)
-    if forces is None:
-        return (), hardly
-    more = (
-        *needs_more_force(simulation, forces),
-        *force_in_vain(simulation, mended, measured, acting),
-    )
-    explained = forces.fall_by(LESS_FORCE) and not more
-    if explained and not any(_raises_its_forces(effect, mended, forces) for effect in acting):
-        return hardly, ()
-    return (), (*hardly, *more)
-
-
-def _raises_its_forces(effect: Effect, mended: Simulation, forces: MissingForces) -> bool:
-    """Whether more force is missing at one of an effect's joints than without the effects."""
-    if (joints := getattr(effect, "joints", None)) is None:
-        return False
-    return bool(forces.factors[selection.joint_dofs(mended.model, joints)].max(initial=0.0) > OWN_FORCE)
 
 
 def _lowers_the_error(
