@@ -23,8 +23,10 @@ from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
+from torchrl_h2o.residuals.grow import gains_beside
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.search import known_set
+from torchrl_h2o.residuals.sweep import sweep
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -112,6 +114,24 @@ def test_a_force_outside_the_catalogue_stands_beside_its_effects():
 def test_a_delay_that_hardly_shows_beside_the_noise_is_found():
     explanation = found(recorded(SIMULATION.with_effects(ActionDelay(0.013, (0,))), 1200, noise=0.01))
     assert values(explanation.effects) == pytest.approx({("ActionDelay", None): 0.013}, rel=0.15)
+
+
+def test_what_is_far_smaller_than_the_gap_is_not_explained_and_alone_it_is():
+    gravity, damping = Gravity(1.5), JointDamping(2e-4, "shoulder")
+    both, alone = (found(recorded(SIMULATION.with_effects(*one), 800)) for one in ((gravity, damping), (damping,)))
+    assert [type(effect) for effect in both.effects] == [Gravity]
+    assert values(alone.effects) == pytest.approx({("JointDamping", "shoulder"): 2e-4}, rel=0.01)
+
+
+def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():
+    measured = recorded(SIMULATION.with_effects(Gravity(0.5), ActionGain(1.4, (1,))), 800)
+    ground = Ground.of(SIMULATION, measured)
+    rough = ground.rough(())
+    (direction,) = sweep(rough, [entry for entry in CATALOGUE if isinstance(entry.effect, Gravity)])
+    (lead,) = gains_beside(rough, ground.found((), ())).leads([direction])
+    gravity = direction.effect(lead.shares[0])
+    assert gravity.scale == pytest.approx(0.5, abs=0.01)
+    assert lead.gain == pytest.approx(rough.score([gravity]) - rough.score(), rel=0.1)
 
 
 def test_a_search_goes_on_from_known_effects():
