@@ -25,7 +25,7 @@ from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import gains_beside
 from torchrl_h2o.residuals.progress import LoopBar
-from torchrl_h2o.residuals.search import known_set
+from torchrl_h2o.residuals.search import known_set, with_intervals
 from torchrl_h2o.residuals.sweep import sweep
 
 SIMULATION = double_pendulum()
@@ -132,6 +132,16 @@ def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():
     gravity = direction.effect(lead.shares[0])
     assert gravity.scale == pytest.approx(0.5, abs=0.01)
     assert lead.gain == pytest.approx(rough.score([gravity]) - rough.score(), rel=0.1)
+
+
+def test_an_effect_whose_interval_holds_its_neutral_value_is_left_out_of_the_last_fit():
+    effects = Gravity(1.3), JointDamping(1e-3, "elbow")
+    entries = [entry_of(effect, CATALOGUE) for effect in effects]
+    for truth in (effects[:1], (effects[0], JointDamping(0.03, "elbow"))):
+        ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(*truth), 800, noise=0.01))
+        found, half_widths, _ = with_intervals(ground, ground.found(entries, effects), [])
+        assert [type(effect) for effect in found.effects] == [type(effect) for effect in truth]
+        assert len(half_widths) == len(truth)
 
 
 def test_a_search_goes_on_from_known_effects():

@@ -29,6 +29,8 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, sweep
 
 RESWEPT = 64  # entries of the largest estimated gain, which are simulated again in later sweeps
+NEUTRAL = 0.1  # half-widths from neutral up to which effects are left out together
+MOST_LEFT_OUT = 3  # fits after which effects are left out whose intervals hold their neutral values
 SWEEPS = 6  # largest number of sweeps
 
 
@@ -93,7 +95,7 @@ def search(
     found = latest[-1]
     progress.begin_last_fit(bool(found.entries))
     try:
-        explanation = _explanation(*_with_intervals(ground, found), alike)
+        explanation = _explanation(*with_intervals(ground, found, alike))
     except OutOfTimeError as end:
         explanation, ended_in = _explanation(found), ended_in or str(end)
     left = [one for name, one in tried.items() if name not in found.names]
@@ -195,12 +197,44 @@ def _unseen(
     return tuple(sorted(effects, key=lambda effect: effect is not first[type(effect)]))
 
 
-def _with_intervals(ground: Ground, found: Found) -> tuple[Found, Sequence[Mapping[str, float]]]:
-    """A set fitted to the rows for fits and for selection, and the half-widths of its intervals."""
+def with_intervals(
+    ground: Ground, found: Found, alike: Sequence[Sequence[Found]]
+) -> tuple[Found, Sequence[Mapping[str, float]], Sequence[Sequence[Found]]]:
+    """A set fitted to the rows for fits and for selection, with half-widths of its intervals, and its alternatives.
+
+    An effect whose interval holds its neutral value is left out, the least certain one first.
+    """
     model = ground.model(found.effects)
     parts = [replace(part, floor=None).of_simulation(ground.simulation) for part in (model.fit, model.selection)]
-    fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
-    return replace(found, effects=fit.effects), fit.half_widths
+    result = None
+    for _ in range(MOST_LEFT_OUT + 1):
+        try:
+            fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
+        except OutOfTimeError:
+            if result is None:
+                raise
+            break
+        found = replace(found, effects=fit.effects)
+        result = found, fit.half_widths, alike
+        sizes = [_certainty(effect, half) for effect, half in zip(fit.effects, fit.half_widths, strict=True)]
+        least = max(NEUTRAL, min(sizes, default=math.inf))
+        left_out = {
+            entry.name for entry, size in zip(found.entries, sizes, strict=True) if size <= least and size < 1.0
+        }
+        if not left_out:
+            break
+        alike = [sets for entry, sets in zip(found.entries, alike, strict=False) if entry.name not in left_out]
+        found = Found(*found.without(left_out), found.scores)
+    return result if result is not None else (found, (), alike)
+
+
+def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
+    """Distance of an effect's only value from neutral, in half-widths of its interval; infinite for other effects."""
+    if len(half_widths) != 1:
+        return math.inf
+    ((name, half),) = half_widths.items()
+    parameter = effect.parameters[name]
+    return abs(parameter.value - parameter.neutral) / half if half > 0.0 else math.inf
 
 
 def _explanation(
