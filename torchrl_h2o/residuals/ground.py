@@ -200,8 +200,8 @@ class Ground:
 
         Noise in the commands moves the simulator and not the machine, and over many steps an effect predicts better
         that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
-        effect must therefore predict the next step better, too: by half of the evidence, and by all of it if it averages
-        neighbouring commands, which lowers their noise by itself.
+        effect must therefore predict the next step better, too: by half of the evidence, and by all of it if it
+        averages neighbouring commands, which lowers their noise by itself.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
