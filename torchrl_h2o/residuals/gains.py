@@ -164,7 +164,7 @@ class Gains:
 
     def evidence_if_there(self, direction: Direction) -> float:
         """Evidence of the rows for an effect if it were there at its trial beside the present errors."""
-        return -self._evidence(direction.change * self.inverse)
+        return -self._evidence(self._gains(direction.change * self.inverse))
 
     @cached_property
     def _inverse(self) -> np.ndarray:
@@ -190,7 +190,7 @@ class Gains:
 
         The others are readjusted; the errors are taken as linear in all variables.
         """
-        left, found, before = {one.effect for one in variables}, [], None
+        left, found, before = {one.effect for one in variables}, [], np.zeros(len(self.white))
         while left:
             dropped = [effect for effect, _ in found]
             results = {effect: self.readjusted({*dropped, effect}, variables) for effect in left}
@@ -198,9 +198,9 @@ class Gains:
             moves, loss = results[effect]
             if math.isinf(loss):
                 return [*found, *((other, math.inf) for other in left)]
-            change = self.beside @ moves
-            found.append((effect, -self._evidence(change, before)))
-            before = change
+            gains = self._gains(self.beside @ moves)
+            found.append((effect, -self._evidence(gains - before)))
+            before = gains
             left.remove(effect)
         return found
 
@@ -222,7 +222,7 @@ class Gains:
 
         def gain(share: float) -> float:
             share = float(np.clip(share, *direction.shares))
-            return gains.setdefault(share, self._gain(share * column))
+            return gains.setdefault(share, float(self._gains(share * column).sum()))
 
         first = least_squares(self.weight)
         for share in (first, math.copysign(1.0, first), *self._shares_of_groups(column)):
@@ -272,19 +272,22 @@ class Gains:
         return shares, gram
 
     def _lead(self, directions: tuple[Direction, ...], shares: tuple[float, ...], change: np.ndarray) -> Lead:
-        return Lead(directions, shares, self._gain(change) / self.num_blocks, self._evidence(change))
+        gains = self._gains(change)
+        return Lead(directions, shares, float(gains.sum()) / self.num_blocks, self._evidence(gains))
 
-    def _gain(self, change: np.ndarray) -> float:
-        return float((self._density(change) - log_density(self.white)) @ self.share)
+    @cached_property
+    def _present(self) -> np.ndarray:
+        """Log density of the errors without a change, (N)."""
+        return log_density(self.white)
 
-    def _evidence(self, change: np.ndarray, before: np.ndarray | None = None) -> float:
-        less = log_density(self.white) if before is None else self._density(before)
-        difference = Difference(np.bincount(self.block, (self._density(change) - less) * self.share))
+    def _gains(self, change: np.ndarray) -> np.ndarray:
+        """Gain of each error by a change, (N), with the variance of each group that makes it likeliest."""
+        return (self._likeliest(change)[0] - self._present) * self.share
+
+    def _evidence(self, gains: np.ndarray) -> float:
+        """Evidence for gains of the errors, (N), paired over blocks."""
+        difference = Difference(np.bincount(self.block, gains))
         return difference.evidence if difference.acting >= FEWEST else float(difference.by_block.sum())
-
-    def _density(self, change: np.ndarray) -> np.ndarray:
-        """Log density of the errors after a change, (N), with the variance of each group that makes them likeliest."""
-        return self._likeliest(change)[0]
 
     def _weight_at(self, change: np.ndarray) -> np.ndarray:
         """Weights of the errors as in :attr:`weight`, after a change and with the variances that are likeliest then."""

@@ -23,6 +23,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates, log_density
 
 FIT_ROWS, SELECTION_ROWS = 1536, 1024  # rows that are predicted for fits, and for comparisons
+FIT_BLOCKS, SELECTION_BLOCKS = 32, 24  # blocks of a long log for which more rows are predicted
 DIVERGED = 1e3  # error in spreads where a simulation diverges
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
@@ -256,7 +257,6 @@ class Model:
         simulation: Simulation,
         measured: Measured,
         noise: Noise | None = None,
-        rows: tuple[int, int] = (FIT_ROWS, SELECTION_ROWS),
     ) -> Model:
         """Builds the model of a simulation.
 
@@ -264,9 +264,9 @@ class Model:
             simulation: the simulator with its effects.
             measured: the data.
             noise: the noise; estimated from the rows for fits by default.
-            rows: most rows for fits and for selection.
         """
         record, steps = Record(simulation, measured), block_steps(measured, simulation.control_step)
+        rows = max(FIT_ROWS, FIT_BLOCKS * steps), max(SELECTION_ROWS, SELECTION_BLOCKS * steps)
         fit = StartStates.of(record, Blocks.of(measured, Split.FIT, steps, rows[0]), noise)
         selection = StartStates.of(record, Blocks.of(measured, Split.SELECTION, steps, rows[1]), fit.noise)
         return cls(Predictions(fit), Predictions(selection))
