@@ -57,7 +57,7 @@ def close_the_loop(
         source: name of the data in the report.
         held_out: share of the transitions, taken from the end, on which errors are reported, or the indices of the
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
-        seed: seed for the synthetic noise and the network that learns from what is left.
+        seed: seed of the network that learns from what the effects leave.
         progress: whether to show a progress bar.
         minutes: time for all of it, more than 0: the search ends early enough for its result to be fitted and judged,
             and what could not be judged in time is named in the report. None for as long as it takes.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from torchrl_h2o.effects import ActionDelay, ActionLag, CatalogueEntry, Effect, ResidualForce
+from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import fit_set
@@ -28,7 +28,6 @@ MATTERS = 0.03  # share of the errors of the simulator without effects, below wh
 NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
-AVERAGES = (ActionDelay, ActionLag)  # average neighbouring commands where they are shorter than a control step
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 
 
@@ -200,8 +199,7 @@ class Ground:
 
         Noise in the commands moves the simulator and not the machine, and over many steps an effect predicts better
         that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
-        effect must therefore predict the next step better, too: by half of the evidence, and by all of it if it
-        averages neighbouring commands, which lowers their noise by itself.
+        effect must therefore predict the next step significantly better, too.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
@@ -210,6 +208,4 @@ class Ground:
             return False
         if more.one_step is None or less.one_step is None:
             return True
-        averages = any(isinstance(effect, AVERAGES) for effect in more.without(less.names)[1])
-        share = 1.0 if averages else 0.5
-        return Difference(more.one_step - less.one_step).evidence > share * min(needed, -math.log(self.level))
+        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))

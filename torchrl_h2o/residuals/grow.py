@@ -99,7 +99,6 @@ def with_one_more(
     passed_over: Collection[frozenset[str]] = (),
     *,
     joints_together: bool = False,
-    least_gain: float = 0.0,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps.
 
@@ -109,7 +108,6 @@ def with_one_more(
         directions: the candidates.
         passed_over: names of the entries of candidates that are not tried.
         joints_together: whether friction, damping and rotors of all joints together are a candidate.
-        least_gain: estimated gain, in nats a block, below which a candidate is not tried.
     """
     rough = ground.rough(found.effects)
     gains = gains_beside(rough, found)
@@ -117,10 +115,7 @@ def with_one_more(
     leads = [
         lead
         for lead in best_of_each(gains.leads(directions))
-        if lead.names not in passed_over
-        and not lead.names <= found.names
-        and lead.evidence > least
-        and lead.gain > least_gain
+        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > least
     ]
     sets = [[lead.beside(found.entries, found.effects, factor) for factor in lead.factors] for lead in leads[:TRIED]]
     best = _best_simulated(rough, sets)

@@ -15,7 +15,6 @@ from torchrl_h2o.residuals.sweep import Direction
 
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
 MOST_KEPT = 3  # effects that were needed when they were dropped, after which no more are
-RIVAL = 0.2  # share of an effect's gain that an estimate of another one must reach for this to be tried in its place
 SWAPS = 4  # largest number of effects that are replaced by others
 
 
@@ -112,8 +111,7 @@ def replaced(
             alike.append([])
             continue
         fewer = ground.found(*found.without({entry.name}))
-        least = RIVAL * (found.scores - fewer.scores).mean()
-        sketched = with_one_more(ground, fewer, directions, [frozenset({entry.name})], least_gain=least)
+        sketched = with_one_more(ground, fewer, directions, [frozenset({entry.name})])
         sketched.sort(key=lambda one: -one.scores.mean())
         fitted = [
             ground.fitted(one.entries, one.effects)

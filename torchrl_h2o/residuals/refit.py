@@ -17,6 +17,7 @@ from torchrl_h2o.residuals.start_states import TAIL, log_density
 STEP = 0.02  # step of the finite differences, in typical sizes of a parameter
 SMALLEST_GAIN = 1e-3  # gain of the score, in nats a row, below which a fit has converged
 FARTHEST = 3.0  # largest move of a parameter in one step of the fit, in typical sizes
+FARTHEST_FACTOR = 60.0  # largest logarithm of a factor, to base 2, beyond which any value is at its bound
 RIDGE = 1e-6  # share of a parameter's curvature that is added, so that what the data do not show stays where it is
 LEVERAGE = 9.0  # squared derivative, in squared medians, at which a row has half its weight
 REWEIGHTED = 8  # solutions of the weighted equations in one step
@@ -51,7 +52,8 @@ class Variable:
 
     def at(self, x: float) -> float:
         """The parameter's value at x."""
-        value = self.value * 2.0 ** (self.size * x) if self.is_factor else self.value + self.size * x
+        octaves = np.clip(self.size * x, -FARTHEST_FACTOR, FARTHEST_FACTOR)
+        value = self.value * 2.0**octaves if self.is_factor else self.value + self.size * x
         return float(np.clip(value, self.low, self.high))
 
     @property

@@ -137,9 +137,8 @@ def _searched(
     entries, directions, alike, unseen = every, [], [], ()
     measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
-        if explained := number > 0 and ground.leaves_little(found):
-            before, alike = found.names, []
-        else:
+        explained = number > 0 and ground.leaves_little(found)
+        if not explained:
             if number:
                 ground = Ground.of(ground.simulation, measured, found.effects, ground.level, ground.base.fit.floor)
             found = ground.fitted(found.entries, found.effects)
@@ -151,7 +150,8 @@ def _searched(
             directions = sweep(rough, entries, found.effects, partial(progress.closer, 0.5 / max(1, len(entries))))
             if not number and not found.entries:
                 unseen = _unseen(ground, rough, every, directions)
-            before, alike = found.names, []  # alternatives belong to one set
+        before, alike = found.names, []  # alternatives belong to one set
+        if not explained:
             found = grow(ground, found, directions, better, tried)
         if found.names == before and not explained:
             progress.stage(FORCES)
@@ -202,30 +202,29 @@ def with_intervals(
 ) -> tuple[Found, Sequence[Mapping[str, float]], Sequence[Sequence[Found]]]:
     """A set fitted to the rows for fits and for selection, with half-widths of its intervals, and its alternatives.
 
-    An effect whose interval holds its neutral value is left out, the least certain one first.
+    Effects whose interval holds their neutral value are left out, the least certain ones first, while there is time.
     """
     model = ground.model(found.effects)
     parts = [replace(part, floor=None).of_simulation(ground.simulation) for part in (model.fit, model.selection)]
-    result = None
-    for _ in range(MOST_LEFT_OUT + 1):
-        try:
-            fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
-        except OutOfTimeError:
-            if result is None:
-                raise
-            break
-        found = replace(found, effects=fit.effects)
-        result = found, fit.half_widths, alike
+    fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
+    for _ in range(MOST_LEFT_OUT):
         sizes = [_certainty(effect, half) for effect, half in zip(fit.effects, fit.half_widths, strict=True)]
         least = max(NEUTRAL, min(sizes, default=math.inf))
-        left_out = {
-            entry.name for entry, size in zip(found.entries, sizes, strict=True) if size <= least and size < 1.0
-        }
-        if not left_out:
+        idle = {one.name for one, size in zip(found.entries, sizes, strict=True) if size <= least and size < 1.0}
+        if not idle:
             break
-        alike = [sets for entry, sets in zip(found.entries, alike, strict=False) if entry.name not in left_out]
-        found = Found(*found.without(left_out), found.scores)
-    return result if result is not None else (found, (), alike)
+        fewer = Found(*replace(found, effects=fit.effects).without(idle), found.scores)
+        try:
+            refit = fit_set(parts, fewer.entries, fewer.effects, most_steps=GROWN, intervals=True)
+        except OutOfTimeError:
+            break
+        alike = [
+            [Found(*one.without(idle), one.scores) for one in sets]
+            for entry, sets in zip(found.entries, alike, strict=False)
+            if entry.name not in idle
+        ]
+        found, fit = fewer, refit
+    return replace(found, effects=fit.effects), fit.half_widths, alike
 
 
 def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:

@@ -106,7 +106,7 @@ def judge(
         catalogue: the effects that were tried; where nothing is missing, the verdict names those of a usual size that
             the data could not have shown.
         progress: the time for the report; what it does not allow is left out and named in ``left_out``.
-        seed: seed of the network that learns from what is left.
+        seed: seed of the network that learns from what the effects leave.
         settings: horizons and significance level.
 
     Returns:
@@ -120,7 +120,7 @@ def judge(
     steps = _shown_steps(error, simulation)
     predictions = optional(
         "the table of predictions",
-        lambda: None if steps is None else predicted(simulation, mended, measured, steps, seed, settings),
+        lambda: None if steps is None else predicted(simulation, mended, measured, steps, seed=seed, settings=settings),
         None,
     )
     verdict = optional(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -33,8 +34,8 @@ FAR = 5.0  # standard deviations at which the network's inputs and targets are c
 LEARNT = 0.8  # share of the error that a network may leave at most for something learnable to be missing
 FARTHEST = 10.0  # largest error of a reading that counts, in its spreads
 BETTER_THAN_GUESS = 0.8  # share of the guess's error up to which effects explain the motion
-NEGLIGIBLE = 0.002  # error, in spreads of the readings, of which nothing is said
-LITTLE = 0.02  # share of the error without effects of which nothing is said, either
+NEGLIGIBLE = 0.002  # errors below this, in spreads of the readings, are not reported as a missing effect
+LITTLE = 0.02  # neither are errors below this share of the error without effects
 TOTAL = "total"
 _COMPARED = ("mended", "velocities_stay")
 
@@ -55,7 +56,7 @@ class Predicted:
     losses: dict[str, np.ndarray]
     settings: LoopSettings
 
-    @property
+    @cached_property
     def table(self) -> PredictionTable:
         """The mean errors with their 95 % intervals, from the scatter between blocks of neighbouring windows."""
         rows = []
@@ -64,6 +65,7 @@ class Predicted:
             rows.append(PredictedRow(name, **cells))
         return PredictionTable(self.seconds, tuple(rows))
 
+    @cached_property
     def learnt(self) -> tuple[str, ...]:
         """Says so if a small network predicts what the simulator leaves of the motion: then something is missing."""
         mended, learned = self.losses["mended"], self.losses["mended_and_network"]
@@ -120,7 +122,8 @@ def predicted(
     mended: Simulation,
     measured: Measured,
     steps: int,
-    seed: int = 0,
+    *,
+    seed: int,
     settings: LoopSettings = DEFAULTS,
 ) -> Predicted | None:
     """Predicts the held-out motion by the simulator as it is and mended, by constant velocities, and with a network.

@@ -117,7 +117,7 @@ def _leaves_little(error: ErrorSummary, predictions: Predicted | None) -> bool:
     head = error.headline
     if head is None or head.after >= SMALL_REMAINDER * head.before:
         return False
-    if predictions is None or not predictions.learnt():
+    if predictions is None or not predictions.learnt:
         return True
     if error.after >= SMALL_REMAINDER * error.before:
         return False
@@ -133,7 +133,7 @@ def signs_of_something_missing(
     settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """The tests by which a simulation with all effects still differs from the data, each in words with its figure."""
-    signs = [] if predictions is None else [*predictions.learnt()]
+    signs = [] if predictions is None else [*predictions.learnt]
     correlations = {d.name: d.autocorrelation for d in error.per_dimension if d.autocorrelation is not None}
     high = {name: value for name, value in correlations.items() if np.isfinite(value) and value > AUTOCORRELATION}
     if high:
@@ -185,7 +185,7 @@ def reasons_against(
     acting = _acting(effects)
     if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
         reasons.append("the effects found do not lower the error on data that chose nothing")
-    if not acting and predictions is not None and (learnt := predictions.learnt()):
+    if not acting and predictions is not None and (learnt := predictions.learnt):
         reasons.append(f"the noise found stands for something that can be predicted: {learnt[0]}")
     names = simulation.names
     reasons += [f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect))]
