@@ -1,5 +1,7 @@
 """Effects on the model."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from torchrl_h2o.effects import (
     JointRest,
     JointSpring,
     JointStiffness,
+    LinkLength,
     Payload,
     RollingResistance,
     ServoStiffness,
@@ -47,6 +50,7 @@ EVERYWHERE = [
     GravityTilt(),
     JointSpring(),
     ContactSoftness(),
+    LinkLength(),
     Timestep(),
 ]
 CHEETAH_ONLY = [GeomLength(), JointStiffness(), JointRest(), JointRange()]
@@ -159,6 +163,24 @@ def test_a_pattern_with_a_slash_names_the_body_too():
 def test_what_the_model_does_not_have_is_named_with_what_it_has(effect, complaint):
     with pytest.raises(ValueError, match=f"cannot be put into model 'cart': .*{complaint}"):
         compile_model(spec(CART), [effect])
+
+
+ARM = """<mujoco model="arm"><worldbody><body name="upper"><joint name="shoulder" pos="0 0 0.1" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0.1 0 0 {end}" size="0.02"/><site name="camera" pos="0 0 {end}"/>
+  <body name="lower" pos="0 0 {lower}" euler="0 30 0"><joint name="elbow" pos="0.3 0 0" axis="0 1 0"/>
+    <geom type="capsule" size="0.02 0.1"/></body></body></worldbody></mujoco>"""
+
+
+def test_the_length_of_a_link_moves_what_it_carries():
+    """A link from the shoulder at 0.1 m to the elbow, which the lower body's frame has at (0.3, 0, 0) turned by 30°."""
+    elbow = 0.3 * math.sin(math.radians(-30.0))  # z of the elbow from the lower body's origin
+    shifted = ARM.format(end=-0.4, lower=-0.5 - elbow)
+    longer = ARM.format(end=0.1 - 1.2 * 0.5, lower=0.1 - 1.2 * 0.6 - elbow)
+    expected = mujoco.MjModel.from_xml_string(longer)
+    expected.body_pos[2, 0] = 0.2 * 0.3 * math.cos(math.radians(30.0))  # the elbow is beside the shoulder's axis, too
+    found = compile_model(spec(shifted), [LinkLength(1.2, bodies="upper")])
+    for field in ("body_pos", "body_mass", "body_ipos", "body_inertia", "jnt_pos", "geom_size", "site_pos"):
+        np.testing.assert_allclose(getattr(found, field), getattr(expected, field), atol=1e-9, err_msg=field)
 
 
 def test_an_exact_name_is_no_pattern():

@@ -32,6 +32,7 @@ from torchrl_h2o.effects.model.joint import (
     JointSpring,
     JointStiffness,
 )
+from torchrl_h2o.effects.model.link import LinkLength
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness
 from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.noise_balance import balanced
@@ -77,6 +78,7 @@ __all__ = [
     "JointSpring",
     "JointStiffness",
     "LinearDrag",
+    "LinkLength",
     "ModelEffect",
     "Names",
     "ObservationBias",

@@ -6,10 +6,10 @@ Sensor noise and the simulator's error one step ahead are estimated from the dat
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from torchrl_h2o.residuals.blocks import LENGTHS, Blocks, Windows
 from torchrl_h2o.residuals.record import Record
@@ -21,9 +21,10 @@ TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
-NOISE_EVALUATIONS = 18
-MOST_FACTOR = 12.0  # largest logarithm of a factor on the typical noise
 USUAL_FACTORS = np.array([0.0, -0.7])
+SPACINGS = (2.0, 1.0, 0.5, 0.25)  # of the logarithms that are tried, one grid after another
+AROUND = np.array([[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
+OF_STEPS = np.array([[0.0, -2.0], [0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])  # for a similar simulation
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
 
 
@@ -82,7 +83,7 @@ class StartStates:
         factors = USUAL_FACTORS
         if noise is None:
             noise, factors = steps.fitted_noise(None if similar is None else similar.factors)
-        mean, covariance, _ = steps.filtered(noise)
+        (mean,), (covariance,), _ = steps.filtered([noise])
         before = _rows_before(blocks)
         return cls(record, blocks, noise, mean[:, before:], covariance[:, before:], steps.slope, factors)
 
@@ -173,23 +174,16 @@ class _Steps:
         """The noise under which the next readings are most likely, and its two factors on :meth:`_typical_noise`.
 
         Args:
-            factors: logarithms of the factors of a similar simulation, from which the fit may begin.
+            factors: logarithms of the factors of a similar simulation, of which only the one of the steps is changed.
         """
         typical = self._typical_noise()
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
-
-        def noise(x: np.ndarray) -> Noise:
-            return typical.scaled(*np.exp(np.clip(x, -MOST_FACTOR, 0.5 * MOST_FACTOR)))
-
-        def loss(x: np.ndarray) -> float:
-            return -self.filtered(noise(x), some)[2]
-
-        begins = [USUAL_FACTORS] if factors is None else [USUAL_FACTORS, factors]
-        begin = min(begins, key=loss) if len(begins) > 1 else USUAL_FACTORS
-        simplex = begin + np.array([[0.0, 0.0], [-0.7, 0.0], [0.0, -0.7]])
-        options = {"maxfev": NOISE_EVALUATIONS, "initial_simplex": simplex, "xatol": 0.1, "fatol": 0.01}
-        best = minimize(loss, begin, method="Nelder-Mead", options=options).x
-        return noise(best), best
+        grids = [spacing * AROUND for spacing in SPACINGS] if factors is None else [OF_STEPS]
+        best = USUAL_FACTORS if factors is None else factors
+        for grid in grids:
+            noises = [typical.scaled(*np.exp(one)) for one in best + grid]
+            best = best + grid[self.filtered(noises, some)[2].argmax()]
+        return typical.scaled(*np.exp(best)), best
 
     def _typical_noise(self) -> Noise:
         """Noise of the sensors by the products of successive misses, and the size of the misses.
@@ -210,40 +204,48 @@ class _Steps:
         share = np.maximum(shared / np.maximum((weight * slope**2).sum((0, 1, 2)), 1e-12), 0.0)
         return Noise(np.sqrt(share) * size[:n], size)
 
-    def filtered(self, noise: Noise, some: slice = slice(None)) -> tuple[np.ndarray, np.ndarray, float]:
-        """Means (B, L, m), covariances (B, L, m, m) and the mean log density of the next readings."""
+    def filtered(
+        self, noises: Sequence[Noise], some: slice = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Filters blocks under each of K noises.
+
+        Returns:
+            Means, (K, B, L, m), covariances, (K, B, L, m, m), and the mean log density of the next readings, (K).
+        """
         n, m = self.record.num_readings, self.miss.shape[-1]
         slope, miss, live, known = (values[some] for values in (self.slope, self.miss, self.live, self.known))
-        sensor, step = np.diag(noise.sensor**2), np.diag(noise.step**2)
-        begin = np.diag(np.append(noise.sensor**2, np.ones(m - n)))
-        mean, covariance = np.zeros((*live.shape, m)), np.zeros((*live.shape, m, m))
-        x, doubt = np.zeros((len(live), m)), np.tile(begin, (len(live), 1, 1))
-        density, count = 0.0, 0
+        sensor, step = (
+            np.stack([np.diag(value**2) for value in values])[:, None]
+            for values in ([noise.sensor for noise in noises], [noise.step for noise in noises])
+        )
+        begin = np.pad(sensor, ((0, 0), (0, 0), (0, m - n), (0, m - n))) + np.diag(np.arange(m) >= n)
+        mean, covariance = np.zeros((len(noises), *live.shape, m)), np.zeros((len(noises), *live.shape, m, m))
+        x, doubt = np.zeros((len(noises), len(live), m)), np.repeat(begin, len(live), axis=1)
+        density = np.zeros(len(noises))
         for row in range(live.shape[1]):
-            mean[:, row], covariance[:, row] = x, doubt
+            mean[:, :, row], covariance[:, :, row] = x, doubt
             guess = (slope[:, row] @ x[..., None])[..., 0] + miss[:, row]
             doubt = slope[:, row] @ doubt @ slope[:, row].transpose(0, 2, 1) + step
-            factor = np.linalg.cholesky(doubt[:, :n, :n] + sensor)
-            white = np.linalg.solve(factor, -guess[:, :n, None])[..., 0]
-            square, valid = (white**2).mean(1), live[:, row] & known[:, row]
-            log_det = np.log(np.einsum("bii->bi", factor)).sum(1)
-            density += float((log_density(white).sum(1) - log_det)[valid].sum())
-            count += int(valid.sum())
+            factor = np.linalg.cholesky(doubt[..., :n, :n] + sensor)
+            white = np.linalg.solve(factor, -guess[..., :n, None])[..., 0]
+            square, valid = (white**2).mean(-1), live[:, row] & known[:, row]
+            log_det = np.log(np.einsum("kbii->kbi", factor)).sum(-1)
+            density += ((log_density(white).sum(-1) - log_det) * valid).sum(-1)
             # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
-            trust = np.where(square > SURPRISE, square, 1.0)
-            doubt = _bounded(doubt * np.where(known[:, row], trust, 1.0 / ROUNDING**2)[:, None, None], MOST_DOUBT)
-            gain = np.linalg.solve(doubt[:, :n, :n] + sensor, doubt[:, :n]).transpose(0, 2, 1)
-            x = guess - (gain @ guess[:, :n, None])[..., 0]
-            left = np.eye(m) - np.pad(gain, ((0, 0), (0, 0), (0, m - n)))
-            doubt = left @ doubt @ left.transpose(0, 2, 1) + gain @ sensor @ gain.transpose(0, 2, 1)
-            x[~live[:, row]], doubt[~live[:, row]] = 0.0, begin
-        return mean, covariance, density / max(1, count)
+            trust = np.where(known[:, row], np.where(square > SURPRISE, square, 1.0), 1.0 / ROUNDING**2)
+            doubt = _bounded(doubt * trust[..., None, None], MOST_DOUBT)
+            gain = np.linalg.solve(doubt[..., :n, :n] + sensor, doubt[..., :n, :]).swapaxes(-1, -2)
+            x = guess - (gain @ guess[..., :n, None])[..., 0]
+            left = np.eye(m) - np.pad(gain, ((0, 0), (0, 0), (0, 0), (0, m - n)))
+            doubt = left @ doubt @ left.swapaxes(-1, -2) + gain @ sensor @ gain.swapaxes(-1, -2)
+            x[:, ~live[:, row]], doubt[:, ~live[:, row]] = 0.0, begin
+        return mean, covariance, density / max(1, int((live & known).sum()))
 
 
 def _bounded(doubt: np.ndarray, most: float) -> np.ndarray:
-    """Covariances (B, m, m) with variances of at most ``most`` and the same correlations."""
-    shrink = np.sqrt(np.minimum(1.0, most / np.maximum(np.einsum("bii->bi", doubt), 1e-300)))
-    return doubt * shrink[:, :, None] * shrink[:, None, :]
+    """Covariances (..., m, m) with variances of at most ``most`` and the same correlations."""
+    shrink = np.sqrt(np.minimum(1.0, most / np.maximum(np.einsum("...ii->...i", doubt), 1e-300)))
+    return doubt * shrink[..., :, None] * shrink[..., None, :]
 
 
 def _rows_before(blocks: Blocks) -> int:

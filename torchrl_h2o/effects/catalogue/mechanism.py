@@ -67,6 +67,13 @@ class Mechanism:
             body = self.model.body_parentid[body]
         return True
 
+    def is_link(self, body: int) -> bool:
+        """Whether a body carries joints of other bodies and does not float."""
+        model = self.model
+        own = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+        carries = any(model.body_parentid[child] == body and model.body_jntnum[child] for child in range(model.nbody))
+        return carries and bool(model.body_weldid[body]) and not any(self.floating(joint) for joint in own)
+
     def axes(self, body: int) -> tuple[str, ...]:
         """Returns the axes of a body's frame along which a shift of its mass has an effect."""
         return ("x", "z") if self.planar(body) else ("x", "z", "y")

@@ -25,6 +25,7 @@ from torchrl_h2o.effects.model.joint import (
     JointSpring,
     JointStiffness,
 )
+from torchrl_h2o.effects.model.link import LinkLength
 from torchrl_h2o.effects.selection import Names
 
 # scales that a trial multiplies a property of the model by
@@ -36,7 +37,7 @@ Choices = dict[Names, tuple[int, ...]]
 
 
 def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
-    """Yields entries for mass, inertia, centre of mass and payload of the bodies that have a mass."""
+    """Yields entries for mass, inertia, centre of mass and payload of the bodies that have a mass, and for links."""
     model = mechanism.model
     heavy = [b for b in range(1, model.nbody) if model.body_weldid[b] and model.body_mass[b] > mujoco.mjMINVAL]
     paths = _body_paths(model)
@@ -54,6 +55,8 @@ def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         if model.body_parentid[index + 1] == 0 or index + 1 in alone
     }
     yield from entries_of(Payload, "bodies", carrying, lambda chosen: _loads(mechanism, chosen[0] + 1))
+    links = named_choices(paths, [b - 1 for b in range(1, model.nbody) if mechanism.is_link(b)], groups=False)
+    yield from _factors(mechanism, LinkLength, "bodies", links)
 
 
 def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
