@@ -111,14 +111,19 @@ class Gains:
     unexplained: np.ndarray
 
     @classmethod
-    def of(cls, predictions: Predictions, errors: Sequence[np.ndarray], beside: Sequence[np.ndarray]) -> Gains:
-        """Prepares the gains for errors (as :meth:`Predictions.errors`), beside changes (N) of present effects."""
+    def of(cls, predictions: Predictions, errors: Sequence[np.ndarray], slopes: np.ndarray | None = None) -> Gains:
+        """Prepares the gains for errors (as :meth:`Predictions.errors`), beside present effects with slopes (N, p)."""
         scales = fitted_scales(predictions, errors)
         white, inverse, share = whitened(predictions, errors, scales)
-        columns = np.stack([change * inverse for change in beside], 1) if beside else np.zeros((len(white), 0))
+        columns = np.zeros((len(white), 0)) if slopes is None else slopes * inverse[:, None]
         groups = _groups(errors)
         fitted = flat([np.broadcast_to(scale, one.shape) for scale, one in zip(scales, errors, strict=True)])
         return cls(white, inverse, share, columns, block_of(predictions), groups, fitted * inverse**2)
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Changes by the values of the present effects, (N, p), in spreads."""
+        return self.beside / self.inverse[:, None]
 
     @cached_property
     def _rescaled(self) -> tuple[np.ndarray, np.ndarray]:

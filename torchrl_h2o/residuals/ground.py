@@ -28,6 +28,7 @@ MATTERS = 0.03  # share of the errors of the simulator without effects, below wh
 NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
+DEAF = 0.98  # share of its response to the commands at which a simulator is deafer to their noise
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 
 
@@ -54,12 +55,14 @@ class Found:
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
         one_step: scores of the blocks for selection one step ahead, (S), if they tell more than the sensors' noise.
+        slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """
 
     entries: tuple[CatalogueEntry, ...]
     effects: tuple[Effect, ...]
     scores: np.ndarray
     one_step: np.ndarray | None = None
+    slopes: np.ndarray | None = field(default=None, repr=False)
 
     @property
     def names(self) -> frozenset[str]:
@@ -160,23 +163,48 @@ class Ground:
         usual = np.concatenate([np.median(np.abs(error), axis=0) for error in errors])
         return bool((usual**2 <= floor + (NEARLY_NONE * ROUNDING) ** 2).all())
 
-    def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
-        """A set with its values fitted from the present ones."""
+    def fitted(
+        self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], slopes: np.ndarray | None = None
+    ) -> Found:
+        """A set with its values fitted from the present ones.
+
+        Args:
+            entries: entries of the catalogue.
+            effects: the effects.
+            slopes: derivatives of the errors by their values, (N, p), if they are known.
+        """
         found = self.found(entries, effects)
         for _ in range(REFITTED if entries else 0):
-            fit = fit_set([self.fit_part(found.effects)], entries, found.effects, most_steps=GROWN)
-            other = self.found(entries, fit.effects)
+            other = self.sketched(self.fit_part(found.effects), entries, found.effects, GROWN, slopes)
             gain = other.scores[: self.num_fit].mean() - found.scores[: self.num_fit].mean()
-            found = other if gain > 0.0 else found
+            slopes = other.slopes
+            found = other if gain > 0.0 else replace(found, slopes=slopes)
             if gain < 0.01 * len(self.simulation.state_map.names):
                 break
         return found
 
     def sketched(
-        self, part: Predictions, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], most_steps: int = SKETCH
+        self,
+        part: Predictions,
+        entries: Sequence[CatalogueEntry],
+        effects: Sequence[Effect],
+        most_steps: int,
+        slopes: np.ndarray | None = None,
     ) -> Found:
-        """A set with its values fitted to predictions, such as rough ones, in a few steps."""
-        return self.found(entries, fit_set([part], entries, effects, most_steps=most_steps).effects if entries else ())
+        """A set with its values fitted to predictions in a few steps.
+
+        Args:
+            part: the predictions.
+            entries: entries of the catalogue.
+            effects: the effects.
+            most_steps: largest number of steps.
+            slopes: derivatives of the errors by the first values, (N, q), if they are known.
+        """
+        if not entries:
+            return self.found((), ())
+        fit = fit_set([part], entries, effects, most_steps=most_steps, slopes=None if slopes is None else [slopes])
+        of_all = fit.slopes and part.blocks is self.base.fit.blocks
+        return replace(self.found(entries, fit.effects), slopes=fit.slopes[0] if of_all else None)
 
     def needed(self, more: Found, less: Found) -> float:
         """Evidence that a larger set needs: a significant one, and more for unusual effects.
@@ -197,9 +225,9 @@ class Ground:
         Rows for selection must show half of the evidence needed, and all rows must show all of it, and more where the
         set is the best of many.
 
-        Noise in the commands moves the simulator and not the machine, and over many steps an effect predicts better
-        that makes the simulator deaf to it, such as friction. Where such noise is larger than that of the sensors, an
-        effect must therefore predict the next step significantly better, too.
+        Noise of the logged commands moves the simulator and not the machine, and over many steps an effect predicts
+        better that makes the simulator deaf to it, such as friction. Where the motion is noisier than the sensors, such
+        an effect must therefore predict the next step significantly better, too.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
@@ -208,4 +236,10 @@ class Ground:
             return False
         if more.one_step is None or less.one_step is None:
             return True
-        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))
+        ahead = Difference(more.one_step - less.one_step).evidence
+        return ahead > min(needed, -math.log(self.level)) or not self._is_deafer(more, less)
+
+    def _is_deafer(self, more: Found, less: Found) -> bool:
+        """Whether commands move the simulator less with a set than with another."""
+        rough = self.rough(less.effects)
+        return rough.response(more.effects) < rough.response(less.effects) + math.log(DEAF)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce, is_negligible
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
-from torchrl_h2o.residuals.ground import FITTED, Found, Ground
+from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground
 from torchrl_h2o.residuals.refit import slopes_of, variables_of
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
@@ -18,10 +21,33 @@ from torchrl_h2o.residuals.sweep import Direction
 TRIED = 16  # candidates of the largest estimated gain whose gain is then simulated
 ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
 MOST_REFUSED = 9  # candidates that are refused one after another before none is added
+FEW = 2  # effects that are added together as if they were one
 MOST_TERMS = 6  # largest number of terms of a force outside the catalogue
 MOST_EFFECTS = 80  # largest number of entries in a set
 
 Set = tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What may be added to a set.
+
+    Args:
+        rough: predictions from start states filtered with the set.
+        leads: the best direction of each candidate, in descending order of the estimated gain.
+        joints: friction, damping and rotors of all joints together.
+    """
+
+    rough: Predictions
+    leads: Sequence[Lead]
+    joints: Lead | None
+
+    @classmethod
+    def of(cls, ground: Ground, found: Found, directions: Sequence[Direction]) -> Candidates:
+        """The candidates beside a set."""
+        rough = ground.rough(found.effects)
+        gains = gains_beside(rough, found)
+        return cls(rough, best_of_each(gains.leads(directions)), gains.of_joints(directions))
 
 
 def grow(
@@ -42,23 +68,29 @@ def grow(
     """
     refused: set[frozenset[str]] = set()
     among = max(1, len({one.entry.name for one in directions}))
+    candidates = Candidates.of(ground, found, directions)
     while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
-        fitted = with_one_more(ground, found, directions, refused, joints_together=True)
+        fitted = with_one_more(ground, found, candidates, refused)
         if not fitted:
             break
         for one in fitted:
             _remember(tried, one, found)
-        better = [one for one in fitted if ground.adds(one, found, among)]
+        better = [one for one in fitted if ground.adds(one, found, 1 if _is_many(one, found) else among)]
         if better:
             best = most_usual(better)
-            many = len(best.entries) > len(found.entries) + 2
-            before, found, refused = found, ground.fitted(best.entries, best.effects), set()
+            before, found, refused = found, ground.fitted(best.entries, best.effects, best.slopes), set()
             advance(found, before)
-            if many or ground.leaves_little(found):  # after many, the candidates change the errors in other ways
+            if _is_many(best, before) or ground.leaves_little(found):  # many change how candidates change the errors
                 break
+            candidates = Candidates.of(ground, found, directions)
         else:
             refused |= {one.names - found.names for one in fitted}
     return found
+
+
+def _is_many(more: Found, less: Found) -> bool:
+    """Whether a set has an effect on each of several joints more than another: a choice among few kinds of effects."""
+    return len(more.entries) > len(less.entries) + FEW
 
 
 def _remember(tried: dict[str, Tried], more: Found, less: Found) -> None:
@@ -82,7 +114,7 @@ def with_force(
                 entries, effects = zip(*new, strict=True)
                 sets.append([((*found.entries, *entries), (*found.effects, *effects))])
         rough = ground.rough(found.effects)
-        fitted = _sketched(ground, rough, _best_simulated(rough, sets))
+        fitted = _sketched(ground, _best_simulated(rough, sets), found)
         better = [one for one in fitted if ground.adds(one, found, max(1, len(sets)))]
         if not better:
             break
@@ -95,34 +127,38 @@ def with_force(
 def with_one_more(
     ground: Ground,
     found: Found,
-    directions: Sequence[Direction],
+    candidates: Candidates,
     passed_over: Collection[frozenset[str]] = (),
-    *,
-    joints_together: bool = False,
+    rival: Found | None = None,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps.
 
     Args:
         ground: where sets are compared.
         found: the set.
-        directions: the candidates.
+        candidates: the candidates beside it.
         passed_over: names of the entries of candidates that are not tried.
-        joints_together: whether friction, damping and rotors of all joints together are a candidate.
+        rival: a larger set; only candidates are tried that are estimated to gain a quarter as much.
     """
-    rough = ground.rough(found.effects)
-    gains = gains_beside(rough, found)
+    rough, joints = candidates.rough, candidates.joints
     least = -0.5 * math.log(ground.level) * len(rough.blocks) / len(ground.base.fit.blocks)
     leads = [
         lead
-        for lead in best_of_each(gains.leads(directions))
+        for lead in candidates.leads
         if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > least
     ]
+    if rival is not None:
+        quarter = 0.25 * (rough.score(rival.effects) - rough.score(found.effects))
+        leads = [lead for lead in leads if lead.gain > quarter]
+    if rival is not None or joints is None or joints.names in passed_over or joints.names <= found.names:
+        joints = None
+    else:
+        leads = [lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names]
     sets = [[lead.beside(found.entries, found.effects, factor) for factor in lead.factors] for lead in leads[:TRIED]]
     best = _best_simulated(rough, sets)
-    joints = gains.of_joints(directions) if leads and joints_together else None
-    if joints is not None and joints.names not in passed_over and not joints.names <= found.names:
+    if joints is not None and leads and joints.gain > max(lead.gain for lead in leads):
         best.append(joints.beside(found.entries, found.effects, 1.0))
-    return [one for one in _sketched(ground, rough, best) if _is_usable(ground, one, found)]
+    return [one for one in _sketched(ground, best, found) if _is_usable(ground, one, found)]
 
 
 def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> list[Set]:
@@ -143,24 +179,30 @@ def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
         return -math.inf
 
 
-def _sketched(ground: Ground, rough: Predictions, sets: Sequence[Set]) -> list[Found]:
-    """Sets with their values fitted in a few steps, without those that the model rejects."""
-    found = []
+def _sketched(ground: Ground, sets: Sequence[Set], present: Found) -> list[Found]:
+    """Sets with their values fitted in a few steps, without those that the model rejects.
+
+    The derivatives by the values of a present set are known where a set begins with its effects.
+    """
+    part, found = ground.fit_part(present.effects), []
+    known = gains_beside(part, present, present.slopes).slopes if sets else None
     for entries, effects in sets:
+        begins = effects[: len(present.effects)] == present.effects
+        many = len(effects) > len(present.effects) + FEW
         try:
-            found.append(ground.sketched(rough, entries, effects))
+            found.append(ground.sketched(part, entries, effects, GROWN if many else SKETCH, known if begins else None))
         except ValueError:
             continue
     return found
 
 
-def gains_beside(part: Predictions, found: Found) -> Gains:
-    """Gains of candidates beside a set, whose values are readjusted."""
-    errors, beside = part.errors(found.effects), []
-    if found.entries:
+def gains_beside(part: Predictions, found: Found, slopes: np.ndarray | None = None) -> Gains:
+    """Gains of candidates beside a set, whose values are readjusted; slopes are those by its values, if known."""
+    errors = part.errors(found.effects)
+    if found.entries and slopes is None:
         variables = variables_of(part, found.entries, found.effects)
-        beside = list(slopes_of([part], found.effects, variables, [errors])[0].T)
-    return Gains.of(part, errors, beside)
+        (slopes,) = slopes_of([part], found.effects, variables, [errors])
+    return Gains.of(part, errors, slopes)
 
 
 def best_of_each(leads: Sequence[Lead]) -> list[Lead]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
-from torchrl_h2o.residuals.grow import ALIKE, gains_beside, is_preferred, most_usual, with_one_more
+from torchrl_h2o.residuals.grow import ALIKE, Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.refit import Variable, variables_of, with_values
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
@@ -43,7 +43,7 @@ def prune(ground: Ground, found: Found) -> Found:
             if not weak:
                 break
             kept.add(weak[0])
-    return found if found is before else ground.fitted(found.entries, found.effects)
+    return found if found is before else ground.fitted(found.entries, found.effects, found.slopes)
 
 
 def _without_needless_kinds(ground: Ground, found: Found) -> Found:
@@ -76,7 +76,8 @@ class _Linear:
     @classmethod
     def about(cls, ground: Ground, found: Found) -> _Linear:
         part = ground.fit_part(found.effects)
-        return cls(found, part, variables_of(part, found.entries, found.effects), gains_beside(part, found))
+        variables = variables_of(part, found.entries, found.effects)
+        return cls(found, part, variables, gains_beside(part, found, found.slopes))
 
     @property
     def estimates(self) -> list[tuple[str, float]]:
@@ -89,8 +90,9 @@ class _Linear:
         dropped = [index for index, entry in enumerate(self.found.entries) if entry.name in names]
         moves, _ = self.gains.readjusted(dropped, self.variables)
         effects = with_values(self.found.effects, self.variables, moves)
+        slopes = self.gains.slopes[:, [one.effect not in dropped for one in self.variables]]
         try:
-            return ground.sketched(self.part, *replace(self.found, effects=effects).without(names), GROWN)
+            return ground.sketched(self.part, *replace(self.found, effects=effects).without(names), GROWN, slopes)
         except ValueError:
             return None
 
@@ -111,12 +113,11 @@ def replaced(
             alike.append([])
             continue
         fewer = ground.found(*found.without({entry.name}))
-        sketched = with_one_more(ground, fewer, directions, [frozenset({entry.name})])
-        sketched.sort(key=lambda one: -one.scores.mean())
+        candidates = Candidates.of(ground, fewer, directions)
+        sketched = with_one_more(ground, fewer, candidates, [frozenset({entry.name})], rival=found)
+        half = 0.5 * (found.scores - fewer.scores).mean()
         fitted = [
-            ground.fitted(one.entries, one.effects)
-            for rank, one in enumerate(sketched)
-            if not rank or 2.0 * (one.scores - fewer.scores).mean() > (found.scores - fewer.scores).mean()
+            ground.fitted(one.entries, one.effects) for one in sketched if (one.scores - fewer.scores).mean() > half
         ]
         others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
         better = [one for one in others if is_preferred(one, found)]

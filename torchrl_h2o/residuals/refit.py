@@ -24,6 +24,7 @@ REWEIGHTED = 8  # solutions of the weighted equations in one step
 CONFIDENCE = 1.96  # standard errors from a value to the end of its 95 % interval
 
 Whitened = tuple[np.ndarray, np.ndarray, np.ndarray]
+Slopes = Sequence[np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,13 @@ class SetFit:
         effects: the effects with their fitted values.
         by_block: score of each fitted block, (B), in nats a row.
         half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
+        slopes: derivatives of the errors by the values, (N, p) for each part, or an estimate of them.
     """
 
     effects: tuple[Effect, ...]
     by_block: np.ndarray
     half_widths: tuple[dict[str, float], ...]
+    slopes: Slopes | None = None
 
 
 def variables_of(
@@ -132,8 +135,12 @@ def fit_set(
     *,
     most_steps: int,
     intervals: bool = False,
+    slopes: Slopes | None = None,
 ) -> SetFit:
     """Maximises the score over the values of effects, from their present values.
+
+    Derivatives follow the errors of each step (Broyden's update). Where they lead no further they are computed again,
+    unless they were given.
 
     Args:
         parts: predictions of the rows to fit.
@@ -141,6 +148,7 @@ def fit_set(
         effects: the effects, in the order of their composition.
         most_steps: largest number of Gauss-Newton steps.
         intervals: whether to compute the intervals.
+        slopes: derivatives of the errors by the first values, (N, q) for each part, if they are known.
 
     Raises:
         ValueError: if the model rejects the effects at the start.
@@ -148,14 +156,11 @@ def fit_set(
     effects = tuple(effects)
     errors = [part.errors(effects) for part in parts]
     scales, by_block = _profiled(parts, errors)
-    slopes, variables = None, []
-    for _ in range(most_steps):
-        variables = variables_of(parts[0], entries, effects)
-        if not variables:
-            break
-        is_new = slopes is None
-        if slopes is None:
-            slopes = slopes_of(parts, effects, variables, errors)
+    variables, is_new, is_given = variables_of(parts[0], entries, effects), False, slopes is not None
+    for _ in range(most_steps if variables else 0):
+        if slopes is None or slopes[0].shape[1] < len(variables):
+            is_new = slopes is None
+            slopes = slopes_of(parts, effects, variables, errors, slopes)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
         move, gain = _step(weighted, slopes, variables), 0.0
         for share in (1.0, 0.3, 0.1) if is_new else (1.0,):
@@ -167,20 +172,23 @@ def fit_set(
             new_scales, new_by_block = _profiled(parts, new_errors)
             gain = float(new_by_block.mean() - by_block.mean())
             if gain > 0.0:
+                slopes = _followed(slopes, share * move, errors, new_errors)
                 effects, errors, scales, by_block = tried, new_errors, new_scales, new_by_block
+                variables = variables_of(parts[0], entries, effects)
                 break
         if gain < SMALLEST_GAIN:
-            if is_new:
+            if is_new or is_given:
                 break
-            slopes = None  # the derivatives of an earlier step lead no further
+            slopes = None
+        is_new = False
     widths: tuple[dict[str, float], ...] = tuple({} for _ in effects)
     if intervals and variables:
-        variables = variables_of(parts[0], entries, effects)
-        slopes = slopes_of(parts, effects, variables, errors)
+        if slopes is None:
+            slopes = slopes_of(parts, effects, variables, errors)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
         for variable, half in zip(variables, _half_widths(parts, weighted, slopes), strict=True):
             widths[variable.effect][variable.name] = half * abs(variable.slope(0.0))
-    return SetFit(effects, by_block, widths)
+    return SetFit(effects, by_block, widths, slopes)
 
 
 def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:
@@ -215,13 +223,17 @@ def block_of(part: Predictions) -> np.ndarray:
 
 
 def slopes_of(
-    parts: Sequence[Predictions], effects: Sequence[Effect], variables: Sequence[Variable], errors
-) -> list[np.ndarray]:
-    """Derivatives of the errors by the variables, (N, p) for each part."""
-    columns: list[list[np.ndarray]] = [[] for _ in parts]
+    parts: Sequence[Predictions],
+    effects: Sequence[Effect],
+    variables: Sequence[Variable],
+    errors,
+    known: Slopes | None = None,
+) -> Slopes:
+    """Derivatives of the errors by the variables, (N, p) for each part; those by the first ones may be known."""
+    columns: list[list[np.ndarray]] = [[] if known is None else list(own.T) for own in known or parts]
     zero = np.zeros(len(variables))
-    for index, variable in enumerate(variables):
-        low, high = variable.bounds
+    for index in range(len(columns[0]), len(variables)):
+        low, high = variables[index].bounds
         step = STEP if high > STEP else -STEP
         if low > step:
             step = 0.0
@@ -237,7 +249,14 @@ def slopes_of(
     return [np.stack(found, axis=1) for found in columns]
 
 
-def _step(parts: Sequence[Whitened], slopes: Sequence[np.ndarray], variables: Sequence[Variable]) -> np.ndarray:
+def _followed(slopes: Slopes, move: np.ndarray, before, after) -> Slopes:
+    """Derivatives that agree with the change of the errors by a move: Broyden's update."""
+    along = move / max(move @ move, 1e-300)
+    changes = [flat(new) - flat(old) for old, new in zip(before, after, strict=True)]
+    return [own + np.outer(change - own @ move, along) for own, change in zip(slopes, changes, strict=True)]
+
+
+def _step(parts: Sequence[Whitened], slopes: Slopes, variables: Sequence[Variable]) -> np.ndarray:
     """The move of the variables, within their bounds, that raises the score most if the errors are linear.
 
     Near a contact a derivative may be arbitrarily large. The move is therefore also computed with less weight for rows
@@ -266,7 +285,7 @@ def _step(parts: Sequence[Whitened], slopes: Sequence[np.ndarray], variables: Se
     return best
 
 
-def _half_widths(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Sequence[np.ndarray]) -> np.ndarray:
+def _half_widths(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Slopes) -> np.ndarray:
     """Half-widths of the variables' 95 % intervals: a sandwich estimate with each block as one observation."""
     curvature, scatter, blocks = 0.0, 0.0, 0
     for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):

@@ -28,6 +28,7 @@ DIVERGED = 1e3  # error in spreads where a simulation diverges
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
 FEWEST = 4  # blocks that must differ
+NOISE_OF_COMMANDS = 0.1  # noise by which a simulation's response is measured, in standard deviations of the commands
 SCALED = 200  # windows from which these variances are fitted
 SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
 
@@ -110,8 +111,10 @@ class Predictions:
         Raises:
             ValueError: if the model rejects an effect.
         """
-        record, simulation, predicted = self.record, self.record.simulation, self._base
-        if effects:
+        record, simulation = self.record, self.record.simulation
+        if not effects:
+            predicted = self._base
+        else:
             simulation, states = record.simulation.with_effects(*effects), self._states
             if any(isinstance(effect, ObservationEffect) for effect in effects):
                 other, _ = true_readings(simulation, record.measured)
@@ -149,9 +152,25 @@ class Predictions:
         errors = self.errors(effects)
         return float(scores(self, errors, fitted_scales(self, errors)).mean())
 
-    def _predicted(self, simulation: Simulation, states: Sequence[np.ndarray]) -> list[np.ndarray]:
-        record, measured = self.record, self.record.measured
-        same = simulation is record.simulation
+    def response(self, effects: Sequence[Effect]) -> float:
+        """How far noise in the commands moves the simulation with effects: the mean logarithm over all readings.
+
+        Raises:
+            ValueError: if the model rejects an effect.
+        """
+        simulation, measured = self.record.simulation.with_effects(*effects), self.record.measured
+        noise = np.random.default_rng(0).standard_normal(measured.action.shape)
+        noisy = replace(measured, action=measured.action + NOISE_OF_COMMANDS * measured.action.std(0) * noise)
+        before, after = self._predicted(simulation, self._states), self._predicted(simulation, self._states, noisy)
+        moves = [np.nanmedian(np.abs(new - old), axis=0) for old, new in zip(before, after, strict=True)]
+        return float(np.mean(np.log(np.concatenate(moves) + ROUNDING)))
+
+    def _predicted(
+        self, simulation: Simulation, states: Sequence[np.ndarray], measured: Measured | None = None
+    ) -> list[np.ndarray]:
+        record = self.record
+        same = simulation is record.simulation and measured is None
+        measured = measured or record.measured
         executed = record.executed if same else executed_actions(simulation, measured)
         active = record.activations if same else activations(simulation, measured, executed)
         n, found = record.num_readings, []

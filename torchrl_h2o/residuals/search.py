@@ -16,7 +16,7 @@ from torchrl_h2o.effects.model.joint import LOCKED, JointRange
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
 from torchrl_h2o.residuals.forces.candidates import force_entry
 from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground
-from torchrl_h2o.residuals.grow import best_of_each, gains_beside, grow, is_preferred, with_force
+from torchrl_h2o.residuals.grow import Candidates, gains_beside, grow, is_preferred, with_force
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.prune import prune, replaced
@@ -135,6 +135,7 @@ def _searched(
     """Sweeps and grows, then drops and replaces, until nothing changes; hands each better set to ``better``."""
     every = [entry for entry in catalogue if not entry.effect.random]
     entries, directions, alike, unseen = every, [], [], ()
+    settled: frozenset[str] | None = None
     measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
         explained = number > 0 and ground.leaves_little(found)
@@ -143,14 +144,14 @@ def _searched(
                 ground = Ground.of(ground.simulation, measured, found.effects, ground.level, ground.base.fit.floor)
             found = ground.fitted(found.entries, found.effects)
             if number > 1:
-                best = best_of_each(gains_beside(ground.rough(found.effects), found).leads(directions))[:RESWEPT]
+                best = Candidates.of(ground, found, directions).leads[:RESWEPT]
                 chosen = found.names.union(*(lead.names for lead in best))
                 entries = [entry for entry in every if entry.name in chosen]
             rough = ground.rough(found.effects)
             directions = sweep(rough, entries, found.effects, partial(progress.closer, 0.5 / max(1, len(entries))))
             if not number and not found.entries:
                 unseen = _unseen(ground, rough, every, directions)
-        before, alike = found.names, []  # alternatives belong to one set
+        before = found.names
         if not explained:
             found = grow(ground, found, directions, better, tried)
         if found.names == before and not explained:
@@ -162,14 +163,17 @@ def _searched(
                     better(alone, found)
                     found = alone
         if found.names == before:
+            if found.names == settled:
+                break
             progress.stage(OTHERS)
             pruned = prune(ground, found)
             better(pruned, found)
             found, alike = replaced(ground, pruned, directions, lambda: progress.closer(0.05))
             better(found, pruned)
-            if found.names == before:
+            settled = found.names
+            if settled == before:
                 break
-    return ground, alike, () if found.entries else unseen
+    return ground, alike if found.names == settled else [], () if found.entries else unseen
 
 
 def _unseen(
@@ -214,8 +218,10 @@ def with_intervals(
         if not idle:
             break
         fewer = Found(*replace(found, effects=fit.effects).without(idle), found.scores)
+        kept = [entry.name not in idle for entry in found.entries for _ in entry.fitted]
+        slopes = [own[:, kept] for own in fit.slopes or ()]
         try:
-            refit = fit_set(parts, fewer.entries, fewer.effects, most_steps=GROWN, intervals=True)
+            refit = fit_set(parts, fewer.entries, fewer.effects, most_steps=GROWN, intervals=True, slopes=slopes)
         except OutOfTimeError:
             break
         alike = [

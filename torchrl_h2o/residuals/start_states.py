@@ -22,9 +22,8 @@ CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
 USUAL_FACTORS = np.array([0.0, -0.7])
-SPACINGS = (2.0, 1.0, 0.5, 0.25)  # of the logarithms that are tried, one grid after another
+SPACINGS = (2.0, 1.0, 0.5, 0.2, 0.07)  # of the logarithms that are tried, one grid after another
 AROUND = np.array([[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
-OF_STEPS = np.array([[0.0, -2.0], [0.0, -1.0], [0.0, 0.0], [0.0, 1.0]])  # for a similar simulation
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
 
 
@@ -174,15 +173,17 @@ class _Steps:
         """The noise under which the next readings are most likely, and its two factors on :meth:`_typical_noise`.
 
         Args:
-            factors: logarithms of the factors of a similar simulation, of which only the one of the steps is changed.
+            factors: logarithms of the factors of a similar simulation, near which they are.
         """
         typical = self._typical_noise()
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
-        grids = [spacing * AROUND for spacing in SPACINGS] if factors is None else [OF_STEPS]
+        spacings = SPACINGS if factors is None else SPACINGS[-3:]
         best = USUAL_FACTORS if factors is None else factors
-        for grid in grids:
-            noises = [typical.scaled(*np.exp(one)) for one in best + grid]
-            best = best + grid[self.filtered(noises, some)[2].argmax()]
+        for spacing in spacings:
+            tried = best + spacing * AROUND
+            densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2]
+            best = tried[densities.argmax()]
+        best = tried[len(tried) // 2] + spacing * _highest(densities)
         return typical.scaled(*np.exp(best)), best
 
     def _typical_noise(self) -> Noise:
@@ -204,9 +205,7 @@ class _Steps:
         share = np.maximum(shared / np.maximum((weight * slope**2).sum((0, 1, 2)), 1e-12), 0.0)
         return Noise(np.sqrt(share) * size[:n], size)
 
-    def filtered(
-        self, noises: Sequence[Noise], some: slice = slice(None)
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def filtered(self, noises: Sequence[Noise], some: slice = slice(None)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Filters blocks under each of K noises.
 
         Returns:
@@ -240,6 +239,16 @@ class _Steps:
             doubt = left @ doubt @ left.swapaxes(-1, -2) + gain @ sensor @ gain.swapaxes(-1, -2)
             x[:, ~live[:, row]], doubt[:, ~live[:, row]] = 0.0, begin
         return mean, covariance, density / max(1, int((live & known).sum()))
+
+
+def _highest(values: np.ndarray) -> np.ndarray:
+    """Where a quadratic function through values at ``AROUND`` is highest, (2), within this grid."""
+    a, b = AROUND.T
+    terms = np.stack([a, b, 0.5 * a**2, a * b, 0.5 * b**2, np.ones(len(a))], axis=1)
+    (p, q, pp, pq, qq, _), *_ = np.linalg.lstsq(terms, values, rcond=None)
+    if pp >= 0.0 or pp * qq <= pq**2:  # it has no highest point
+        return AROUND[values.argmax()]
+    return np.clip(-np.linalg.solve([[pp, pq], [pq, qq]], [p, q]), -1.0, 1.0)
 
 
 def _bounded(doubt: np.ndarray, most: float) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.model.inertial import compile_unscaled
 from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Names
 
@@ -39,14 +40,18 @@ class LinkLength(ModelEffect):
 
     def edit(self, spec: mujoco.MjSpec) -> None:
         bodies = selection.bodies(spec, self.bodies)
-        for body in bodies if not self.is_neutral else ():
+        if self.is_neutral:
+            return
+        turns = compile_unscaled(spec).body_quat  # the specification may give them in other ways, such as Euler angles
+        for body in bodies:
             joint = anchor(body)
 
             def scaled(point: np.ndarray, joint: np.ndarray = joint) -> np.ndarray:
                 return joint + self.scale * (point - joint)
 
             for child in body.bodies:
-                own = _turned(child, anchor(child))
+                own = np.zeros(3)
+                mujoco.mju_rotVecQuat(own, anchor(child), turns[spec.bodies.index(child)])
                 child.pos = scaled(child.pos + own) - own
             for geom in body.geoms:
                 if not np.isnan(geom.fromto[0]):
@@ -63,10 +68,3 @@ class LinkLength(ModelEffect):
 def anchor(body: mujoco.MjsBody) -> np.ndarray:
     """Position of a body's first joint in the body's frame, (3,); its origin without a joint."""
     return np.array(body.joints[0].pos) if body.joints else np.zeros(3)
-
-
-def _turned(body: mujoco.MjsBody, point: np.ndarray) -> np.ndarray:
-    """A point of a body's frame, (3,), along the axes of the parent's frame."""
-    turned = np.zeros(3)
-    mujoco.mju_rotVecQuat(turned, point, body.quat)
-    return turned
