@@ -137,6 +137,18 @@ def test_families_are_selected_together():
     assert {"GeomSize *wheel*", "RollingResistance *wheel*"} <= set(names_of("wheel_legged"))
 
 
+@pytest.mark.parametrize(
+    ("task", "links"),
+    [
+        ("Walker2d", {"thigh", "leg", "thigh_left", "leg_left"}),
+        ("HalfCheetah", {"bthigh", "bshin", "fthigh", "fshin"}),
+        ("InvertedPendulum", {"cart"}),
+    ],
+)
+def test_links_carry_joints_and_do_not_float(task, links):
+    assert {name for name in names_of(task) if name.startswith("LinkLength")} == {f"LinkLength {one}" for one in links}
+
+
 def test_what_lets_a_root_float_has_no_bearing_but_feels_the_wind():
     names = names_of("HalfCheetah")
     assert {"JointForce rootx", "JointForce rootz"} <= set(names)

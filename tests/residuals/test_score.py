@@ -19,6 +19,7 @@ from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.refit import fit_set, slopes_of, variables_of
 from torchrl_h2o.residuals.score import Difference, Model
 from torchrl_h2o.residuals.search import search
 
@@ -46,6 +47,25 @@ def difference(measured, better, worse):
 )
 def test_the_true_effect_predicts_better_than_a_wrong_one(measured, wrong):
     assert difference(measured, (TRUTH,), wrong).evidence > 10.0
+
+
+def test_friction_makes_a_simulator_deafer_to_commands_and_gravity_does_not(measured):
+    part = Model.of(pendulum(), measured).fit
+    before = part.response(())
+    assert part.response((JointFrictionLoss(0.5),)) < before + np.log(0.9)
+    assert part.response((Gravity(1.1),)) == pytest.approx(before, abs=0.02)
+
+
+def test_a_fit_that_is_given_derivatives_reaches_the_values_of_one_that_computes_them(measured):
+    part, effects = Model.of(pendulum(), measured).fit, (JointFrictionLoss(0.07), Gravity(1.03))
+    entries = (CATALOGUE[1], CATALOGUE[0])
+    slopes = slopes_of([part], effects, variables_of(part, entries, effects), [part.errors(effects)])
+    given, computed = (
+        fit_set([part], entries, effects, most_steps=8, slopes=known) for known in ([slopes[0][:, :1]], None)
+    )
+    for one, other in zip(given.effects, computed.effects, strict=True):
+        for name, parameter in one.parameters.items():
+            assert parameter.value == pytest.approx(other.parameters[name].value, rel=0.01)
 
 
 def test_an_effect_too_many_predicts_no_better(measured):

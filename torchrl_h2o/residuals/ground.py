@@ -28,7 +28,7 @@ MATTERS = 0.03  # share of the errors of the simulator without effects, below wh
 NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
-DEAF = 0.98  # share of its response to the commands at which a simulator is deafer to their noise
+DEAF = 0.995  # share of its response to the commands at which a simulator is deafer to their noise
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 
 
@@ -73,6 +73,14 @@ class Found:
     def surprise(self) -> int:
         """How unusual the effects are in all; see :func:`surprise_of`."""
         return surprise_of(self.effects)
+
+    @property
+    def unusual(self) -> tuple[int, int, int]:
+        """Surprise, number of entries, and of those that not all joints or motors have: joints resemble each other."""
+        single = [
+            one for one in self.effects if getattr(one, "joints", getattr(one, "actuators", None)) not in ("*", None)
+        ]
+        return self.surprise, len(self.entries), len(single)
 
     def without(self, names: Collection[str]) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
         """Entries and effects without some of them."""

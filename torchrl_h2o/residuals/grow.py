@@ -145,12 +145,12 @@ def with_one_more(
     leads = [
         lead
         for lead in candidates.leads
-        if lead.names not in passed_over and not lead.names <= found.names and lead.evidence > least
+        if lead.names - found.names not in passed_over and not lead.names <= found.names and lead.evidence > least
     ]
     if rival is not None:
         quarter = 0.25 * (rough.score(rival.effects) - rough.score(found.effects))
         leads = [lead for lead in leads if lead.gain > quarter]
-    if rival is not None or joints is None or joints.names in passed_over or joints.names <= found.names:
+    if rival is not None or joints is None or joints.names - found.names in {frozenset(), *passed_over}:
         joints = None
     else:
         leads = [lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names]
@@ -225,11 +225,10 @@ def most_usual(sets: Sequence[Found]) -> Found:
     """The best set, or the most usual and smallest one of those that are not significantly worse."""
     best = max(sets, key=lambda one: one.scores.mean())
     alike = [one for one in sets if Difference(best.scores - one.scores).evidence < ALIKE]
-    return min([best, *alike], key=lambda one: (one.surprise, len(one.entries), -one.scores.mean()))
+    return min([best, *alike], key=lambda one: (*one.unusual, -one.scores.mean()))
 
 
 def is_preferred(other: Found, found: Found) -> bool:
     """Whether a set explains the data better than another, or as well and by fewer or more usual effects."""
     evidence = Difference(other.scores - found.scores).evidence
-    simpler = (other.surprise, len(other.entries)) < (found.surprise, len(found.entries))
-    return evidence > ALIKE or (evidence > -ALIKE and simpler)
+    return evidence > ALIKE or (evidence > -ALIKE and other.unusual < found.unusual)
