@@ -49,11 +49,12 @@ def test_the_true_effect_predicts_better_than_a_wrong_one(measured, wrong):
     assert difference(measured, (TRUTH,), wrong).evidence > 10.0
 
 
-def test_friction_makes_a_simulator_deafer_to_commands_and_gravity_does_not(measured):
-    part = Model.of(pendulum(), measured).fit
-    before = part.response(())
-    assert part.response((JointFrictionLoss(0.5),)) < before + np.log(0.9)
-    assert part.response((Gravity(1.1),)) == pytest.approx(before, abs=0.02)
+def test_noise_of_the_commands_is_white_one_step_ahead_and_missing_gravity_is_not():
+    measured, simulation = recorded(pendulum(), 2000, 1e-4), pendulum()
+    noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
+    noisy = Model.of(simulation, replace(measured, action=measured.action + noise))
+    assert noisy.one_step_ahead() is not None
+    assert noisy.one_step_ahead((Gravity(2.0),)) is None
 
 
 def test_a_fit_that_is_given_derivatives_reaches_the_values_of_one_that_computes_them(measured):

@@ -28,7 +28,6 @@ MATTERS = 0.03  # share of the errors of the simulator without effects, below wh
 NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
-DEAF = 0.995  # share of its response to the commands at which a simulator is deafer to their noise
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 
 
@@ -54,7 +53,7 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
-        one_step: scores of the blocks for selection one step ahead, (S), if they tell more than the sensors' noise.
+        one_step: scores of the blocks for selection one step ahead, (S), if these errors are noise of the motion.
         slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """
 
@@ -234,8 +233,8 @@ class Ground:
         set is the best of many.
 
         Noise of the logged commands moves the simulator and not the machine, and over many steps an effect predicts
-        better that makes the simulator deaf to it, such as friction. Where the motion is noisier than the sensors, such
-        an effect must therefore predict the next step significantly better, too.
+        better that makes the simulator deaf to it, such as friction. Where the errors one step ahead are such noise, an
+        effect must therefore predict the next step significantly better, too.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
@@ -244,10 +243,4 @@ class Ground:
             return False
         if more.one_step is None or less.one_step is None:
             return True
-        ahead = Difference(more.one_step - less.one_step).evidence
-        return ahead > min(needed, -math.log(self.level)) or not self._is_deafer(more, less)
-
-    def _is_deafer(self, more: Found, less: Found) -> bool:
-        """Whether commands move the simulator less with a set than with another."""
-        rough = self.rough(less.effects)
-        return rough.response(more.effects) < rough.response(less.effects) + math.log(DEAF)
+        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))

@@ -28,7 +28,7 @@ DIVERGED = 1e3  # error in spreads where a simulation diverges
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
 FEWEST = 4  # blocks that must differ
-NOISE_OF_COMMANDS = 0.1  # noise by which a simulation's response is measured, in standard deviations of the commands
+WHITE = 0.8  # effective share of a window from which neighbouring errors count as independent noise
 SCALED = 200  # windows from which these variances are fitted
 SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
 
@@ -152,25 +152,9 @@ class Predictions:
         errors = self.errors(effects)
         return float(scores(self, errors, fitted_scales(self, errors)).mean())
 
-    def response(self, effects: Sequence[Effect]) -> float:
-        """How far noise in the commands moves the simulation with effects: the mean logarithm over all readings.
-
-        Raises:
-            ValueError: if the model rejects an effect.
-        """
-        simulation, measured = self.record.simulation.with_effects(*effects), self.record.measured
-        noise = np.random.default_rng(0).standard_normal(measured.action.shape)
-        noisy = replace(measured, action=measured.action + NOISE_OF_COMMANDS * measured.action.std(0) * noise)
-        before, after = self._predicted(simulation, self._states), self._predicted(simulation, self._states, noisy)
-        moves = [np.nanmedian(np.abs(new - old), axis=0) for old, new in zip(before, after, strict=True)]
-        return float(np.mean(np.log(np.concatenate(moves) + ROUNDING)))
-
-    def _predicted(
-        self, simulation: Simulation, states: Sequence[np.ndarray], measured: Measured | None = None
-    ) -> list[np.ndarray]:
-        record = self.record
-        same = simulation is record.simulation and measured is None
-        measured = measured or record.measured
+    def _predicted(self, simulation: Simulation, states: Sequence[np.ndarray]) -> list[np.ndarray]:
+        record, measured = self.record, self.record.measured
+        same = simulation is record.simulation
         executed = record.executed if same else executed_actions(simulation, measured)
         active = record.activations if same else activations(simulation, measured, executed)
         n, found = record.num_readings, []
@@ -308,7 +292,7 @@ class Model:
     def one_step_ahead(self, effects: Sequence[Effect] = ()) -> np.ndarray | None:
         """Score of the blocks for selection one step ahead, (S), with effects added.
 
-        None if the noise of the sensors is larger than the rest of these errors, so that one step tells little.
+        None if these errors are no noise of the motion: smaller than that of the sensors, or alike in neighbouring rows.
         """
         return self._scored(tuple(effects))[1]
 
@@ -319,7 +303,8 @@ class Model:
             by_block = np.append(scores(self.fit, errors, scales), scores(self.selection, ahead, scales))
             windows, known = self.selection.blocks.windows[0], self.selection.variances[0][:, 0]
             one_step = None
-            if np.median(scales[0][0] / np.median(known, axis=0)) > 1.0:
+            is_white = self.fit.effective_counts(errors)[0][0] > WHITE
+            if is_white and np.median(scales[0][0] / np.median(known, axis=0)) > 1.0:
                 density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
                 one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
             self._found[effects] = by_block, one_step
