@@ -230,7 +230,7 @@ def slopes_of(
     known: Slopes | None = None,
 ) -> Slopes:
     """Derivatives of the errors by the variables, (N, p) for each part; those by the first ones may be known."""
-    columns: list[list[np.ndarray]] = [[] if known is None else list(own.T) for own in known or parts]
+    columns: list[list[np.ndarray]] = [list(own.T) for own in known] if known is not None else [[] for _ in parts]
     zero = np.zeros(len(variables))
     for index in range(len(columns[0]), len(variables)):
         low, high = variables[index].bounds

@@ -292,7 +292,7 @@ class Model:
     def one_step_ahead(self, effects: Sequence[Effect] = ()) -> np.ndarray | None:
         """Score of the blocks for selection one step ahead, (S), with effects added.
 
-        None if these errors are no noise of the motion: smaller than that of the sensors, or alike in neighbouring rows.
+        None if these errors are no noise of the motion: smaller than the sensors' noise, or alike in successive rows.
         """
         return self._scored(tuple(effects))[1]
 
