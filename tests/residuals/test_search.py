@@ -73,10 +73,10 @@ def test_what_predicts_the_next_row_worse_is_not_added_where_the_motion_is_noisi
     ground = Ground.of(SIMULATION, recorded(SIMULATION, 800, noise=1e-4))
     blocks = np.arange(ground.num_fit + len(ground.base.selection.blocks)) % 7
     friction = entry_of(JointFrictionLoss(0.1), CATALOGUE)
-    less = Found((), (), 0.01 * blocks, blocks[ground.num_fit :])
+    less = Found((), (), 0.01 * blocks, blocks[ground.num_fit :], is_noise=True)
     more = Found((friction,), (JointFrictionLoss(0.1),), 5.0 + 0.1 * blocks, less.one_step - 1.0)
     assert not ground.adds(more, less)
-    assert ground.adds(replace(more, one_step=None), less)
+    assert ground.adds(more, replace(less, is_noise=False))
     assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less)
 
 

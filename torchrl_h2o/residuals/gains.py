@@ -237,7 +237,7 @@ class Gains:
             if gain(least_squares(self._weight_at(best * column))) < gains[best] + SLIGHT * self.num_blocks:
                 break
         best = max(gains, key=gains.__getitem__)
-        return self._lead((direction,), (best,), best * column) if gains[best] > 0.0 else None
+        return self._lead((direction,), (best,), best * column) if best and gains[best] > 0.0 else None
 
     def _shares_of_groups(self, column: np.ndarray) -> list[float]:
         """The shares that explain most of the errors of one group each, for the few groups with the largest gain."""

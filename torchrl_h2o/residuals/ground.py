@@ -53,7 +53,8 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
-        one_step: scores of the blocks for selection one step ahead, (S), if these errors are noise of the motion.
+        one_step: scores of the blocks for selection one step ahead, (S).
+        is_noise: whether these errors are noise of the motion.
         slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """
 
@@ -61,6 +62,7 @@ class Found:
     effects: tuple[Effect, ...]
     scores: np.ndarray
     one_step: np.ndarray | None = None
+    is_noise: bool = False
     slopes: np.ndarray | None = field(default=None, repr=False)
 
     @property
@@ -159,7 +161,7 @@ class Ground:
     def found(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its scores."""
         model = self.model(effects)
-        return Found(tuple(entries), tuple(effects), model.scores(), model.one_step_ahead())
+        return Found(tuple(entries), tuple(effects), model.scores(), *model.one_step_ahead())
 
     def leaves_little(self, found: Found) -> bool:
         """Whether all errors left are too small to matter, at all horizons; see ``MATTERS``."""
@@ -241,6 +243,6 @@ class Ground:
         in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
         if in_selection <= 0.5 * needed or in_all <= needed + math.log(among):
             return False
-        if more.one_step is None or less.one_step is None:
+        if not less.is_noise or more.one_step is None or less.one_step is None:
             return True
         return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))
