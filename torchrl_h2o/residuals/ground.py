@@ -172,17 +172,9 @@ class Ground:
         usual = np.concatenate([np.median(np.abs(error), axis=0) for error in errors])
         return bool((usual**2 <= floor + (NEARLY_NONE * ROUNDING) ** 2).all())
 
-    def fitted(
-        self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], slopes: np.ndarray | None = None
-    ) -> Found:
-        """A set with its values fitted from the present ones.
-
-        Args:
-            entries: entries of the catalogue.
-            effects: the effects.
-            slopes: derivatives of the errors by their values, (N, p), if they are known.
-        """
-        found = self.found(entries, effects)
+    def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
+        """A set with its values fitted from the present ones; a set that is not would lose to any larger one."""
+        found, slopes = self.found(entries, effects), None
         for _ in range(REFITTED if entries else 0):
             other = self.sketched(self.fit_part(found.effects), entries, found.effects, GROWN, slopes)
             gain = other.scores[: self.num_fit].mean() - found.scores[: self.num_fit].mean()

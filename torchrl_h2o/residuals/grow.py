@@ -78,7 +78,7 @@ def grow(
         better = [one for one in fitted if ground.adds(one, found, 1 if _is_many(one, found) else among)]
         if better:
             best = most_usual(better)
-            before, found, refused = found, ground.fitted(best.entries, best.effects, best.slopes), set()
+            before, found, refused = found, ground.fitted(best.entries, best.effects), set()
             advance(found, before)
             if _is_many(best, before) or ground.leaves_little(found):  # many change how candidates change the errors
                 break

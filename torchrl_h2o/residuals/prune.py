@@ -43,7 +43,7 @@ def prune(ground: Ground, found: Found) -> Found:
             if not weak:
                 break
             kept.add(weak[0])
-    return found if found is before else ground.fitted(found.entries, found.effects, found.slopes)
+    return found if found is before else ground.fitted(found.entries, found.effects)
 
 
 def _without_needless_kinds(ground: Ground, found: Found) -> Found:
