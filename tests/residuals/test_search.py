@@ -23,7 +23,7 @@ from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
-from torchrl_h2o.residuals.grow import gains_beside
+from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.search import known_set, with_intervals
 from torchrl_h2o.residuals.sweep import sweep
@@ -78,6 +78,30 @@ def test_what_predicts_the_next_row_worse_is_not_added_where_the_motion_is_noisi
     assert not ground.adds(more, less)
     assert ground.adds(more, replace(less, is_noise=False))
     assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less)
+
+
+def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_them():
+    ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(*EACH_JOINT), 1200, noise=0.01))
+    friction = JointFrictionLoss(EACH_JOINT[0].torque, "shoulder")
+    less = ground.found((entry_of(friction, CATALOGUE),), (friction,))
+    entries = [entry for entry in CATALOGUE if getattr(entry.effect, "joints", None) in ("shoulder", "elbow")]
+    candidates = Candidates.of(ground, less, sweep(ground.rough(less.effects), entries, less.effects))
+    together = max(with_one_more(ground, less, candidates), key=lambda one: len(one.entries))
+    refused = together.names - less.names
+    assert len(refused) > 2
+    assert refused not in [one.names - less.names for one in with_one_more(ground, less, candidates, [refused])]
+
+
+def test_of_sets_that_explain_equally_well_the_one_of_all_joints_is_taken():
+    of_all, of_one = (
+        Found((entry_of(effect, CATALOGUE),), (effect,), scores)
+        for effect, scores in (
+            (JointFrictionLoss(0.1), np.array([1.0, 2.0, 3.0, 4.0, 5.0])),
+            (JointFrictionLoss(0.1, "elbow"), np.array([1.2, 2.3, 2.9, 4.1, 5.0])),
+        )
+    )
+    assert most_usual([of_one, of_all]) is of_all
+    assert is_preferred(of_all, of_one)
 
 
 @pytest.mark.parametrize("rows", [800, pytest.param(1600, marks=pytest.mark.slow)])

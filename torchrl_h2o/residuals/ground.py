@@ -61,7 +61,7 @@ class Found:
     entries: tuple[CatalogueEntry, ...]
     effects: tuple[Effect, ...]
     scores: np.ndarray
-    one_step: np.ndarray | None = None
+    one_step: np.ndarray = field(default_factory=lambda: np.zeros(0))
     is_noise: bool = False
     slopes: np.ndarray | None = field(default=None, repr=False)
 
@@ -174,12 +174,11 @@ class Ground:
 
     def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its values fitted from the present ones; a set that is not would lose to any larger one."""
-        found, slopes = self.found(entries, effects), None
+        found = self.found(entries, effects)
         for _ in range(REFITTED if entries else 0):
-            other = self.sketched(self.fit_part(found.effects), entries, found.effects, GROWN, slopes)
+            other = self.sketched(self.fit_part(found.effects), entries, found.effects, GROWN)
             gain = other.scores[: self.num_fit].mean() - found.scores[: self.num_fit].mean()
-            slopes = other.slopes
-            found = other if gain > 0.0 else replace(found, slopes=slopes)
+            found = other if gain > 0.0 else replace(found, slopes=other.slopes)
             if gain < 0.01 * len(self.simulation.state_map.names):
                 break
         return found
@@ -235,6 +234,6 @@ class Ground:
         in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
         if in_selection <= 0.5 * needed or in_all <= needed + math.log(among):
             return False
-        if not less.is_noise or more.one_step is None or less.one_step is None:
+        if not less.is_noise:
             return True
         return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))

@@ -83,13 +83,11 @@ class SetFit:
 
     Args:
         effects: the effects with their fitted values.
-        by_block: score of each fitted block, (B), in nats a row.
         half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
         slopes: derivatives of the errors by the values, (N, p) for each part, or an estimate of them.
     """
 
     effects: tuple[Effect, ...]
-    by_block: np.ndarray
     half_widths: tuple[dict[str, float], ...]
     slopes: Slopes | None = None
 
@@ -139,8 +137,7 @@ def fit_set(
 ) -> SetFit:
     """Maximises the score over the values of effects, from their present values.
 
-    Derivatives follow the errors of each step (Broyden's update). Where they lead no further they are computed again,
-    unless they were given.
+    Derivatives are computed in each step; those that are given serve for all steps.
 
     Args:
         parts: predictions of the rows to fit.
@@ -156,14 +153,13 @@ def fit_set(
     effects = tuple(effects)
     errors = [part.errors(effects) for part in parts]
     scales, by_block = _profiled(parts, errors)
-    variables, is_new, is_given = variables_of(parts[0], entries, effects), False, slopes is not None
+    variables, is_given = variables_of(parts[0], entries, effects), slopes is not None
     for _ in range(most_steps if variables else 0):
-        if slopes is None or slopes[0].shape[1] < len(variables):
-            is_new = slopes is None
-            slopes = slopes_of(parts, effects, variables, errors, slopes)
+        if not is_given or slopes is None or slopes[0].shape[1] < len(variables):
+            slopes = slopes_of(parts, effects, variables, errors, slopes if is_given else None)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
         move, gain = _step(weighted, slopes, variables), 0.0
-        for share in (1.0, 0.3, 0.1) if is_new else (1.0,):
+        for share in (1.0, 0.3, 0.1):
             try:
                 tried = with_values(effects, variables, share * move)
                 new_errors = [part.errors(tried) for part in parts]
@@ -172,23 +168,18 @@ def fit_set(
             new_scales, new_by_block = _profiled(parts, new_errors)
             gain = float(new_by_block.mean() - by_block.mean())
             if gain > 0.0:
-                slopes = _followed(slopes, share * move, errors, new_errors)
                 effects, errors, scales, by_block = tried, new_errors, new_scales, new_by_block
                 variables = variables_of(parts[0], entries, effects)
                 break
         if gain < SMALLEST_GAIN:
-            if is_new or is_given:
-                break
-            slopes = None
-        is_new = False
+            break
     widths: tuple[dict[str, float], ...] = tuple({} for _ in effects)
     if intervals and variables:
-        if slopes is None:
-            slopes = slopes_of(parts, effects, variables, errors)
+        slopes = slopes_of(parts, effects, variables, errors)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
         for variable, half in zip(variables, _half_widths(parts, weighted, slopes), strict=True):
             widths[variable.effect][variable.name] = half * abs(variable.slope(0.0))
-    return SetFit(effects, by_block, widths, slopes)
+    return SetFit(effects, widths, slopes)
 
 
 def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:
@@ -247,13 +238,6 @@ def slopes_of(
                 after = before
             found.append((after - before) / (step or 1.0))
     return [np.stack(found, axis=1) for found in columns]
-
-
-def _followed(slopes: Slopes, move: np.ndarray, before, after) -> Slopes:
-    """Derivatives that agree with the change of the errors by a move: Broyden's update."""
-    along = move / max(move @ move, 1e-300)
-    changes = [flat(new) - flat(old) for old, new in zip(before, after, strict=True)]
-    return [own + np.outer(change - own @ move, along) for own, change in zip(slopes, changes, strict=True)]
 
 
 def _step(parts: Sequence[Whitened], slopes: Slopes, variables: Sequence[Variable]) -> np.ndarray:

@@ -229,7 +229,7 @@ class _Steps:
             white = np.linalg.solve(factor, -guess[..., :n, None])[..., 0]
             square, valid = (white**2).mean(-1), live[:, row] & known[:, row]
             log_det = np.log(np.einsum("kbii->kbi", factor)).sum(-1)
-            density += ((log_density(white).sum(-1) - log_det) * valid).sum(-1)
+            density += (log_density(white).sum(-1) - log_det).sum(-1, where=valid)
             # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
             trust = np.where(known[:, row], np.where(square > SURPRISE, square, 1.0), 1.0 / ROUNDING**2)
             doubt = _bounded(doubt * trust[..., None, None], MOST_DOUBT)

@@ -35,7 +35,7 @@ class LinkLength(ModelEffect):
     """
 
     wording: ClassVar[str] = "link length of {bodies} × {scale}"
-    scale: float = parameter(unit="1", bounds=(0.001, 10.0), neutral=1.0)
+    scale: float = parameter(unit="1", bounds=(0.01, 10.0), neutral=1.0)
     bodies: Names = "*"
 
     def edit(self, spec: mujoco.MjSpec) -> None:
