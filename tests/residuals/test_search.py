@@ -69,15 +69,17 @@ def test_noise_of_the_logged_torques_is_no_friction():
     assert found(replace(measured, action=measured.action + noise)).effects == ()
 
 
-def test_what_predicts_the_next_row_worse_is_not_added_where_the_motion_is_noisier_than_the_sensors():
+def test_with_noisy_commands_an_effect_must_predict_the_next_row_with_the_expected_and_the_logged_ones():
     ground = Ground.of(SIMULATION, recorded(SIMULATION, 800, noise=1e-4))
     blocks = np.arange(ground.num_fit + len(ground.base.selection.blocks)) % 7
-    friction = entry_of(JointFrictionLoss(0.1), CATALOGUE)
-    less = Found((), (), 0.01 * blocks, blocks[ground.num_fit :], is_noise=True)
-    more = Found((friction,), (JointFrictionLoss(0.1),), 5.0 + 0.1 * blocks, less.one_step - 1.0)
-    assert not ground.adds(more, less)
-    assert ground.adds(more, replace(less, is_noise=False))
-    assert ground.adds(replace(more, one_step=less.one_step + 5.0 + 0.1 * less.one_step), less)
+    row = blocks[ground.num_fit :]
+    friction, worse, better = entry_of(JointFrictionLoss(0.1), CATALOGUE), row - 1.0, 5.0 + 1.1 * row
+    less = Found((), (), 0.01 * blocks, (row, row))
+    more = Found((friction,), (JointFrictionLoss(0.1),), 5.0 + 0.1 * blocks, (better, better))
+    assert ground.adds(more, less)
+    assert not ground.adds(replace(more, one_step=(better, worse)), less)
+    assert not ground.adds(replace(more, one_step=(worse, better)), less)
+    assert ground.adds(replace(more, one_step=()), replace(less, one_step=()))
 
 
 def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_them():

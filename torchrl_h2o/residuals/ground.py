@@ -10,6 +10,7 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
 from torchrl_h2o.effects.catalogue.plausibility import surprise
+from torchrl_h2o.residuals.command_noise import expected_commands
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import fit_set
 from torchrl_h2o.residuals.score import Difference, Model, Predictions
@@ -53,16 +54,15 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
-        one_step: scores of the blocks for selection one step ahead, (S).
-        is_noise: whether these errors are noise of the motion.
+        one_step: scores of the blocks for selection one step ahead, with the expected commands and the logged ones,
+            (2, S); empty if the logged commands have no noise.
         slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """
 
     entries: tuple[CatalogueEntry, ...]
     effects: tuple[Effect, ...]
     scores: np.ndarray
-    one_step: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    is_noise: bool = False
+    one_step: Sequence[np.ndarray] = ()
     slopes: np.ndarray | None = field(default=None, repr=False)
 
     @property
@@ -97,39 +97,52 @@ class Ground:
         simulation: the simulator without effects.
         base: predictions of a set near those to compare, whose derivatives the filters of all sets use.
         level: significance level at which an effect is added.
+        logged: the data with the logged commands, if these have noise.
     """
 
     simulation: Simulation
     base: Model
     level: float = DEFAULTS.level
+    logged: Measured | None = None
     _models: dict[tuple[Effect, ...], Model] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
-        cls,
-        simulation: Simulation,
-        measured: Measured,
-        effects: Sequence[Effect] = (),
-        level: float = DEFAULTS.level,
-        floor: np.ndarray | None = None,
+        cls, simulation: Simulation, measured: Measured, effects: Sequence[Effect] = (), level: float = DEFAULTS.level
     ) -> Ground:
-        """The ground near a set of effects.
+        """The ground near a set of effects, with the logged commands.
 
         Args:
             simulation: the simulator without effects.
             measured: the data.
             effects: the set.
             level: significance level at which an effect is added.
-            floor: that of another ground; by default a share of the errors of the simulator without effects.
         """
         model = Model.of(simulation.with_effects(*effects), measured)
-        if floor is None:
-            errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
-            floor = np.concatenate([(MATTERS * np.median(np.abs(error), axis=0)) ** 2 for error in errors])
-        counts = model.fit.effective_counts(model.fit.errors())
-        fit, selection = (replace(part, counts=counts, floor=floor) for part in (model.fit, model.selection))
-        base = Model(fit, selection)
-        return cls(simulation, base, level, {tuple(effects): base})
+        errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
+        floor = np.concatenate([(MATTERS * np.median(np.abs(error), axis=0)) ** 2 for error in errors])
+        base = _weighted(model, floor)
+        return cls(simulation, base, level, None, {tuple(effects): base})
+
+    def near(self, found: Found, measured: Measured) -> Ground:
+        """The ground near a set that was found, with the commands under which its readings are likeliest.
+
+        The expected commands take the place of logged ones if the set, fitted to each, predicts significantly better.
+
+        Args:
+            found: the set.
+            measured: the data with the logged commands.
+        """
+        simulation = self.simulation.with_effects(*found.effects)
+        base = _weighted(Model.of(simulation, measured), self.base.fit.floor)
+        best = logged = Ground(self.simulation, base, self.level)
+        first = highest = logged.refit(found)
+        for expected in expected_commands(measured):
+            other = Ground(self.simulation, base.of_simulation(simulation, expected), self.level, measured)
+            if (own := other.refit(found)).scores.mean() <= highest.scores.mean():
+                break
+            best, highest = other, own
+        return best if Difference(highest.scores - first.scores).evidence > -math.log(self.level) else logged
 
     @property
     def num_fit(self) -> int:
@@ -161,7 +174,10 @@ class Ground:
     def found(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its scores."""
         model = self.model(effects)
-        return Found(tuple(entries), tuple(effects), model.scores(), *model.one_step_ahead())
+        one_step: tuple[np.ndarray, ...] = ()
+        if self.logged is not None:
+            one_step = model.one_step_ahead(), model.with_commands(self.logged).one_step_ahead()
+        return Found(tuple(entries), tuple(effects), model.scores(), one_step)
 
     def leaves_little(self, found: Found) -> bool:
         """Whether all errors left are too small to matter, at all horizons; see ``MATTERS``."""
@@ -182,6 +198,11 @@ class Ground:
             if gain < 0.01 * len(self.simulation.state_map.names):
                 break
         return found
+
+    def refit(self, found: Found) -> Found:
+        """A set of another ground with its values fitted in a few steps."""
+        part = self.fit_part(found.effects)
+        return self.sketched(part, found.entries, found.effects, SKETCH, found.slopes)
 
     def sketched(
         self,
@@ -226,14 +247,23 @@ class Ground:
         set is the best of many.
 
         Noise of the logged commands moves the simulator and not the machine, and over many steps an effect predicts
-        better that makes the simulator deaf to it, such as friction. Where the errors one step ahead are such noise, an
-        effect must therefore predict the next step significantly better, too.
+        better that makes the simulator deaf to what is left of it, such as damping. Where there is such noise, an
+        effect must therefore predict the next step significantly better, too, with the expected commands and the
+        logged ones.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
         in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
         if in_selection <= 0.5 * needed or in_all <= needed + math.log(among):
             return False
-        if not less.is_noise:
-            return True
-        return Difference(more.one_step - less.one_step).evidence > min(needed, -math.log(self.level))
+        least = min(needed, -math.log(self.level))
+        return all(
+            Difference(one - other).evidence > least for one, other in zip(more.one_step, less.one_step, strict=True)
+        )
+
+
+def _weighted(model: Model, floor: np.ndarray | None) -> Model:
+    """A model whose errors count by their correlation in neighbouring windows, and not below a floor."""
+    counts = model.fit.effective_counts(model.fit.errors())
+    fit, selection = (replace(part, counts=counts, floor=floor) for part in (model.fit, model.selection))
+    return Model(fit, selection)

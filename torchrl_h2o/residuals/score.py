@@ -28,7 +28,6 @@ DIVERGED = 1e3  # error in spreads where a simulation diverges
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
 FEWEST = 4  # blocks that must differ
-WHITE = 0.5  # effective share of a window from which neighbouring errors count as independent noise
 SCALED = 200  # windows from which these variances are fitted
 SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
 
@@ -75,9 +74,9 @@ class Predictions:
             found.append((1.0 - r) / (1.0 + r))
         return tuple(found)
 
-    def of_simulation(self, simulation: Simulation) -> Predictions:
-        """The same windows from the same start states, predicted by another simulation."""
-        own, record = self.record, Record(simulation, self.record.measured)
+    def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Predictions:
+        """The same windows from the same start states, predicted by another simulation, or with other commands."""
+        own, record = self.record, Record(simulation, measured or self.record.measured)
         shifts = [np.nan_to_num(new - old) for new, old in zip(record.readings, own.readings, strict=True)]
         restore = simulation.state_map.restore_observed.T
         # unobserved coordinates stay those that the present simulation has reached
@@ -252,7 +251,7 @@ class Model:
 
     fit: Predictions
     selection: Predictions
-    _found: dict[tuple[Effect, ...], tuple[np.ndarray, np.ndarray, bool]] = field(default_factory=dict, repr=False)
+    _found: dict[tuple[Effect, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -274,12 +273,23 @@ class Model:
         selection = StartStates.of(record, Blocks.of(measured, Split.SELECTION, steps, rows[1]), fit.noise)
         return cls(Predictions(fit), Predictions(selection))
 
-    def of_simulation(self, simulation: Simulation) -> Model:
-        """The same blocks, predicted by a similar simulation from start states that are filtered with it."""
-        record = Record(simulation, self.fit.record.measured)
+    def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Model:
+        """The same blocks, predicted by a similar simulation from start states that are filtered with it.
+
+        Args:
+            simulation: the simulator with its effects.
+            measured: the same log with similar commands; that of this model by default.
+        """
+        record = Record(simulation, measured or self.fit.record.measured)
         fit = StartStates.of(record, self.fit.blocks, similar=self.fit.starts)
         selection = StartStates.of(record, self.selection.blocks, fit.noise, self.selection.starts)
         return Model(replace(self.fit, starts=fit), replace(self.selection, starts=selection))
+
+    def with_commands(self, measured: Measured) -> Model:
+        """The same predictions from the same start states, but with the commands of another log."""
+        simulation = self.fit.record.simulation
+        fit, selection = (part.of_simulation(simulation, measured) for part in (self.fit, self.selection))
+        return Model(fit, selection)
 
     def scores(self, effects: Sequence[Effect] = ()) -> np.ndarray:
         """Scores with effects added: of the blocks for fits, then of those for selection, (F + S); see :func:`scores`.
@@ -289,14 +299,11 @@ class Model:
         """
         return self._scored(tuple(effects))[0]
 
-    def one_step_ahead(self, effects: Sequence[Effect] = ()) -> tuple[np.ndarray, bool]:
-        """Score of the blocks for selection one step ahead, (S), and whether these errors are noise of the motion.
+    def one_step_ahead(self, effects: Sequence[Effect] = ()) -> np.ndarray:
+        """Score of the blocks for selection one step ahead, (S)."""
+        return self._scored(tuple(effects))[1]
 
-        They are if they are larger than the sensors' noise, and independent in successive rows.
-        """
-        return self._scored(tuple(effects))[1:]
-
-    def _scored(self, effects: tuple[Effect, ...]) -> tuple[np.ndarray, np.ndarray, bool]:
+    def _scored(self, effects: tuple[Effect, ...]) -> tuple[np.ndarray, np.ndarray]:
         if effects not in self._found:
             errors, ahead = self.fit.errors(effects), self.selection.errors(effects)
             scales = fitted_scales(self.fit, errors)
@@ -304,7 +311,5 @@ class Model:
             windows, known = self.selection.blocks.windows[0], self.selection.variances[0][:, 0]
             density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
             one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
-            is_larger = np.median(scales[0][0] / np.median(known, axis=0)) > 1.0
-            is_white = self.fit.effective_counts(errors)[0][0] > WHITE
-            self._found[effects] = by_block, one_step, bool(is_larger and is_white)
+            self._found[effects] = by_block, one_step
         return self._found[effects]

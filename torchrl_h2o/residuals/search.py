@@ -89,7 +89,7 @@ def search(
     progress.stage(EFFECTS)
     ground = Ground.of(simulation, measured, latest[0].effects, level)
     try:
-        ground, alike, unseen = _searched(ground, latest[0], catalogue, progress, better, tried)
+        ground, alike, unseen = _searched(ground, measured, latest[0], catalogue, progress, better, tried)
     except OutOfTimeError as end:
         ended_in = str(end)
     found = latest[-1]
@@ -126,6 +126,7 @@ def known_set(catalogue: Sequence[CatalogueEntry], known: Sequence[Effect]) -> F
 
 def _searched(
     ground: Ground,
+    measured: Measured,
     found: Found,
     catalogue: Sequence[CatalogueEntry],
     progress: LoopBar,
@@ -136,12 +137,11 @@ def _searched(
     every = [entry for entry in catalogue if not entry.effect.random]
     entries, directions, alike, unseen = every, [], [], ()
     settled: frozenset[str] | None = None
-    measured = ground.base.fit.record.measured
     for number in range(SWEEPS):
         explained = number > 0 and ground.leaves_little(found)
         if not explained:
             if number:
-                ground = Ground.of(ground.simulation, measured, found.effects, ground.level, ground.base.fit.floor)
+                ground = ground.near(found, measured)
             found = ground.fitted(found.entries, found.effects)
             if number > 1:
                 best = Candidates.of(ground, found, directions).leads[:RESWEPT]

@@ -18,7 +18,7 @@ from torchrl_h2o.effects import (
     ObservationDelay,
 )
 from torchrl_h2o.residuals import Simulation, StateMap
-from torchrl_h2o.residuals.judge.prediction_table import predicted, readings_of_joint
+from torchrl_h2o.residuals.judge.prediction_table import mean_errors, predicted, readings_of_joint
 
 SIMULATION, DOUBLE_PENDULUM = pendulum(), double_pendulum()
 SLOW_ELBOW = (JointDamping(0.3, "shoulder"), JointDamping(1.0, "elbow"))
@@ -98,6 +98,13 @@ def test_unknown_readings_of_late_sensors_count_neither_for_nor_against():
     rotors = (JointDamping(0.3, "shoulder"), Armature(30.0, "elbow"), ObservationDelay(0.1, (2, 3)))
     (reason,) = hardly_better(rotors, measured=runs)
     assert "hardly better than by the guess that every velocity stays as it is" in reason
+
+
+def test_the_mean_error_of_several_readings_is_that_of_the_known_ones():
+    error = np.array([[1.0, -3.0, 5.0], [2.0, np.nan, 4.0]])
+    known = np.array([[True, True, True], [True, False, True]])
+    means = mean_errors(error, known, [[0, 1], [1]])
+    np.testing.assert_allclose(means, [[2.0, 2.0], [3.0, 0.0]])
 
 
 def test_the_readings_of_joints_without_names_and_with_several_coordinates_are_found():

@@ -168,7 +168,7 @@ def predicted(
         "mended_and_network": left - learned,
     }
     known = np.isfinite(stays)  # late sensors leave the readings at the ends of runs unknown
-    losses = {name: _losses(error, known, readings) for name, error in by_predictor.items()}
+    losses = {name: mean_errors(error, known, readings) for name, error in by_predictor.items()}
     return Predicted(names, steps * simulation.control_step, losses, settings)
 
 
@@ -214,7 +214,7 @@ def readings_of_joint(simulation: Simulation, joint: int) -> list[int]:
     return np.flatnonzero((observe[:, [*positions, *(model.nq + dofs)]] != 0.0).any(1)).tolist()
 
 
-def _losses(error: np.ndarray, known: np.ndarray, readings: list[list[int]]) -> np.ndarray:
+def mean_errors(error: np.ndarray, known: np.ndarray, readings: list[list[int]]) -> np.ndarray:
     """Mean absolute errors of the known readings among some, (R, W), of errors (W, n), each cut at ``FARTHEST``."""
     size = np.where(known, np.fmin(np.nan_to_num(np.abs(error), nan=FARTHEST), FARTHEST), 0.0)
     return np.stack([size[:, own].sum(1) / np.maximum(known[:, own].sum(1), 1) for own in readings])
