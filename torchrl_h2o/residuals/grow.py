@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,12 +33,14 @@ class Candidates:
     """What may be added to a set.
 
     Args:
-        rough: predictions from start states filtered with the set.
+        rough: predictions from start states filtered with the set, on which candidates are fitted.
+        slopes: derivatives of their errors by the values of the set, (N, p).
         leads: the best direction of each candidate, in descending order of the estimated gain.
         joints: friction, damping and rotors of all joints together.
     """
 
     rough: Predictions
+    slopes: np.ndarray
     leads: Sequence[Lead]
     joints: Lead | None
 
@@ -47,7 +49,7 @@ class Candidates:
         """The candidates beside a set."""
         rough = ground.rough(found.effects)
         gains = gains_beside(rough, found)
-        return cls(rough, best_of_each(gains.leads(directions)), gains.of_joints(directions))
+        return cls(rough, gains.slopes, best_of_each(gains.leads(directions)), gains.of_joints(directions))
 
 
 def grow(
@@ -113,8 +115,8 @@ def with_force(
             if new:
                 entries, effects = zip(*new, strict=True)
                 sets.append([((*found.entries, *entries), (*found.effects, *effects))])
-        rough = ground.rough(found.effects)
-        fitted = _sketched(ground, _best_simulated(rough, sets), found)
+        beside = Candidates.of(ground, found, ())
+        fitted = _sketched(ground, beside, _best_simulated(beside.rough, sets), found)
         better = [one for one in fitted if ground.adds(one, found, max(1, len(sets)))]
         if not better:
             break
@@ -158,17 +160,21 @@ def with_one_more(
     best = _best_simulated(rough, sets)
     if joints is not None and leads and joints.gain > max(lead.gain for lead in leads):
         best.append(joints.beside(found.entries, found.effects, 1.0))
-    return [one for one in _sketched(ground, best, found) if _is_usable(ground, one, found)]
+    return [one for one in _sketched(ground, candidates, best, found) if _is_usable(ground, one, found)]
 
 
 def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> list[Set]:
-    """The sets of the few best candidates by their score, each at the best of its sizes."""
-    scored = []
-    for sizes in candidates:
-        best = max(((_score(rough, effects), entries, effects) for entries, effects in sizes), key=lambda one: one[0])
-        scored.append(best)
+    """The sets of the few best candidates by their score, each at the best of its sizes.
+
+    Other sizes than the first are simulated of those candidates alone that are among the best at it.
+    """
+    scored = [(_score(rough, sizes[0][1]), sizes[0], sizes[1:]) for sizes in candidates]
     scored.sort(key=lambda one: -one[0])
-    return [(entries, effects) for score, entries, effects in scored[:FITTED] if score > -math.inf]
+    for index, (score, first, others) in enumerate(scored[: 2 * FITTED]):
+        sizes = [(score, first), *((_score(rough, size[1]), size) for size in others)]
+        scored[index] = (*max(sizes, key=lambda one: one[0]), ())
+    scored.sort(key=lambda one: -one[0])
+    return [one for score, one, _ in scored[:FITTED] if score > -math.inf]
 
 
 def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
@@ -179,18 +185,17 @@ def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
         return -math.inf
 
 
-def _sketched(ground: Ground, sets: Sequence[Set], present: Found) -> list[Found]:
+def _sketched(ground: Ground, candidates: Candidates, sets: Sequence[Set], present: Found) -> list[Found]:
     """Sets with their values fitted in a few steps, without those that the model rejects.
 
     The derivatives by the values of a present set are known where a set begins with its effects.
     """
-    part, found = ground.fit_part(present.effects), []
-    known = gains_beside(part, present, present.slopes).slopes if sets else None
+    found = []
     for entries, effects in sets:
-        begins = effects[: len(present.effects)] == present.effects
-        many = len(effects) > len(present.effects) + FEW
+        known = candidates.slopes if effects[: len(present.effects)] == present.effects else None
+        steps = GROWN if len(effects) > len(present.effects) + FEW else SKETCH
         try:
-            found.append(ground.sketched(part, entries, effects, GROWN if many else SKETCH, known if begins else None))
+            found.append(replace(ground.sketched(candidates.rough, entries, effects, steps, known), slopes=None))
         except ValueError:
             continue
     return found

@@ -15,7 +15,7 @@ from torchrl_h2o.residuals.score import Predictions, fitted_scales, scores
 from torchrl_h2o.residuals.start_states import TAIL, log_density
 
 STEP = 0.02  # step of the finite differences, in typical sizes of a parameter
-SMALLEST_GAIN = 1e-3  # gain of the score, in nats a row, below which a fit has converged
+SMALLEST_GAIN = 1e-2  # gain of the score, in nats a block, below which a fit has converged
 FARTHEST = 3.0  # largest move of a parameter in one step of the fit, in typical sizes
 FARTHEST_FACTOR = 60.0  # largest logarithm of a factor, to base 2, beyond which any value is at its bound
 RIDGE = 1e-6  # share of a parameter's curvature that is added, so that what the data do not show stays where it is
