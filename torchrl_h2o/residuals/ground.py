@@ -224,8 +224,7 @@ class Ground:
         if not entries:
             return self.found((), ())
         fit = fit_set([part], entries, effects, most_steps=most_steps, slopes=None if slopes is None else [slopes])
-        found = self.found(entries, fit.effects)
-        return replace(found, slopes=fit.slopes[0]) if fit.slopes is not None else found
+        return replace(self.found(entries, fit.effects), slopes=fit.slopes[0])
 
     def needed(self, more: Found, less: Found) -> float:
         """Evidence that a larger set needs: a significant one, and more for unusual effects.

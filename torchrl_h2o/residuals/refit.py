@@ -84,12 +84,12 @@ class SetFit:
     Args:
         effects: the effects with their fitted values.
         half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
-        slopes: derivatives of the errors by the values, (N, p) for each part, or an estimate of them.
+        slopes: derivatives of the errors by the values, (N, p) for each part.
     """
 
     effects: tuple[Effect, ...]
     half_widths: tuple[dict[str, float], ...]
-    slopes: Slopes | None = None
+    slopes: Slopes
 
 
 def variables_of(
@@ -137,7 +137,7 @@ def fit_set(
 ) -> SetFit:
     """Maximises the score over the values of effects, from their present values.
 
-    Derivatives are computed in each step; those that are given serve for all steps.
+    Derivatives are computed once and serve for all steps, because each costs a simulation for each value.
 
     Args:
         parts: predictions of the rows to fit.
@@ -153,10 +153,9 @@ def fit_set(
     effects = tuple(effects)
     errors = [part.errors(effects) for part in parts]
     scales, by_block = _profiled(parts, errors)
-    variables, is_given = variables_of(parts[0], entries, effects), slopes is not None
+    variables = variables_of(parts[0], entries, effects)
+    slopes = slopes_of(parts, effects, variables, errors, slopes)
     for _ in range(most_steps if variables else 0):
-        if not is_given or slopes is None or slopes[0].shape[1] < len(variables):
-            slopes = slopes_of(parts, effects, variables, errors, slopes if is_given else None)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
         move, gain = _step(weighted, slopes, variables), 0.0
         for share in (1.0, 0.3, 0.1):
@@ -237,7 +236,10 @@ def slopes_of(
             except ValueError:
                 after = before
             found.append((after - before) / (step or 1.0))
-    return [np.stack(found, axis=1) for found in columns]
+    return [
+        np.stack(found, axis=1) if found else np.zeros((len(flat(error)), 0))
+        for found, error in zip(columns, errors, strict=True)
+    ]
 
 
 def _step(parts: Sequence[Whitened], slopes: Slopes, variables: Sequence[Variable]) -> np.ndarray:

@@ -219,7 +219,7 @@ def with_intervals(
             break
         fewer = Found(*replace(found, effects=fit.effects).without(idle), found.scores)
         kept = [entry.name not in idle for entry in found.entries for _ in entry.fitted]
-        slopes = [own[:, kept] for own in fit.slopes or ()]
+        slopes = [own[:, kept] for own in fit.slopes]
         try:
             refit = fit_set(parts, fewer.entries, fewer.effects, most_steps=GROWN, intervals=True, slopes=slopes)
         except OutOfTimeError:
