@@ -49,6 +49,14 @@ def test_the_true_effect_predicts_better_than_a_wrong_one(measured, wrong):
     assert difference(measured, (TRUTH,), wrong).evidence > 10.0
 
 
+def test_noise_of_the_commands_is_white_one_step_ahead_and_missing_gravity_is_not():
+    measured, simulation = recorded(pendulum(), 2000, 1e-4), pendulum()
+    noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
+    noisy = Model.of(simulation, replace(measured, action=measured.action + noise))
+    assert noisy.one_step_ahead()[1]
+    assert not noisy.one_step_ahead((Gravity(2.0),))[1]
+
+
 def test_a_fit_that_is_given_derivatives_reaches_the_same_values_by_fewer_simulations(measured, monkeypatch):
     part, effects, entries = Model.of(pendulum(), measured).fit, (JointFrictionLoss(0.07),), (CATALOGUE[1],)
     slopes = slopes_of([part], effects, variables_of(part, entries, effects), [part.errors(effects)])

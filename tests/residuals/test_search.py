@@ -74,12 +74,12 @@ def test_with_noisy_commands_an_effect_must_predict_the_next_row_with_the_expect
     blocks = np.arange(ground.num_fit + len(ground.base.selection.blocks)) % 7
     row = blocks[ground.num_fit :]
     friction, worse, better = entry_of(JointFrictionLoss(0.1), CATALOGUE), row - 1.0, 5.0 + 1.1 * row
-    less = Found((), (), 0.01 * blocks, (row, row))
+    less = Found((), (), 0.01 * blocks, (row, row), is_noise=True)
     more = Found((friction,), (JointFrictionLoss(0.1),), 5.0 + 0.1 * blocks, (better, better))
     assert ground.adds(more, less)
     assert not ground.adds(replace(more, one_step=(better, worse)), less)
     assert not ground.adds(replace(more, one_step=(worse, better)), less)
-    assert ground.adds(replace(more, one_step=()), replace(less, one_step=()))
+    assert ground.adds(replace(more, one_step=(worse, worse)), replace(less, is_noise=False))
 
 
 def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_them():

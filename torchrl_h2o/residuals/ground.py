@@ -54,8 +54,8 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
-        one_step: scores of the blocks for selection one step ahead, with the expected commands and the logged ones,
-            (2, S); empty if the logged commands have no noise.
+        one_step: scores of the blocks for selection one step ahead, (S), and those with logged commands that have noise.
+        is_noise: whether these errors are noise of the motion or of the logged commands.
         slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """
 
@@ -63,6 +63,7 @@ class Found:
     effects: tuple[Effect, ...]
     scores: np.ndarray
     one_step: Sequence[np.ndarray] = ()
+    is_noise: bool = False
     slopes: np.ndarray | None = field(default=None, repr=False)
 
     @property
@@ -174,10 +175,11 @@ class Ground:
     def found(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
         """A set with its scores."""
         model = self.model(effects)
-        one_step: tuple[np.ndarray, ...] = ()
+        one_step, is_noise = model.one_step_ahead()
+        both = [one_step]
         if self.logged is not None:
-            one_step = model.one_step_ahead(), model.with_commands(self.logged).one_step_ahead()
-        return Found(tuple(entries), tuple(effects), model.scores(), one_step)
+            both.append(model.with_commands(self.logged).one_step_ahead()[0])
+        return Found(tuple(entries), tuple(effects), model.scores(), both, is_noise or len(both) > 1)
 
     def leaves_little(self, found: Found) -> bool:
         """Whether all errors left are too small to matter, at all horizons; see ``MATTERS``."""
@@ -245,10 +247,10 @@ class Ground:
         Rows for selection must show half of the evidence needed, and all rows must show all of it, and more where the
         set is the best of many.
 
-        Noise of the logged commands moves the simulator and not the machine, and over many steps an effect predicts
-        better that makes the simulator deaf to what is left of it, such as damping. Where there is such noise, an
-        effect must therefore predict the next step significantly better, too, with the expected commands and the
-        logged ones.
+        Noise of the logged commands moves the simulator and not the machine, and noise of the motion the machine alone.
+        Over many steps an effect then predicts better that makes the simulator deaf to it, such as damping. Where there
+        is such noise, an effect must therefore predict the next step significantly better, too, with the expected
+        commands and the logged ones.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
@@ -256,7 +258,7 @@ class Ground:
         if in_selection <= 0.5 * needed or in_all <= needed + math.log(among):
             return False
         least = min(needed, -math.log(self.level))
-        return all(
+        return not less.is_noise or all(
             Difference(one - other).evidence > least for one, other in zip(more.one_step, less.one_step, strict=True)
         )
 

@@ -28,6 +28,7 @@ DIVERGED = 1e3  # error in spreads where a simulation diverges
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
 FEWEST = 4  # blocks that must differ
+WHITE = 0.5  # effective share of a window from which neighbouring errors count as independent noise
 SCALED = 200  # windows from which these variances are fitted
 SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
 
@@ -251,7 +252,7 @@ class Model:
 
     fit: Predictions
     selection: Predictions
-    _found: dict[tuple[Effect, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, repr=False)
+    _found: dict[tuple[Effect, ...], tuple[np.ndarray, np.ndarray, bool]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -299,11 +300,14 @@ class Model:
         """
         return self._scored(tuple(effects))[0]
 
-    def one_step_ahead(self, effects: Sequence[Effect] = ()) -> np.ndarray:
-        """Score of the blocks for selection one step ahead, (S)."""
-        return self._scored(tuple(effects))[1]
+    def one_step_ahead(self, effects: Sequence[Effect] = ()) -> tuple[np.ndarray, bool]:
+        """Score of the blocks for selection one step ahead, (S), and whether these errors are noise of the motion.
 
-    def _scored(self, effects: tuple[Effect, ...]) -> tuple[np.ndarray, np.ndarray]:
+        They are if they are larger than the sensors' noise, and independent in successive rows.
+        """
+        return self._scored(tuple(effects))[1:]
+
+    def _scored(self, effects: tuple[Effect, ...]) -> tuple[np.ndarray, np.ndarray, bool]:
         if effects not in self._found:
             errors, ahead = self.fit.errors(effects), self.selection.errors(effects)
             scales = fitted_scales(self.fit, errors)
@@ -311,5 +315,7 @@ class Model:
             windows, known = self.selection.blocks.windows[0], self.selection.variances[0][:, 0]
             density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
             one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
-            self._found[effects] = by_block, one_step
+            is_larger = np.median(scales[0][0] / np.median(known, axis=0)) > 1.0
+            is_white = self.fit.effective_counts(errors)[0][0] > WHITE
+            self._found[effects] = by_block, one_step, bool(is_larger and is_white)
         return self._found[effects]
