@@ -211,7 +211,7 @@ def _log_scale(axes: Axes, name: Literal["x", "y"], values: Sequence[float | Non
 
 def _positive(value: float | None) -> float:
     """The value, or NaN, which is not drawn, if it is not positive."""
-    return value if value is not None and 0.0 < value < math.inf else math.nan
+    return float(value) if value is not None and 0.0 < value < math.inf else math.nan
 
 
 def _unit(unit: str) -> str:
