@@ -55,4 +55,4 @@ def test_what_later_readings_would_tell_of_a_command_is_unpredicted(measured):
     of_next_row = replace(measured, action=measured.following[:, 2:4], run=runs)
     of_this_row = replace(measured, action=measured.observation[:, 2:4], run=runs)
     assert (unpredicted(of_this_row).std(0) < 1e-9).all()
-    assert (unpredicted(of_next_row).std(0) > 1e-6).all()
+    assert (unpredicted(of_next_row).std(0) > 0.01 * of_next_row.action.std(0)).all()
