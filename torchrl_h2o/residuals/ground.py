@@ -125,8 +125,8 @@ class Ground:
         base = _weighted(model, floor)
         return cls(simulation, base, level, None, {tuple(effects): base})
 
-    def near(self, found: Found, measured: Measured) -> Ground:
-        """The ground near a set that was found, with the commands under which its readings are likeliest.
+    def near(self, found: Found, measured: Measured) -> tuple[Ground, Found]:
+        """The ground near a set that was found, and the set fitted to the commands that make its readings likeliest.
 
         The expected commands take the place of logged ones if the set, fitted to each, predicts significantly better.
 
@@ -136,14 +136,16 @@ class Ground:
         """
         simulation = self.simulation.with_effects(*found.effects)
         base = _weighted(Model.of(simulation, measured), self.base.fit.floor)
-        best = logged = Ground(self.simulation, base, self.level)
-        first = highest = logged.refit(found)
+        best = logged = replace(self, base=base, logged=None, _models={found.effects: base})
+        highest = first = logged.refit(found)
         for expected in expected_commands(measured):
-            other = Ground(self.simulation, base.of_simulation(simulation, expected), self.level, measured)
+            model = base.of_simulation(simulation, expected)
+            other = replace(self, base=model, logged=measured, _models={found.effects: model})
             if (own := other.refit(found)).scores.mean() <= highest.scores.mean():
                 break
             best, highest = other, own
-        return best if Difference(highest.scores - first.scores).evidence > -math.log(self.level) else logged
+        is_better = Difference(highest.scores - first.scores).evidence > -math.log(self.level)
+        return (best, highest) if is_better else (logged, first)
 
     @property
     def num_fit(self) -> int:

@@ -87,15 +87,15 @@ def search(
 
     ended_in, unseen, alike = None, (), []
     progress.stage(EFFECTS)
-    ground = Ground.of(simulation, measured, latest[0].effects, level)
+    grounds = [Ground.of(simulation, measured, latest[0].effects, level)]
     try:
-        ground, alike, unseen = _searched(ground, measured, latest[0], catalogue, progress, better, tried)
+        alike, unseen = _searched(grounds, measured, latest[0], catalogue, progress, better, tried)
     except OutOfTimeError as end:
         ended_in = str(end)
     found = latest[-1]
     progress.begin_last_fit(bool(found.entries))
     try:
-        explanation = _explanation(*with_intervals(ground, found, alike))
+        explanation = _explanation(*with_intervals(grounds[-1], found, alike))
     except OutOfTimeError as end:
         explanation, ended_in = _explanation(found), ended_in or str(end)
     left = [one for name, one in tried.items() if name not in found.names]
@@ -125,23 +125,28 @@ def known_set(catalogue: Sequence[CatalogueEntry], known: Sequence[Effect]) -> F
 
 
 def _searched(
-    ground: Ground,
+    grounds: list[Ground],
     measured: Measured,
     found: Found,
     catalogue: Sequence[CatalogueEntry],
     progress: LoopBar,
     better: Callable[[Found, Found], object],
     tried: dict[str, Tried],
-) -> tuple[Ground, list[list[Found]], tuple[Effect, ...]]:
-    """Sweeps and grows, then drops and replaces, until nothing changes; hands each better set to ``better``."""
+) -> tuple[list[list[Found]], tuple[Effect, ...]]:
+    """Sweeps and grows, then drops and replaces, until nothing changes; hands each better set to ``better``.
+
+    The ground of each sweep is added to ``grounds``, so that it is known when the time is up.
+    """
     every = [entry for entry in catalogue if not entry.effect.random]
     entries, directions, alike, unseen = every, [], [], ()
     settled: frozenset[str] | None = None
+    ground = grounds[-1]
     for number in range(SWEEPS):
         explained = number > 0 and ground.leaves_little(found)
         if not explained:
             if number:
-                ground = ground.near(found, measured)
+                ground, found = grounds[-1].near(found, measured)
+                grounds.append(ground)
             found = ground.fitted(found.entries, found.effects)
             if number > 1:
                 best = Candidates.of(ground, found, directions).leads[:RESWEPT]
@@ -173,7 +178,7 @@ def _searched(
             settled = found.names
             if settled == before:
                 break
-    return ground, alike if found.names == settled else [], () if found.entries else unseen
+    return alike if found.names == settled else [], () if found.entries else unseen
 
 
 def _unseen(
