@@ -1,5 +1,6 @@
 """A search finds what each joint lacks together, replaces what explains less, and takes no noise for an effect."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +25,7 @@ from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
-from torchrl_h2o.residuals.progress import LoopBar
+from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.search import known_set, with_intervals
 from torchrl_h2o.residuals.sweep import sweep
 
@@ -67,6 +68,24 @@ def test_noise_of_the_logged_torques_is_no_friction():
     measured = recorded(SIMULATION, 2000, noise=1e-4)
     noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
     assert found(replace(measured, action=measured.action + noise)).effects == ()
+
+
+def test_the_last_fit_has_the_expected_commands_if_the_time_is_up(monkeypatch):
+    module, calls, grounds = sys.modules[search.__module__], [], []
+    grow, with_intervals = module.grow, module.with_intervals
+
+    def grow_once(*args):
+        calls.append(args)
+        if len(calls) > 1:
+            raise OutOfTimeError("looking for effects")
+        return grow(*args)
+
+    monkeypatch.setattr(module, "grow", grow_once)
+    monkeypatch.setattr(module, "with_intervals", lambda *args: grounds.append(args[0]) or with_intervals(*args))
+    measured = recorded(SIMULATION.with_effects(JointFrictionLoss(0.03)), 2000, noise=1e-4)
+    noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
+    assert found(replace(measured, action=measured.action + noise)).ended_in == "looking for effects"
+    assert grounds[0].logged is not None
 
 
 def test_with_noisy_commands_an_effect_must_predict_the_next_row_with_the_expected_and_the_logged_ones():
