@@ -356,3 +356,9 @@ def test_an_undeclared_effect_is_marked_in_words_and_a_declared_one_is_not():
     effect = JointFrictionLoss(0.1)
     assert FoundEffect(effect, True, {}, 0.1).words == effect.describe()
     assert FoundEffect(effect, False, {}, 0.1).words == f"outside the catalogue: {effect.describe()}"
+
+
+def test_a_window_has_one_value_per_time():
+    window = windowed().windows[0]
+    with pytest.raises(ValueError, match="elbow angle has 6 measured values at 5 times"):
+        dataclasses.replace(window, ahead=window.ahead[1:])

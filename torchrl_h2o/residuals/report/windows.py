@@ -47,6 +47,9 @@ class ShownWindow:
             by the standard deviation of its change over such a window; NaN if the simulation diverges.
         after: the same error with all effects.
         quantities: the quantities whose errors are largest over all windows.
+
+    Raises:
+        ValueError: if a quantity does not have one value per time.
     """
 
     rank: str
@@ -57,6 +60,14 @@ class ShownWindow:
     before: float
     after: float
     quantities: tuple[WindowQuantity, ...]
+
+    def __post_init__(self):
+        for quantity in self.quantities:
+            if len(quantity.measured) != len(self.ahead):
+                raise ValueError(
+                    f"{quantity.name} has {len(quantity.measured)} measured values at {len(self.ahead)} times; "
+                    "give one of each per time"
+                )
 
 
 @dataclass(frozen=True)
