@@ -140,8 +140,17 @@ def test_families_are_selected_together():
 @pytest.mark.parametrize(
     ("task", "links"),
     [
-        ("Walker2d", {"thigh", "leg", "thigh_left", "leg_left"}),
-        ("HalfCheetah", {"bthigh", "bshin", "fthigh", "fshin"}),
+        (
+            "Walker2d",
+            {
+                *("thigh", "leg", "thigh_left", "leg_left", "*thigh*", "*leg*"),
+                *("thigh_left, leg_left", "thigh, leg, thigh_left, leg_left"),
+            },
+        ),
+        (
+            "HalfCheetah",
+            {"bthigh", "bshin", "fthigh", "fshin", "*thigh*", "*shin*", "bthigh, bshin, fthigh, fshin"},
+        ),
         ("InvertedPendulum", {"cart"}),
     ],
 )

@@ -11,7 +11,17 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchrl_h2o.effects import Armature, CatalogueEntry, Effect, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, flat, weights, whitened
+from torchrl_h2o.residuals.refit import (
+    FARTHEST,
+    REWEIGHTED,
+    RIDGE,
+    Variable,
+    block_of,
+    flat,
+    weights,
+    whitened,
+    with_values,
+)
 from torchrl_h2o.residuals.score import FEWEST, Difference, Predictions, fitted_scales
 from torchrl_h2o.residuals.start_states import log_density
 from torchrl_h2o.residuals.sweep import Direction
@@ -26,19 +36,21 @@ SLIGHT = 0.01  # gain of such a refinement, in nats a block, after which none fo
 LEAST_NATS = 2.0  # estimated gain of all blocks with which one of several joints or motors has an effect of its own
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lead:
     """A candidate with its estimated gain: one effect, or the same effect on each of several joints or motors.
 
     Args:
         directions: the direction of each effect.
         shares: estimated share of each trial.
+        moves: estimated moves of the values of the present effects beside it, (p).
         gain: estimated gain of the score in nats a block, if the errors are linear in the effect.
         evidence: estimated evidence of the rows for the candidate.
     """
 
     directions: tuple[Direction, ...]
     shares: tuple[float, ...]
+    moves: np.ndarray
     gain: float
     evidence: float
 
@@ -53,18 +65,29 @@ class Lead:
         return tuple(dict.fromkeys((1.0, 0.5, 1.0 / max(abs(share) for share in self.shares))))
 
     def beside(
-        self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect], factor: float
+        self,
+        entries: Sequence[CatalogueEntry],
+        effects: Sequence[Effect],
+        factor: float,
+        variables: Sequence[Variable] = (),
     ) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
         """Present entries and effects with the candidate at a factor of its shares.
 
         Effects on each of several joints take the place of present ones of the same kind, and begin at their values.
+
+        Args:
+            entries: the present entries.
+            effects: the present effects.
+            factor: the factor.
+            variables: values of the present effects; they are readjusted to the candidate.
         """
         own = [direction.effect(factor * share) for direction, share in zip(self.directions, self.shares, strict=True)]
-        kept = list(zip(entries, effects, strict=True))
+        moves = np.clip(factor * self.moves, -FARTHEST, FARTHEST) if variables else np.zeros(0)
+        kept = list(zip(entries, with_values(effects, variables, moves), strict=True))
         if len(own) > 1:
             kinds = {type(one) for one in own}
-            alone = {entry.name for entry, _ in kept if entry.name in self.names}
-            for entry, effect in kept:
+            alone = {entry.name for entry in entries if entry.name in self.names}
+            for entry, effect in zip(entries, effects, strict=True):
                 own = [
                     _sum(one, effect)
                     if type(one) is type(effect) and (entry.name == d.entry.name or entry.name not in alone)
@@ -165,7 +188,7 @@ class Gains:
         columns = self._free_of_present(chosen)
         shares, _ = self._solved(chosen, columns)
         shares = np.where(np.abs(shares) < START_SHARE, START_SHARE, shares)
-        return self._lead(tuple(chosen), tuple(map(float, shares)), np.stack(columns, axis=1) @ shares)
+        return self._lead(tuple(chosen), shares, np.stack(columns, axis=1) @ shares)
 
     def evidence_if_there(self, direction: Direction) -> float:
         """Evidence of the rows for an effect if it were there at its trial beside the present errors."""
@@ -209,15 +232,17 @@ class Gains:
             left.remove(effect)
         return found
 
+    @cached_property
+    def _readjust(self) -> np.ndarray:
+        """(p, N): moves of the values of the present effects that make up for a whitened change."""
+        weighted = self.weight[:, None] * self.beside
+        gram = weighted.T @ self.beside
+        return -np.linalg.pinv(gram + 1e-9 * np.diag(np.diag(gram))) @ weighted.T
+
     def _free_of_present(self, directions: Sequence[Direction]) -> list[np.ndarray]:
         """Whitened changes, each after the present effects have been readjusted."""
-        weighted, found = self.weight[:, None] * self.beside, []
-        gram = weighted.T @ self.beside
-        solve = np.linalg.pinv(gram + 1e-9 * np.diag(np.diag(gram))) if len(gram) else gram
-        for direction in directions:
-            column = direction.change * self.inverse
-            found.append(column - self.beside @ (solve @ (weighted.T @ column)) if len(gram) else column)
-        return found
+        columns = [direction.change * self.inverse for direction in directions]
+        return [column + self.beside @ (self._readjust @ column) for column in columns]
 
     def _alone(self, direction: Direction, column: np.ndarray) -> Lead | None:
         def least_squares(weight: np.ndarray) -> float:
@@ -237,7 +262,7 @@ class Gains:
             if gain(least_squares(self._weight_at(best * column))) < gains[best] + SLIGHT * self.num_blocks:
                 break
         best = max(gains, key=gains.__getitem__)
-        return self._lead((direction,), (best,), best * column) if best and gains[best] > 0.0 else None
+        return self._lead((direction,), np.array([best]), best * column) if best and gains[best] > 0.0 else None
 
     def _shares_of_groups(self, column: np.ndarray) -> list[float]:
         """The shares that explain most of the errors of one group each, for the few groups with the largest gain."""
@@ -259,7 +284,7 @@ class Gains:
         if len(acting) < len(columns):
             kept = [directions[i] for i in acting], [columns[i] for i in acting]
             return self._together(*kept) if len(acting) > 1 else None
-        return self._lead(tuple(directions), tuple(map(float, shares)), np.stack(columns, axis=1) @ shares)
+        return self._lead(tuple(directions), shares, np.stack(columns, axis=1) @ shares)
 
     def _solved(self, directions: Sequence[Direction], columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The shares with the best score, within their bounds, and the curvature of the score."""
@@ -276,9 +301,13 @@ class Gains:
             moved = self.white + matrix @ shares
         return shares, gram
 
-    def _lead(self, directions: tuple[Direction, ...], shares: tuple[float, ...], change: np.ndarray) -> Lead:
+    def _lead(self, directions: tuple[Direction, ...], shares: np.ndarray, change: np.ndarray) -> Lead:
         gains = self._gains(change)
-        return Lead(directions, shares, float(gains.sum()) / self.num_blocks, self._evidence(gains))
+        moved = sum(share * one.change for one, share in zip(directions, shares, strict=True))
+        moves = self._readjust @ (moved * self.inverse)
+        return Lead(
+            directions, tuple(map(float, shares)), moves, float(gains.sum()) / self.num_blocks, self._evidence(gains)
+        )
 
     @cached_property
     def _present(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
 from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground
-from torchrl_h2o.residuals.refit import slopes_of, variables_of
+from torchrl_h2o.residuals.refit import Variable, slopes_of, variables_of
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
 
@@ -34,12 +34,14 @@ class Candidates:
 
     Args:
         rough: predictions from start states filtered with the set, on which candidates are fitted.
+        variables: values of the set.
         slopes: derivatives of their errors by the values of the set, (N, p).
         leads: the best direction of each candidate, in descending order of the estimated gain.
         joints: friction, damping and rotors of all joints together.
     """
 
     rough: Predictions
+    variables: Sequence[Variable]
     slopes: np.ndarray
     leads: Sequence[Lead]
     joints: Lead | None
@@ -48,8 +50,8 @@ class Candidates:
     def of(cls, ground: Ground, found: Found, directions: Sequence[Direction]) -> Candidates:
         """The candidates beside a set."""
         rough = ground.rough(found.effects)
-        gains = gains_beside(rough, found)
-        return cls(rough, gains.slopes, best_of_each(gains.leads(directions)), gains.of_joints(directions))
+        gains, variables = gains_beside(rough, found), variables_of(rough, found.entries, found.effects)
+        return cls(rough, variables, gains.slopes, best_of_each(gains.leads(directions)), gains.of_joints(directions))
 
 
 def grow(
@@ -156,10 +158,16 @@ def with_one_more(
         joints = None
     else:
         leads = [lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names]
-    sets = [[lead.beside(found.entries, found.effects, factor) for factor in lead.factors] for lead in leads[:TRIED]]
+    sets = [
+        [
+            *(lead.beside(found.entries, found.effects, factor, candidates.variables) for factor in lead.factors),
+            lead.beside(found.entries, found.effects, 1.0),
+        ]
+        for lead in leads[:TRIED]
+    ]
     best = _best_simulated(rough, sets)
     if joints is not None and leads and joints.gain > max(lead.gain for lead in leads):
-        best.append(joints.beside(found.entries, found.effects, 1.0))
+        best.append(joints.beside(found.entries, found.effects, 1.0, candidates.variables))
     return [one for one in _sketched(ground, candidates, best, found) if _is_usable(ground, one, found)]
 
 
@@ -192,7 +200,7 @@ def _sketched(ground: Ground, candidates: Candidates, sets: Sequence[Set], prese
     """
     found = []
     for entries, effects in sets:
-        known = candidates.slopes if effects[: len(present.effects)] == present.effects else None
+        known = candidates.slopes if entries[: len(present.entries)] == present.entries else None
         steps = GROWN if len(effects) > len(present.effects) + FEW else SKETCH
         try:
             found.append(replace(ground.sketched(candidates.rough, entries, effects, steps, known), slopes=None))

@@ -87,6 +87,12 @@ class Predictions:
         record.__dict__["spread"] = own.spread
         return replace(self, starts=replace(self.starts, record=record))
 
+    @cached_property
+    def quick(self) -> Predictions:
+        """The same windows by :attr:`Simulation.quick`, for derivatives."""
+        quick = self.record.simulation.quick
+        return self if quick is self.record.simulation else self.of_simulation(quick)
+
     @property
     def record(self) -> Record:
         """The log and the simulation."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from torchrl_h2o.residuals.blocks import LENGTHS, Blocks, Windows
 from torchrl_h2o.residuals.record import Record
+from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 BEFORE = 16  # largest number of rows before each block on which the filter settles
 NUDGE = 1e-3  # step of the finite differences, in spreads
@@ -20,6 +21,7 @@ ROUNDING = 1e-6  # rounding of a reading, in spreads: that of single precision, 
 TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
+LINEARISED = 2  # times that the steps of the simulation are linearised, about better states each time
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
 USUAL_FACTORS = np.array([0.0, -0.7])
 SPACINGS = (2.0, 1.0, 0.5, 0.2, 0.07)  # of the logarithms that are tried, one grid after another
@@ -54,6 +56,7 @@ class StartStates:
         noise: the noise.
         mean: (B, rows, m).
         covariance: (B, rows, m, m).
+        about: (B, rows before the block and in it, m), states about which the steps of the simulation are linearised.
         slope: (B, rows before the block and in it, m, m), derivative of the coordinates one control step later.
         factors: logarithms of the two factors of the fit of the noise.
     """
@@ -63,6 +66,7 @@ class StartStates:
     noise: Noise
     mean: np.ndarray
     covariance: np.ndarray
+    about: np.ndarray
     slope: np.ndarray
     factors: np.ndarray
 
@@ -72,26 +76,37 @@ class StartStates:
     ) -> StartStates:
         """Filters the log from some rows before each block to its end.
 
+        The steps are linearised about the measured rows, and then about the filtered ones.
+
         Args:
             record: the log and the simulation.
             blocks: the blocks.
             noise: the noise; estimated from these blocks by default.
-            similar: start states of a similar simulation in these blocks, whose derivatives are used.
+            similar: start states of a similar simulation in these blocks, with the same derivatives and the same two
+                factors of the noise. Explanations are compared with the same factors, because a change of the noise
+                changes the scores of all blocks alike, as a better explanation does.
         """
-        steps = _Steps.of(record, blocks, None if similar is None else similar.slope)
-        factors = USUAL_FACTORS
-        if noise is None:
-            noise, factors = steps.fitted_noise(None if similar is None else similar.factors)
-        (mean,), (covariance,), _ = steps.filtered([noise])
+        if similar is not None:
+            steps, factors = _Steps.of(record, blocks, similar.about, similar.slope), similar.factors
+            own = noise or steps.noise(factors)
+            (mean,), (covariance,), _ = steps.filtered([own])
+        else:
+            steps, factors = _Steps.of(record, blocks), USUAL_FACTORS
+            for relinearised in range(LINEARISED):
+                if relinearised:
+                    steps = _Steps.of(record, blocks, mean)
+                factors = factors if noise else steps.fitted_factors()
+                own = noise or steps.noise(factors)
+                (mean,), (covariance,), _ = steps.filtered([own])
         before = _rows_before(blocks)
-        return cls(record, blocks, noise, mean[:, before:], covariance[:, before:], steps.slope, factors)
+        return cls(record, blocks, own, mean[:, before:], covariance[:, before:], steps.about, steps.slope, factors)
 
     def rough(self, most: int) -> StartStates:
         """Returns the start states of at most ``most`` blocks, evenly spread, without the shortest windows."""
         some = slice(None, None, -(-len(self.blocks) // most))
         blocks = Blocks(self.blocks.first[some], self.blocks.steps, LENGTHS[-1:])
-        mean, covariance, slope = self.mean[some], self.covariance[some], self.slope[some]
-        return StartStates(self.record, blocks, self.noise, mean, covariance, slope, self.factors)
+        parts = (values[some] for values in (self.mean, self.covariance, self.about, self.slope))
+        return StartStates(self.record, blocks, self.noise, *parts, self.factors)
 
     @property
     def of_rows(self) -> tuple[np.ndarray, np.ndarray]:
@@ -122,18 +137,22 @@ class StartStates:
 
 @dataclass(frozen=True, eq=False)
 class _Steps:
-    """One control step linearised about each row of the blocks: ``next = slope @ deviation + miss``, in spreads.
+    """One control step linearised in each row of the blocks: ``next = slope @ deviation + miss``, in spreads.
+
+    Deviations are those from the measured coordinates.
 
     Args:
         record: the log and the simulation.
+        about: (B, L, m), deviations about which it is linearised.
         slope: (B, L, m, m).
-        miss: (B, L, m), simulated minus measured coordinates after the step.
+        miss: (B, L, m), simulated minus measured coordinates after a step from the measured ones.
         live: (B, L), False before the beginning of a run.
         known: (B, L), False where the simulation diverges.
         jerk: (n), size of the third differences of the readings over that of white noise.
     """
 
     record: Record
+    about: np.ndarray
     slope: np.ndarray
     miss: np.ndarray
     live: np.ndarray
@@ -141,7 +160,9 @@ class _Steps:
     jerk: np.ndarray
 
     @classmethod
-    def of(cls, record: Record, blocks: Blocks, slope: np.ndarray | None = None) -> _Steps:
+    def of(
+        cls, record: Record, blocks: Blocks, about: np.ndarray | None = None, slope: np.ndarray | None = None
+    ) -> _Steps:
         measured, spread, m = record.measured, record.spread, len(record.spread)
         begins = np.empty(len(measured), int)
         for run in measured.runs:
@@ -150,41 +171,42 @@ class _Steps:
         live = rows >= begins[blocks.first][:, None]
         rows = np.maximum(rows, begins[blocks.first][:, None])
         flat, size = rows.ravel(), rows.shape
-        states, actions = record.states[0][flat], record.executed[flat][:, None]
+        about = np.zeros((*size, m)) if about is None else np.where(live[..., None], about, 0.0)
+        states = record.states[0][flat] + (about.reshape(-1, m) * spread) @ record.into_state.T
+        actions = record.executed[flat][:, None]
         at = {"time": measured.time[flat], "activations": record.activations[flat]}
 
-        def reached(start: np.ndarray) -> np.ndarray:
-            return record.simulation.rollout(start, actions, **at)[:, 0] @ record.from_state.T / spread
+        def reached(simulation: Simulation, start: np.ndarray) -> np.ndarray:
+            return simulation.rollout(start, actions, **at)[:, 0] @ record.from_state.T / spread
 
-        base = reached(states)
+        base = reached(record.simulation, states)
         if slope is None:
-            slope = np.empty((*size, m, m))
+            slope, quick = np.empty((*size, m, m)), record.simulation.quick
+            before = base if quick is record.simulation else reached(quick, states)
             for index in range(m):
                 moved = states + NUDGE * spread[index] * record.into_state[:, index]
-                slope[..., index] = ((reached(moved) - base) / NUDGE).reshape(*size, m)
+                slope[..., index] = ((reached(quick, moved) - before) / NUDGE).reshape(*size, m)
         miss = (base - record.states[1][flat] @ record.from_state.T / spread).reshape(*size, m)
+        miss = miss - (slope @ about[..., None])[..., 0]
         known = np.asarray(np.isfinite(slope).all((2, 3)) & np.isfinite(miss).all(2))
         slope, miss = np.where(known[..., None, None], slope, np.eye(m)), np.where(known[..., None], miss, 0.0)
         third = np.abs(np.diff(record.readings[0][rows], 3, axis=1) / spread[: record.num_readings])
         jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
-        return cls(record, slope, miss, live, known, jerk)
+        return cls(record, about, slope, miss, live, known, jerk)
 
-    def fitted_noise(self, factors: np.ndarray | None) -> tuple[Noise, np.ndarray]:
-        """The noise under which the next readings are most likely, and its two factors on :meth:`_typical_noise`.
+    def noise(self, factors: np.ndarray) -> Noise:
+        """The noise with given logarithms of its two factors on :meth:`_typical_noise`."""
+        return self._typical_noise().scaled(*np.exp(factors))
 
-        Args:
-            factors: logarithms of the factors of a similar simulation, near which they are.
-        """
-        typical = self._typical_noise()
+    def fitted_factors(self) -> np.ndarray:
+        """Logarithms of the two factors of the noise under which the next readings are most likely."""
+        typical, best = self._typical_noise(), USUAL_FACTORS
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
-        spacings = SPACINGS if factors is None else SPACINGS[-3:]
-        best = USUAL_FACTORS if factors is None else factors
-        for spacing in spacings:
+        for spacing in SPACINGS:
             tried = best + spacing * AROUND
             densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2]
             best = tried[densities.argmax()]
-        best = tried[len(tried) // 2] + spacing * _highest(densities)
-        return typical.scaled(*np.exp(best)), best
+        return tried[len(tried) // 2] + spacing * _highest(densities)
 
     def _typical_noise(self) -> Noise:
         """Noise of the sensors by the products of successive misses, and the size of the misses.

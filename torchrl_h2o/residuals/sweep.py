@@ -17,6 +17,7 @@ from torchrl_h2o.effects import (
     CatalogueEntry,
     Effect,
     JointRange,
+    LinkLength,
     ObservationDelay,
 )
 from torchrl_h2o.residuals.elements import elements
@@ -26,7 +27,16 @@ from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 #: effects that act otherwise at each size, so that every trial is simulated
-NOT_LINEAR = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay)
+NOT_LINEAR = (
+    ActionBacklash,
+    ActionDeadBand,
+    ActionDelay,
+    ActionLag,
+    ActionSaturation,
+    JointRange,
+    LinkLength,
+    ObservationDelay,
+)
 SMOOTH = (ActionDelay, ActionLag, ObservationDelay)  # of these, those whose errors are linear in a small size
 LEAST_FACTOR = 0.1  # least factor that a share of a trial stands for, if the trial is above it
 MOST_SHARE = 4.0  # largest move along a candidate's direction, in moves of its trial
@@ -88,7 +98,8 @@ def sweep(
         beside: effects that the simulator has already.
         advance: called after each entry.
     """
-    before, simulation = flat(predictions.errors(beside)), predictions.record.simulation
+    quick, simulation = predictions.quick, predictions.record.simulation
+    before = flat(quick.errors(beside))
     alone = _alone(entries, simulation)
     found: dict[str, list[Direction]] = {}
     shared: list[tuple[CatalogueEntry, list[CatalogueEntry]]] = []
@@ -104,7 +115,7 @@ def sweep(
             if _side(entry, trial) in without_effect:  # a smaller trial has none, either
                 continue
             try:
-                change = flat(predictions.errors([*beside, entry.effect.with_parameters(trial)])) - before
+                change = flat(quick.errors([*beside, entry.effect.with_parameters(trial)])) - before
             except ValueError:
                 continue
             if np.abs(change).max() == 0.0:
@@ -189,6 +200,8 @@ def _shares(
     entry: CatalogueEntry, trial: Mapping[str, float], simulation: Simulation, beside: Sequence[Effect]
 ) -> tuple[float, float]:
     """Shares of a trial at which the errors are about linear and the model accepts the effect."""
+    if isinstance(entry.effect, LinkLength) and _size(entry, trial) == min(_size(entry, one) for one in entry.trials):
+        return -MOST_SHARE, MOST_SHARE
     if isinstance(entry.effect, NOT_LINEAR):
         return 0.0, 1.5
     least = lowest_value(entry.effect, simulation.model, beside)

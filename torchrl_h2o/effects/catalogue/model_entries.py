@@ -30,6 +30,7 @@ from torchrl_h2o.effects.selection import Names
 
 # scales that a trial multiplies a property of the model by
 FACTORS = (0.5, 0.8, 1.25, 2.0)
+LENGTHS = (0.05, 0.4, 0.8)  # the same of a link
 # relative change of a body's inertia above which a geom contributes to it
 _INERTIA_CHANGE = 1e-9
 
@@ -55,8 +56,8 @@ def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
         if model.body_parentid[index + 1] == 0 or index + 1 in alone
     }
     yield from entries_of(Payload, "bodies", carrying, lambda chosen: _loads(mechanism, chosen[0] + 1))
-    links = named_choices(paths, [b - 1 for b in range(1, model.nbody) if mechanism.is_link(b)], groups=False)
-    yield from _factors(mechanism, LinkLength, "bodies", links)
+    links = named_choices(paths, [b - 1 for b in range(1, model.nbody) if mechanism.is_link(b)])
+    yield from entries_of(LinkLength, "bodies", links, lambda _: each("scale", *LENGTHS))
 
 
 def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:

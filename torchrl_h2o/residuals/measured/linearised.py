@@ -92,13 +92,17 @@ def one_step(
         diverges.
     """
     steps = nudge * simulation.state_map.restore_observed
-    begun = np.concatenate([states, *(states + step for step in steps.T)])
-    copies = 1 + len(nudge)
-    reached = simulation.rollout(
-        begun,
-        np.tile(actions, (copies, 1))[:, None],
-        time=np.tile(time, copies),
-        activations=np.tile(activations, (copies, 1)),
-    )[:, 0]
-    reached = simulation.state_map.observations(reached).reshape(copies, len(states), -1)
-    return reached[0], np.moveaxis(reached[1:] - reached[0], 0, -1) / nudge
+
+    def reached(simulation: Simulation, begun: np.ndarray) -> np.ndarray:
+        copies = len(begun)
+        after = simulation.rollout(
+            begun.reshape(copies * len(states), -1),
+            np.tile(actions, (copies, 1))[:, None],
+            time=np.tile(time, copies),
+            activations=np.tile(activations, (copies, 1)),
+        )[:, 0]
+        return simulation.state_map.observations(after).reshape(copies, len(states), -1)
+
+    near = reached(simulation.quick, np.stack([states, *(states + step for step in steps.T)]))
+    base = near[0] if simulation.quick is simulation else reached(simulation, states[None])[0]
+    return base, np.moveaxis(near[1:] - near[0], 0, -1) / nudge

@@ -191,6 +191,19 @@ class Simulation:
             more.__dict__.update(model=self.model, _scratch=self._scratch)
         return more
 
+    @cached_property
+    def quick(self) -> Simulation:
+        """The simulation with Euler's steps in the place of RK4's, for derivatives: these need a quarter of the time."""
+        if self.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+            return self
+
+        def spec() -> mujoco.MjSpec:
+            with_euler = self.spec()
+            with_euler.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+            return with_euler
+
+        return replace(self, spec=spec)
+
     def executed(self, actions: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """Returns the executed actions of one recorded run, (T, nu); see :meth:`Pipeline.executed_run`.
 
