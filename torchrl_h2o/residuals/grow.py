@@ -154,7 +154,8 @@ def with_one_more(
     if rival is not None:
         quarter = 0.25 * (rough.score(rival.effects) - rough.score(found.effects))
         leads = [lead for lead in leads if lead.gain > quarter]
-    if rival is not None or joints is None or joints.names - found.names in {frozenset(), *passed_over}:
+    is_new = joints is not None and joints.names - found.names not in {frozenset(), *passed_over}
+    if rival is not None or joints is None or not is_new or joints.evidence <= least:
         joints = None
     else:
         leads = [lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names]
@@ -165,9 +166,11 @@ def with_one_more(
         ]
         for lead in leads[:TRIED]
     ]
+    if joints is not None:
+        sets.append(
+            [joints.beside(found.entries, found.effects, factor, candidates.variables) for factor in (1.0, 0.5)]
+        )
     best = _best_simulated(rough, sets)
-    if joints is not None and leads and joints.gain > max(lead.gain for lead in leads):
-        best.append(joints.beside(found.entries, found.effects, 1.0, candidates.variables))
     return [one for one in _sketched(ground, candidates, best, found) if _is_usable(ground, one, found)]
 
 

@@ -193,7 +193,7 @@ class Simulation:
 
     @cached_property
     def quick(self) -> Simulation:
-        """The simulation with Euler's steps in the place of RK4's, for derivatives: these need a quarter of the time."""
+        """The simulation with Euler's steps in place of RK4's, for derivatives: that takes a quarter of the time."""
         if self.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
             return self
 
