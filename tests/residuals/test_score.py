@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import pendulum, recorded
+from tests.residuals.pendulum import double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     Armature,
     CatalogueEntry,
@@ -16,7 +16,7 @@ from torchrl_h2o.effects import (
     ObservationGain,
 )
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
-from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals import Measured, Simulation, start_states
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.refit import fit_set, slopes_of, variables_of
@@ -67,6 +67,23 @@ def test_a_fit_that_is_given_derivatives_reaches_the_same_values_by_fewer_simula
     (computed,) = fit_set([part], entries, effects, most_steps=8).effects
     assert given.torque == pytest.approx(computed.torque, rel=0.01)
     assert fewer < len(simulated)
+
+
+def test_sets_are_compared_with_the_same_noise_so_that_an_effect_of_no_size_gains_nothing():
+    ground = Ground.of(double_pendulum(), recorded(double_pendulum(), 1200, 0.01))
+    gain = Difference(ground.model((Gravity(1.0 + 1e-9),)).scores() - ground.base.scores())
+    assert np.abs(gain.by_block).max() < 1e-4
+
+
+def test_noise_is_not_taken_for_an_error_of_the_simulator_because_steps_are_linearised_about_filtered_states(
+    monkeypatch,
+):
+    measured = recorded(double_pendulum(), 1200, 0.01)
+    twice = Model.of(double_pendulum(), measured)
+    monkeypatch.setattr(start_states, "LINEARISED", 1)
+    once = Model.of(double_pendulum(), measured)
+    assert twice.scores().mean() > once.scores().mean() + 0.3
+    assert (twice.fit.starts.noise.step < 0.5 * once.fit.starts.noise.step).all()
 
 
 def test_an_effect_too_many_predicts_no_better(measured):

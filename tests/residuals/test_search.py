@@ -181,6 +181,21 @@ def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():
     assert lead.gain == pytest.approx(rough.score([gravity]) - rough.score(), rel=0.1)
 
 
+def test_the_present_values_are_readjusted_to_a_candidate_before_it_is_simulated():
+    """Damping that was fitted in the place of a gravity is too large beside this gravity."""
+    measured = recorded(SIMULATION.with_effects(Gravity(0.7), JointDamping(0.02, "elbow")), 1200, noise=0.001)
+    ground, entry = Ground.of(SIMULATION, measured), entry_of(JointDamping(0.02, "elbow"), CATALOGUE)
+    less = ground.fitted([entry], [JointDamping(0.02, "elbow")])
+    directions = sweep(ground.rough(less.effects), [e for e in CATALOGUE if e.name == "Gravity"], less.effects)
+    candidates = Candidates.of(ground, less, directions)
+    (lead,) = candidates.leads
+    moved, alone = (
+        lead.beside(less.entries, less.effects, 1.0, variables)[1] for variables in (candidates.variables, ())
+    )
+    assert moved[0] != alone[0] == less.effects[0]
+    assert candidates.rough.score(moved) > candidates.rough.score(alone)
+
+
 def test_derivatives_are_those_of_euler_steps_where_the_model_has_four_evaluations_a_step():
     measured = recorded(SIMULATION.with_effects(Gravity(0.9)), 800)
     rough = Ground.of(SIMULATION, measured).rough(())

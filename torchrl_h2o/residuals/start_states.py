@@ -105,8 +105,8 @@ class StartStates:
         """Returns the start states of at most ``most`` blocks, evenly spread, without the shortest windows."""
         some = slice(None, None, -(-len(self.blocks) // most))
         blocks = Blocks(self.blocks.first[some], self.blocks.steps, LENGTHS[-1:])
-        parts = (values[some] for values in (self.mean, self.covariance, self.about, self.slope))
-        return StartStates(self.record, blocks, self.noise, *parts, self.factors)
+        mean, covariance, about, slope = (part[some] for part in (self.mean, self.covariance, self.about, self.slope))
+        return StartStates(self.record, blocks, self.noise, mean, covariance, about, slope, self.factors)
 
     @property
     def of_rows(self) -> tuple[np.ndarray, np.ndarray]:
