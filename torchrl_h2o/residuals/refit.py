@@ -221,20 +221,16 @@ def slopes_of(
 ) -> Slopes:
     """Derivatives of the errors by the variables, (N, p) for each part; those by the first ones may be known."""
     columns: list[list[np.ndarray]] = [list(own.T) for own in known] if known is not None else [[] for _ in parts]
-    zero, unknown = np.zeros(len(variables)), range(len(columns[0]), len(variables))
-    quick = [part.quick for part in parts]
-    start = [
-        flat(error if one is part or not unknown else one.errors(effects))
-        for one, part, error in zip(quick, parts, errors, strict=True)
-    ]
-    for index in unknown:
+    zero = np.zeros(len(variables))
+    for index in range(len(columns[0]), len(variables)):
         low, high = variables[index].bounds
         step = STEP if high > STEP else -STEP
         if low > step:
             step = 0.0
         moved = zero.copy()
         moved[index] = step
-        for part, before, found in zip(quick, start, columns, strict=True):
+        for part, error, found in zip(parts, errors, columns, strict=True):
+            before = flat(error)
             try:
                 after = flat(part.errors(with_values(effects, variables, moved))) if step else before
             except ValueError:
