@@ -231,7 +231,7 @@ def test_a_search_goes_on_from_known_effects():
 def test_what_was_tried_and_not_put_in_is_listed_by_its_evidence():
     catalogue = [e for e in SIMULATION.catalogue() if isinstance(e.effect, Gravity | JointSpring | Armature)]
     tried = found(recorded(SIMULATION.with_effects(Gravity(1.3)), 800, noise=0.01), catalogue).tried
-    assert len(tried) > 1
+    assert tried
     evidence = [one.evidence for one in tried]
     assert evidence == sorted(evidence, reverse=True)
     assert not any(isinstance(one.effect, Gravity) for one in tried)
