@@ -108,10 +108,10 @@ def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_the
     less = ground.found((entry_of(friction, CATALOGUE),), (friction,))
     entries = [entry for entry in CATALOGUE if getattr(entry.effect, "joints", None) in ("shoulder", "elbow")]
     candidates = Candidates.of(ground, less, sweep(ground.rough(less.effects), entries, less.effects))
-    together = max(with_one_more(ground, less, candidates), key=lambda one: len(one.entries))
+    together = max(with_one_more(ground, candidates), key=lambda one: len(one.entries))
     refused = together.names - less.names
     assert len(refused) > 2
-    assert refused not in [one.names - less.names for one in with_one_more(ground, less, candidates, [refused])]
+    assert refused not in [one.names - less.names for one in with_one_more(ground, candidates, [refused])]
 
 
 def test_of_sets_that_explain_equally_well_the_one_of_all_joints_is_taken():
@@ -158,7 +158,7 @@ def test_a_force_outside_the_catalogue_stands_beside_its_effects():
 
 
 def test_a_delay_that_hardly_shows_beside_the_noise_is_found():
-    explanation = found(recorded(SIMULATION.with_effects(ActionDelay(0.013, (0,))), 1200, noise=0.01, seed=1))
+    explanation = found(recorded(SIMULATION.with_effects(ActionDelay(0.013, (0,))), 1200, noise=0.01))
     assert values(explanation.effects) == pytest.approx({("ActionDelay", None): 0.013}, rel=0.15)
 
 
@@ -189,9 +189,7 @@ def test_the_present_values_are_readjusted_to_a_candidate_before_it_is_simulated
     directions = sweep(ground.rough(less.effects), [e for e in CATALOGUE if e.name == "Gravity"], less.effects)
     candidates = Candidates.of(ground, less, directions)
     (lead,) = candidates.leads
-    moved, alone = (
-        lead.beside(less.entries, less.effects, 1.0, variables)[1] for variables in (candidates.variables, ())
-    )
+    moved, *_, alone = (effects for _, effects in candidates.sizes(lead))
     assert moved[0] != alone[0] == less.effects[0]
     assert candidates.rough.score(moved) > candidates.rough.score(alone)
 
@@ -230,8 +228,9 @@ def test_a_search_goes_on_from_known_effects():
 
 def test_what_was_tried_and_not_put_in_is_listed_by_its_evidence():
     catalogue = [e for e in SIMULATION.catalogue() if isinstance(e.effect, Gravity | JointSpring | Armature)]
-    tried = found(recorded(SIMULATION.with_effects(Gravity(1.3)), 800, noise=0.01), catalogue).tried
-    assert tried
+    real = SIMULATION.with_effects(Gravity(1.3), Armature(0.005, "elbow"))
+    tried = found(recorded(real, 800, noise=0.01, seed=1), catalogue).tried
+    assert len(tried) > 1
     evidence = [one.evidence for one in tried]
     assert evidence == sorted(evidence, reverse=True)
     assert not any(isinstance(one.effect, Gravity) for one in tried)
@@ -242,9 +241,13 @@ def test_the_p_value_of_what_was_tried_is_between_0_and_1(evidence, p_value):
     assert Tried(CATALOGUE[0], CATALOGUE[0].starts[0], evidence).p_value == pytest.approx(p_value, abs=0.01)
 
 
-def test_effects_of_a_size_that_no_row_shows_are_listed_where_nothing_is_found():
+DEAF = pytest.mark.xfail(strict=True, reason="damping is found, because start states are that uncertain")
+
+
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=DEAF), 1])
+def test_effects_of_a_size_that_no_row_shows_are_listed_where_nothing_is_found(seed):
     """Noise of a third of the motion hides dry friction of a usual size; without noise all effects would show."""
-    still = recorded(SIMULATION, 1200, noise=0.3, seed=1)
+    still = recorded(SIMULATION, 1200, noise=0.3, seed=seed)
     kinds = {type(effect) for effect in found(still).unseen}
     assert JointFrictionLoss in kinds
     assert not found(recorded(SIMULATION, 1200)).unseen

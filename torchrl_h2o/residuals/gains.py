@@ -11,17 +11,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchrl_h2o.effects import Armature, CatalogueEntry, Effect, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals.refit import (
-    FARTHEST,
-    REWEIGHTED,
-    RIDGE,
-    Variable,
-    block_of,
-    flat,
-    weights,
-    whitened,
-    with_values,
-)
+from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, flat, weights, whitened
 from torchrl_h2o.residuals.score import FEWEST, Difference, Predictions, fitted_scales
 from torchrl_h2o.residuals.start_states import log_density
 from torchrl_h2o.residuals.sweep import Direction
@@ -36,21 +26,19 @@ SLIGHT = 0.01  # gain of such a refinement, in nats a block, after which none fo
 LEAST_NATS = 2.0  # estimated gain of all blocks with which one of several joints or motors has an effect of its own
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Lead:
     """A candidate with its estimated gain: one effect, or the same effect on each of several joints or motors.
 
     Args:
         directions: the direction of each effect.
         shares: estimated share of each trial.
-        moves: estimated moves of the values of the present effects beside it, (p).
         gain: estimated gain of the score in nats a block, if the errors are linear in the effect.
         evidence: estimated evidence of the rows for the candidate.
     """
 
     directions: tuple[Direction, ...]
     shares: tuple[float, ...]
-    moves: np.ndarray
     gain: float
     evidence: float
 
@@ -69,7 +57,7 @@ class Lead:
         entries: Sequence[CatalogueEntry],
         effects: Sequence[Effect],
         factor: float,
-        variables: Sequence[Variable] = (),
+        readjusted: Sequence[Effect] | None = None,
     ) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
         """Present entries and effects with the candidate at a factor of its shares.
 
@@ -79,11 +67,10 @@ class Lead:
             entries: the present entries.
             effects: the present effects.
             factor: the factor.
-            variables: values of the present effects; they are readjusted to the candidate.
+            readjusted: the present effects with values readjusted to the candidate.
         """
         own = [direction.effect(factor * share) for direction, share in zip(self.directions, self.shares, strict=True)]
-        moves = np.clip(factor * self.moves, -FARTHEST, FARTHEST) if variables else np.zeros(0)
-        kept = list(zip(entries, with_values(effects, variables, moves), strict=True))
+        kept = list(zip(entries, effects if readjusted is None else readjusted, strict=True))
         if len(own) > 1:
             kinds = {type(one) for one in own}
             alone = {entry.name for entry in entries if entry.name in self.names}
@@ -303,11 +290,12 @@ class Gains:
 
     def _lead(self, directions: tuple[Direction, ...], shares: np.ndarray, change: np.ndarray) -> Lead:
         gains = self._gains(change)
-        moved = sum(share * one.change for one, share in zip(directions, shares, strict=True))
-        moves = self._readjust @ (moved * self.inverse)
-        return Lead(
-            directions, tuple(map(float, shares)), moves, float(gains.sum()) / self.num_blocks, self._evidence(gains)
-        )
+        return Lead(directions, tuple(map(float, shares)), float(gains.sum()) / self.num_blocks, self._evidence(gains))
+
+    def moves_beside(self, lead: Lead) -> np.ndarray:
+        """Estimated moves of the values of the present effects beside a candidate, (p)."""
+        change = sum(share * one.change for one, share in zip(lead.directions, lead.shares, strict=True))
+        return self._readjust @ (change * self.inverse)
 
     @cached_property
     def _present(self) -> np.ndarray:

@@ -246,8 +246,8 @@ class Ground:
     def adds(self, more: Found, less: Found, among: int = 1) -> bool:
         """Whether a set predicts better than a smaller one, by more than its surprise.
 
-        Rows for selection must show half of the evidence needed, and all rows must show all of it, and more where the
-        set is the best of many.
+        It must predict the rows for selection better, which chose none of its values, and all rows together must show
+        the evidence needed, and more where the set is the best of many.
 
         Noise of the logged commands moves the simulator and not the machine, and noise of the motion the machine alone.
         Over many steps an effect then predicts better that makes the simulator deaf to it, such as damping. Where there
@@ -257,7 +257,7 @@ class Ground:
         needed = self.needed(more, less)
         difference = more.scores - less.scores
         in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
-        if in_selection <= 0.5 * needed or in_all <= needed + math.log(among):
+        if in_selection <= 0.0 or in_all <= needed + math.log(among):
             return False
         least = min(needed, -math.log(self.level))
         return not less.is_noise or all(

@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
 from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground
-from torchrl_h2o.residuals.refit import Variable, slopes_of, variables_of
+from torchrl_h2o.residuals.refit import FARTHEST, Variable, slopes_of, variables_of, with_values
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
 
@@ -34,15 +34,17 @@ class Candidates:
 
     Args:
         rough: predictions from start states filtered with the set, on which candidates are fitted.
+        found: the set.
+        gains: gains beside the set.
         variables: values of the set.
-        slopes: derivatives of their errors by the values of the set, (N, p).
         leads: the best direction of each candidate, in descending order of the estimated gain.
         joints: friction, damping and rotors of all joints together.
     """
 
     rough: Predictions
+    found: Found
+    gains: Gains
     variables: Sequence[Variable]
-    slopes: np.ndarray
     leads: Sequence[Lead]
     joints: Lead | None
 
@@ -51,7 +53,21 @@ class Candidates:
         """The candidates beside a set."""
         rough = ground.rough(found.effects)
         gains, variables = gains_beside(rough, found), variables_of(rough, found.entries, found.effects)
-        return cls(rough, variables, gains.slopes, best_of_each(gains.leads(directions)), gains.of_joints(directions))
+        leads, joints = best_of_each(gains.leads(directions)), gains.of_joints(directions)
+        return cls(rough, found, gains, variables, leads, joints)
+
+    def sizes(self, lead: Lead) -> list[Set]:
+        """The set with a candidate at a few sizes, beside readjusted values and, at the first size, present ones."""
+        moves, present = self.gains.moves_beside(lead), (self.found.entries, self.found.effects)
+
+        def readjusted(factor: float) -> tuple[Effect, ...]:
+            limited = np.clip(factor * moves, -FARTHEST, FARTHEST)
+            return with_values(self.found.effects, self.variables, limited)
+
+        return [
+            *(lead.beside(*present, factor, readjusted(factor)) for factor in lead.factors),
+            lead.beside(*present, 1.0),
+        ]
 
 
 def grow(
@@ -74,7 +90,7 @@ def grow(
     among = max(1, len({one.entry.name for one in directions}))
     candidates = Candidates.of(ground, found, directions)
     while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
-        fitted = with_one_more(ground, found, candidates, refused)
+        fitted = with_one_more(ground, candidates, refused)
         if not fitted:
             break
         for one in fitted:
@@ -118,7 +134,7 @@ def with_force(
                 entries, effects = zip(*new, strict=True)
                 sets.append([((*found.entries, *entries), (*found.effects, *effects))])
         beside = Candidates.of(ground, found, ())
-        fitted = _sketched(ground, beside, _best_simulated(beside.rough, sets), found)
+        fitted = _sketched(ground, beside, _best_simulated(beside.rough, sets))
         better = [one for one in fitted if ground.adds(one, found, max(1, len(sets)))]
         if not better:
             break
@@ -130,48 +146,35 @@ def with_force(
 
 def with_one_more(
     ground: Ground,
-    found: Found,
     candidates: Candidates,
     passed_over: Collection[frozenset[str]] = (),
-    rival: Found | None = None,
+    rival: str | None = None,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps.
 
     Args:
         ground: where sets are compared.
-        found: the set.
-        candidates: the candidates beside it.
+        candidates: the candidates beside the set.
         passed_over: names of the entries of candidates that are not tried.
-        rival: a larger set; only candidates are tried that are estimated to gain a quarter as much.
+        rival: name of an entry; others are tried in its place if they are estimated to gain a quarter as much.
     """
-    rough, joints = candidates.rough, candidates.joints
+    rough, found, joints = candidates.rough, candidates.found, candidates.joints
     least = -0.5 * math.log(ground.level) * len(rough.blocks) / len(ground.base.fit.blocks)
     leads = [
         lead
         for lead in candidates.leads
-        if lead.names - found.names not in passed_over and not lead.names <= found.names and lead.evidence > least
+        if lead.names - found.names not in {frozenset({rival}), *passed_over}
+        and not lead.names <= found.names
+        and lead.evidence > least
     ]
     if rival is not None:
-        quarter = 0.25 * (rough.score(rival.effects) - rough.score(found.effects))
-        leads = [lead for lead in leads if lead.gain > quarter]
+        gain = max((lead.gain for lead in candidates.leads if lead.names == {rival}), default=0.0)
+        leads = [lead for lead in leads if lead.gain > 0.25 * gain]
     is_new = joints is not None and joints.names - found.names not in {frozenset(), *passed_over}
-    if rival is not None or joints is None or not is_new or joints.evidence <= least:
-        joints = None
-    else:
-        leads = [lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names]
-    sets = [
-        [
-            *(lead.beside(found.entries, found.effects, factor, candidates.variables) for factor in lead.factors),
-            lead.beside(found.entries, found.effects, 1.0),
-        ]
-        for lead in leads[:TRIED]
-    ]
-    if joints is not None:
-        sets.append(
-            [joints.beside(found.entries, found.effects, factor, candidates.variables) for factor in (1.0, 0.5)]
-        )
-    best = _best_simulated(rough, sets)
-    return [one for one in _sketched(ground, candidates, best, found) if _is_usable(ground, one, found)]
+    if rival is None and joints and is_new and joints.evidence > least:
+        leads = [joints, *(lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names)]
+    best = _best_simulated(rough, [candidates.sizes(lead) for lead in leads[:TRIED]])
+    return [one for one in _sketched(ground, candidates, best) if _is_usable(ground, one, found)]
 
 
 def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> list[Set]:
@@ -196,14 +199,14 @@ def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
         return -math.inf
 
 
-def _sketched(ground: Ground, candidates: Candidates, sets: Sequence[Set], present: Found) -> list[Found]:
+def _sketched(ground: Ground, candidates: Candidates, sets: Sequence[Set]) -> list[Found]:
     """Sets with their values fitted in a few steps, without those that the model rejects.
 
-    The derivatives by the values of a present set are known where a set begins with its effects.
+    The derivatives by the values of the present set are known where a set begins with its entries.
     """
-    found = []
+    found, present = [], candidates.found
     for entries, effects in sets:
-        known = candidates.slopes if entries[: len(present.entries)] == present.entries else None
+        known = candidates.gains.slopes if entries[: len(present.entries)] == present.entries else None
         steps = GROWN if len(effects) > len(present.effects) + FEW else SKETCH
         try:
             found.append(replace(ground.sketched(candidates.rough, entries, effects, steps, known), slopes=None))

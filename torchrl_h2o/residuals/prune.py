@@ -114,7 +114,7 @@ def replaced(
             continue
         fewer = ground.found(*found.without({entry.name}))
         candidates = Candidates.of(ground, fewer, directions)
-        sketched = with_one_more(ground, fewer, candidates, [frozenset({entry.name})], rival=found)
+        sketched = with_one_more(ground, candidates, rival=entry.name)
         half = 0.5 * (found.scores - fewer.scores).mean()
         fitted = [
             ground.fitted(one.entries, one.effects) for one in sketched if (one.scores - fewer.scores).mean() > half

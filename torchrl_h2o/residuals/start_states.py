@@ -86,18 +86,18 @@ class StartStates:
                 factors of the noise. Explanations are compared with the same factors, because a change of the noise
                 changes the scores of all blocks alike, as a better explanation does.
         """
-        if similar is not None:
-            steps, factors = _Steps.of(record, blocks, similar.about, similar.slope), similar.factors
+
+        def filtered(steps: _Steps) -> tuple[Noise, np.ndarray, np.ndarray, np.ndarray]:
+            factors = USUAL_FACTORS if noise else steps.fitted_factors() if similar is None else similar.factors
             own = noise or steps.noise(factors)
             (mean,), (covariance,), _ = steps.filtered([own])
-        else:
-            steps, factors = _Steps.of(record, blocks), USUAL_FACTORS
-            for relinearised in range(LINEARISED):
-                if relinearised:
-                    steps = _Steps.of(record, blocks, mean)
-                factors = factors if noise else steps.fitted_factors()
-                own = noise or steps.noise(factors)
-                (mean,), (covariance,), _ = steps.filtered([own])
+            return own, factors, mean, covariance
+
+        steps = _Steps.of(record, blocks, *(() if similar is None else (similar.about, similar.slope)))
+        own, factors, mean, covariance = filtered(steps)
+        for _ in range(LINEARISED - 1 if similar is None else 0):
+            steps = _Steps.of(record, blocks, mean)
+            own, factors, mean, covariance = filtered(steps)
         before = _rows_before(blocks)
         return cls(record, blocks, own, mean[:, before:], covariance[:, before:], steps.about, steps.slope, factors)
 

@@ -17,7 +17,6 @@ from torchrl_h2o.effects import (
     CatalogueEntry,
     Effect,
     JointRange,
-    LinkLength,
     ObservationDelay,
 )
 from torchrl_h2o.residuals.elements import elements
@@ -27,17 +26,9 @@ from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 #: effects that act otherwise at each size, so that every trial is simulated
-NOT_LINEAR = (
-    ActionBacklash,
-    ActionDeadBand,
-    ActionDelay,
-    ActionLag,
-    ActionSaturation,
-    JointRange,
-    LinkLength,
-    ObservationDelay,
-)
+NOT_LINEAR = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay)
 SMOOTH = (ActionDelay, ActionLag, ObservationDelay)  # of these, those whose errors are linear in a small size
+FAR = 2.0  # factor beyond which a trial is simulated for itself, because the errors are not linear that far
 LEAST_FACTOR = 0.1  # least factor that a share of a trial stands for, if the trial is above it
 MOST_SHARE = 4.0  # largest move along a candidate's direction, in moves of its trial
 
@@ -142,14 +133,15 @@ def _alone(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tu
 
 
 def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
-    """The trials to simulate, larger ones first: one along each line through the neutral values, or, where the errors
-    are not linear in the size, all. The least of three lags or delays is left out, because small ones are linear."""
+    """The trials to simulate, larger ones first: one along each line through the neutral values and each far factor,
+    or, where the errors are not linear in the size, all. The least of three lags or delays is left out, because small
+    ones are linear."""
     neutral = {name: parameter.neutral for name, parameter in entry.effect.parameters.items()}
     by_size: list[Mapping[str, float]] = sorted(entry.trials, key=lambda trial: -_size(entry, trial))
     if isinstance(entry.effect, NOT_LINEAR):
         return by_size[:-1] if isinstance(entry.effect, SMOOTH) and len(by_size) > 2 else by_size
     if len(entry.fitted) == 1 and neutral[entry.fitted[0]] == 1.0:
-        return by_size[-1:]
+        return [*(trial for trial in by_size[:-1] if _is_far(entry, trial)), by_size[-1]]
     lines = {}
     for trial in entry.trials:
         moves = np.array([value - neutral[name] for name, value in trial.items()])
@@ -167,6 +159,12 @@ def _size(entry: CatalogueEntry, trial: Mapping[str, float]) -> float:
     if not math.isfinite(neutral):
         return 1.0 / max(abs(value), 1e-300)
     return abs(math.log(value)) if neutral == 1.0 and value > 0.0 else abs(value - neutral)
+
+
+def _is_far(entry: CatalogueEntry, trial: Mapping[str, float]) -> bool:
+    """Whether a trial is a factor beyond ``FAR``."""
+    neutrals = [entry.effect.parameters[name].neutral for name in trial]
+    return neutrals == [1.0] and _size(entry, trial) > math.log(FAR) + 1e-9
 
 
 def _side(entry: CatalogueEntry, trial: Mapping[str, float]) -> tuple[bool, ...]:
@@ -200,9 +198,7 @@ def _shares(
     entry: CatalogueEntry, trial: Mapping[str, float], simulation: Simulation, beside: Sequence[Effect]
 ) -> tuple[float, float]:
     """Shares of a trial at which the errors are about linear and the model accepts the effect."""
-    if isinstance(entry.effect, LinkLength) and _size(entry, trial) == min(_size(entry, one) for one in entry.trials):
-        return -MOST_SHARE, MOST_SHARE
-    if isinstance(entry.effect, NOT_LINEAR):
+    if isinstance(entry.effect, NOT_LINEAR) or _is_far(entry, trial):
         return 0.0, 1.5
     least = lowest_value(entry.effect, simulation.model, beside)
     if not math.isfinite(least):

@@ -115,8 +115,8 @@ def test_every_draw_of_a_search_explains_the_data():
     """Half the mass with half the torque is the same motion, so an alternative needs another damping beside it."""
     gap = DynamicsGap(ActionGain(0.7), JointDamping(0.5))
     env = TransformedEnv(GymEnv("InvertedPendulum-v5"), gap)
-    env.set_seed(1)
-    torch.manual_seed(1)
+    env.set_seed(0)
+    torch.manual_seed(0)
     measured = env.rollout(800, break_when_any_done=False)
     simulation = Simulation.from_env(GymEnv("InvertedPendulum-v5"))
     tried = (ActionGain, JointDamping, BodyMass)
