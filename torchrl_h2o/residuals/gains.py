@@ -23,6 +23,8 @@ RESCALED = np.logspace(-3.0, 3.0, 7)  # factors that are tried on the variance o
 GROUPS = 4  # groups of errors, each of which suggests a share of a candidate
 REFINED = 4  # refinements of the share of one candidate
 SLIGHT = 0.01  # gain of such a refinement, in nats a block, after which none follows
+PAIRED = 24  # candidates of which two are tried together
+LEAST_REST = 0.02  # share of the errors' change by a candidate that another one must leave, for both to be told apart
 LEAST_NATS = 2.0  # estimated gain of all blocks with which one of several joints or motors has an effect of its own
 
 
@@ -176,6 +178,33 @@ class Gains:
         shares, _ = self._solved(chosen, columns)
         shares = np.where(np.abs(shares) < START_SHARE, START_SHARE, shares)
         return self._lead(tuple(chosen), shares, np.stack(columns, axis=1) @ shares)
+
+    def pairs(self, leads: Sequence[Lead]) -> list[Lead]:
+        """Two candidates together, in descending order of their gain, if each adds to what the other one gains.
+
+        Each of two effects may explain nothing without the other, or less than a third effect that stands for both.
+
+        Args:
+            leads: candidates of one direction, in descending order of their gain.
+        """
+        chosen = [lead for lead in leads if len(lead.directions) == 1][:PAIRED]
+        directions = [lead.directions[0] for lead in chosen]
+        matrix = np.stack(self._free_of_present(directions), axis=1) if chosen else np.zeros((len(self.white), 0))
+        weighted = self.weight[:, None] * matrix
+        gram, pull = weighted.T @ matrix, weighted.T @ self.white
+        square = np.maximum(np.diag(gram), 1e-300)
+        first, second = np.triu_indices(len(chosen), 1)
+        rest = 1.0 - gram[first, second] ** 2 / (square[first] * square[second])  # of one beside the other
+        beside = pull[second] - pull[first] * gram[first, second] / square[first]
+        gains = pull[first] ** 2 / square[first] + beside**2 / (square[second] * np.maximum(rest, 1e-300))
+        gains[rest < LEAST_REST] = -math.inf
+        best = np.argsort(-gains)[: 2 * PAIRED]
+        found = []
+        for i, j in ((first[k], second[k]) for k in best if gains[k] > 0.0):
+            lead = self._together([directions[i], directions[j]], [matrix[:, i], matrix[:, j]])
+            if lead is not None and lead.gain > max(chosen[i].gain, chosen[j].gain):
+                found.append(lead)
+        return sorted(found, key=lambda lead: -lead.gain)
 
     def evidence_if_there(self, direction: Direction) -> float:
         """Evidence of the rows for an effect if it were there at its trial beside the present errors."""

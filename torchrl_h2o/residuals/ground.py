@@ -20,7 +20,7 @@ from torchrl_h2o.residuals.start_states import ROUNDING
 
 ROUGH_WORK = 24_000  # physics steps times degrees of freedom that are simulated for each candidate of a sweep
 ROUGH_ROWS = 1024  # rows beyond which these are not more, unless that suffices for all
-FITTED = 3  # of these, the best whose values are fitted
+FITTED = 3  # candidates whose values are fitted
 SKETCH = 3  # steps of such a fit
 GROWN = 5  # steps of the fit of a set after an effect was added
 REFITTED = 3  # fits of a set, each from the start states that the fit before gives
@@ -54,7 +54,7 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
-        one_step: scores of the blocks for selection one step ahead, (S), and those with noisy logged commands.
+        one_step: scores of the blocks one step ahead, (F + S), and those with noisy logged commands.
         is_noise: whether these errors are noise of the motion or of the logged commands.
         slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """

@@ -14,12 +14,14 @@ from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
 from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground
-from torchrl_h2o.residuals.refit import FARTHEST, Variable, slopes_of, variables_of, with_values
+from torchrl_h2o.residuals.refit import FARTHEST, Variable, fit_set, slopes_of, variables_of, with_values
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
 
 TRIED = 16  # candidates of the largest estimated gain whose gain is then simulated
+BEGUN = 8  # of these, the best that are fitted in one step
 ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
+RENEWED = 8  # values by which derivatives are computed again beside a candidate
 MOST_REFUSED = 9  # candidates that are refused one after another before none is added
 FEW = 2  # effects that are added together as if they were one
 MOST_TERMS = 6  # largest number of terms of a force outside the catalogue
@@ -89,13 +91,15 @@ def grow(
     refused: set[frozenset[str]] = set()
     among = max(1, len({one.entry.name for one in directions}))
     candidates = Candidates.of(ground, found, directions)
-    while len(found.entries) < MOST_EFFECTS and len(refused) < MOST_REFUSED:
-        fitted = with_one_more(ground, candidates, refused)
-        if not fitted:
-            break
+    while len(found.entries) < MOST_EFFECTS:
+        singly = len(refused) < MOST_REFUSED
+        fitted = with_one_more(ground, candidates, refused) if singly else []
+        if not fitted:  # no candidate suffices by itself
+            singly = False
+            fitted = with_one_more(ground, candidates, pairs=True)
         for one in fitted:
             _remember(tried, one, found)
-        better = [one for one in fitted if ground.adds(one, found, 1 if _is_many(one, found) else among)]
+        better = [one for one in fitted if ground.adds(one, found, _choices(among, one, found))]
         if better:
             best = most_usual(better)
             before, found, refused = found, ground.fitted(best.entries, best.effects), set()
@@ -103,9 +107,16 @@ def grow(
             if _is_many(best, before) or ground.leaves_little(found):  # many change how candidates change the errors
                 break
             candidates = Candidates.of(ground, found, directions)
-        else:
+        elif singly:
             refused |= {one.names - found.names for one in fitted}
+        else:
+            break
     return found
+
+
+def _choices(among: int, more: Found, less: Found) -> int:
+    """Number of sets of which a larger one is the best: pairs of candidates, or candidates."""
+    return 1 if _is_many(more, less) else among ** len(more.names - less.names)
 
 
 def _is_many(more: Found, less: Found) -> bool:
@@ -149,6 +160,7 @@ def with_one_more(
     candidates: Candidates,
     passed_over: Collection[frozenset[str]] = (),
     rival: str | None = None,
+    pairs: bool = False,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps.
 
@@ -157,6 +169,7 @@ def with_one_more(
         candidates: the candidates beside the set.
         passed_over: names of the entries of candidates that are not tried.
         rival: name of an entry; others are tried in its place if they are estimated to gain a quarter as much.
+        pairs: whether to try two candidates together.
     """
     rough, found, joints = candidates.rough, candidates.found, candidates.joints
     least = -0.5 * math.log(ground.level) * len(rough.blocks) / len(ground.base.fit.blocks)
@@ -167,28 +180,38 @@ def with_one_more(
         and not lead.names <= found.names
         and lead.evidence > least
     ]
-    if rival is not None:
+    if pairs:
+        leads = candidates.gains.pairs([lead for lead in leads if not _kinds(lead) & _kinds_of(found)])
+    elif rival is not None:
         gain = max((lead.gain for lead in candidates.leads if lead.names == {rival}), default=0.0)
         leads = [lead for lead in leads if lead.gain > 0.25 * gain]
     is_new = joints is not None and joints.names - found.names not in {frozenset(), *passed_over}
-    if rival is None and joints and is_new and joints.evidence > least:
+    if rival is None and not pairs and joints and is_new and joints.evidence > least:
         leads = [joints, *(lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names)]
     best = _best_simulated(rough, [candidates.sizes(lead) for lead in leads[:TRIED]])
     return [one for one in _sketched(ground, candidates, best) if _is_usable(ground, one, found)]
 
 
+def _kinds(lead: Lead) -> set[type]:
+    return {type(direction.entry.effect) for direction in lead.directions}
+
+
+def _kinds_of(found: Found) -> set[type]:
+    return {type(effect) for effect in found.effects}
+
+
 def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> list[Set]:
-    """The sets of the few best candidates by their score, each at the best of its sizes.
+    """The sets of the best candidates by their score, each at the best of its sizes.
 
     Other sizes than the first are simulated of those candidates alone that are among the best at it.
     """
     scored = [(_score(rough, sizes[0][1]), sizes[0], sizes[1:]) for sizes in candidates]
     scored.sort(key=lambda one: -one[0])
-    for index, (score, first, others) in enumerate(scored[: 2 * FITTED]):
+    for index, (score, first, others) in enumerate(scored[:BEGUN]):
         sizes = [(score, first), *((_score(rough, size[1]), size) for size in others)]
         scored[index] = (*max(sizes, key=lambda one: one[0]), ())
     scored.sort(key=lambda one: -one[0])
-    return [one for score, one, _ in scored[:FITTED] if score > -math.inf]
+    return [one for score, one, _ in scored[:BEGUN] if score > -math.inf]
 
 
 def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
@@ -200,18 +223,24 @@ def _score(rough: Predictions, effects: Sequence[Effect]) -> float:
 
 
 def _sketched(ground: Ground, candidates: Candidates, sets: Sequence[Set]) -> list[Found]:
-    """Sets with their values fitted in a few steps, without those that the model rejects.
+    """The few best sets after one step of a fit, with their values fitted in a few more.
 
-    The derivatives by the values of the present set are known where a set begins with its entries.
+    Sets that the model rejects are left out. The derivatives by many values of the present set are not computed again
+    where a set begins with its entries.
     """
-    found, present = [], candidates.found
+    rough, present, begun = candidates.rough, candidates.found, []
     for entries, effects in sets:
-        known = candidates.gains.slopes if entries[: len(present.entries)] == present.entries else None
-        steps = GROWN if len(effects) > len(present.effects) + FEW else SKETCH
+        is_known = len(candidates.variables) > RENEWED and entries[: len(present.entries)] == present.entries
+        known = [candidates.gains.slopes] if is_known else None
         try:
-            found.append(replace(ground.sketched(candidates.rough, entries, effects, steps, known), slopes=None))
+            begun.append((fit_set([rough], entries, effects, most_steps=1, slopes=known), entries))
         except ValueError:
             continue
+    begun.sort(key=lambda one: -one[0].score)
+    found = []
+    for fit, entries in begun[:FITTED]:
+        steps = GROWN if len(entries) > len(present.entries) + FEW else SKETCH
+        found.append(replace(ground.sketched(rough, entries, fit.effects, steps - 1, fit.slopes[0]), slopes=None))
     return found
 
 

@@ -115,14 +115,21 @@ def replaced(
         fewer = ground.found(*found.without({entry.name}))
         candidates = Candidates.of(ground, fewer, directions)
         sketched = with_one_more(ground, candidates, rival=entry.name)
+        sketched += with_one_more(ground, candidates, [frozenset({entry.name})], pairs=True)
         half = 0.5 * (found.scores - fewer.scores).mean()
         fitted = [
             ground.fitted(one.entries, one.effects) for one in sketched if (one.scores - fewer.scores).mean() > half
         ]
         others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
-        better = [one for one in others if is_preferred(one, found)]
+        better = [one for one in others if is_preferred(one, found) and _is_worth_it(ground, one, found, directions)]
         if better and swaps < SWAPS:
             found, alike, swaps = most_usual(better), [], swaps + 1
         else:
             alike.append(sorted(others, key=lambda one: -one.scores.mean()))
     return found, alike
+
+
+def _is_worth_it(ground: Ground, other: Found, found: Found, directions: Sequence[Direction]) -> bool:
+    """Whether a set with more effects predicts better by what the best of many needs; others need not."""
+    added = len(other.entries) - len(found.entries)
+    return added <= 0 or ground.adds(other, found, len({one.entry.name for one in directions}) ** (added + 1))

@@ -81,6 +81,12 @@ class Record:
         return {index: pairs[index] for index in state_map.hidden if index in pairs and observed[pairs[index]]}
 
     @cached_property
+    def settled(self) -> np.ndarray:
+        """Whether a coordinate is one that a simulation along the data reaches, such as the depth of a contact, (m)."""
+        hidden = [index not in self.positions_of_velocities for index in self.simulation.state_map.hidden]
+        return np.array([False] * self.num_readings + hidden)
+
+    @cached_property
     def states(self) -> tuple[np.ndarray, np.ndarray]:
         """States before and after each step, each (T, nq + nv).
 

@@ -85,11 +85,13 @@ class SetFit:
         effects: the effects with their fitted values.
         half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
         slopes: derivatives of the errors by the values, (N, p) for each part.
+        score: mean score of the blocks, in nats.
     """
 
     effects: tuple[Effect, ...]
     half_widths: tuple[dict[str, float], ...]
     slopes: Slopes
+    score: float
 
 
 def variables_of(
@@ -178,7 +180,7 @@ def fit_set(
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
         for variable, half in zip(variables, _half_widths(parts, weighted, slopes), strict=True):
             widths[variable.effect][variable.name] = half * abs(variable.slope(0.0))
-    return SetFit(effects, widths, slopes)
+    return SetFit(effects, widths, slopes, float(by_block.mean()))
 
 
 def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:

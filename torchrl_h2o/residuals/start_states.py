@@ -242,7 +242,8 @@ class _Steps:
         begin = np.pad(sensor, ((0, 0), (0, 0), (0, m - n), (0, m - n))) + np.diag(np.arange(m) >= n)
         mean, covariance = np.zeros((len(noises), *live.shape, m)), np.zeros((len(noises), *live.shape, m, m))
         x, doubt = np.zeros((len(noises), len(live), m)), np.repeat(begin, len(live), axis=1)
-        density = np.zeros(len(noises))
+        density, most = np.zeros(len(noises)), np.where(np.arange(m) < n, MOST_DOUBT, 1.0)
+        follows = ~self.record.settled
         for row in range(live.shape[1]):
             mean[:, :, row], covariance[:, :, row] = x, doubt
             guess = (slope[:, row] @ x[..., None])[..., 0] + miss[:, row]
@@ -254,7 +255,8 @@ class _Steps:
             density += (log_density(white).sum(-1) - log_det).sum(-1, where=valid)
             # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
             trust = np.where(known[:, row], np.where(square > SURPRISE, square, 1.0), 1.0 / ROUNDING**2)
-            doubt = _bounded(doubt * trust[..., None, None], MOST_DOUBT)
+            inflated = np.where(follows, np.sqrt(trust)[..., None], 1.0)
+            doubt = _bounded(doubt * inflated[..., :, None] * inflated[..., None, :], most)
             gain = np.linalg.solve(doubt[..., :n, :n] + sensor, doubt[..., :n, :]).swapaxes(-1, -2)
             x = guess - (gain @ guess[..., :n, None])[..., 0]
             left = np.eye(m) - np.pad(gain, ((0, 0), (0, 0), (0, 0), (0, m - n)))
@@ -273,7 +275,7 @@ def _highest(values: np.ndarray) -> np.ndarray:
     return np.clip(-np.linalg.solve([[pp, pq], [pq, qq]], [p, q]), -1.0, 1.0)
 
 
-def _bounded(doubt: np.ndarray, most: float) -> np.ndarray:
+def _bounded(doubt: np.ndarray, most: np.ndarray | float) -> np.ndarray:
     """Covariances (..., m, m) with variances of at most ``most`` and the same correlations."""
     shrink = np.sqrt(np.minimum(1.0, most / np.maximum(np.einsum("...ii->...i", doubt), 1e-300)))
     return doubt * shrink[..., :, None] * shrink[..., None, :]

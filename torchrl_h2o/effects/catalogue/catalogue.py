@@ -119,8 +119,8 @@ def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]
 
         return of
 
-    def times(parameter: str) -> Callable[[tuple[int, ...]], Trials]:
-        return lambda actuators: each(parameter, 0.3 * dt, dt, 2.0 * dt)
+    def times(parameter: str, *steps: float) -> Callable[[tuple[int, ...]], Trials]:
+        return lambda actuators: each(parameter, *(step * dt for step in steps))
 
     single_and_all = indexed_choices(labels)
     singles = {chosen: indices for chosen, indices in single_and_all.items() if len(indices) == 1}
@@ -134,8 +134,8 @@ def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]
     yield from entries_of(ActionDeadBand, "actuators", single_and_all, shares("width", 0.03, 0.15))
     yield from entries_of(ActionSaturation, "actuators", single_and_all, shares("limit", 0.4, 0.8))
     yield from entries_of(ActionBacklash, "actuators", single_and_all, shares("width", 0.1, 0.4))
-    yield from entries_of(ActionLag, "actuators", single_and_all, times("time_constant"))
-    yield from entries_of(ActionDelay, "actuators", single_and_all, times("delay"))
+    yield from entries_of(ActionLag, "actuators", single_and_all, times("time_constant", 0.3, 1.0, 2.0))
+    yield from entries_of(ActionDelay, "actuators", single_and_all, times("delay", 0.3, 1.0, 2.0, 3.0))
     yield from entries_of(ActionNoise, "actuators", indexed_choices(labels, singles=False), shares("std", 0.1, 0.5))
 
 
