@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
+from torchrl_h2o.effects import ActionBias, CatalogueEntry, Effect, JointForce, ObservationBias, ResidualForce
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.residuals.command_noise import expected_commands
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -29,12 +29,13 @@ MATTERS = 0.03  # share of the errors of the simulator without effects, below wh
 NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
+OWN = (ResidualForce, JointForce, ActionBias, ObservationBias)  # effects of which joints do not resemble each other
 SURPRISE_OF_FORCE = 3  # surprise of a term of a force outside the catalogue
 
 
 def kind_of(effect: Effect) -> Hashable:
-    """What effects on several joints have in common; a term of a force has nothing in common with others."""
-    return effect if isinstance(effect, ResidualForce) else type(effect)
+    """What effects on several joints have in common; a force or an offset has nothing in common with others."""
+    return effect if isinstance(effect, OWN) else type(effect)
 
 
 def surprise_of(effects: Iterable[Effect]) -> int:

@@ -13,7 +13,7 @@ from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
-from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground
+from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground, kind_of
 from torchrl_h2o.residuals.refit import FARTHEST, Variable, fit_set, slopes_of, variables_of, with_values
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.sweep import Direction
@@ -115,8 +115,9 @@ def grow(
 
 
 def _choices(among: int, more: Found, less: Found) -> int:
-    """Number of sets of which a larger one is the best: pairs of candidates, or candidates."""
-    return 1 if _is_many(more, less) else among ** len(more.names - less.names)
+    """Number of sets of which a larger one is the best: 1 for what each of several joints has."""
+    added = more.without(less.names)[1]
+    return among ** len(added) if len({*map(kind_of, added)}) == len(added) else 1
 
 
 def _is_many(more: Found, less: Found) -> bool:
