@@ -22,6 +22,7 @@ from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.refit import fit_set, slopes_of, variables_of
 from torchrl_h2o.residuals.score import Difference, Model, Predictions
 from torchrl_h2o.residuals.search import search
+from torchrl_h2o.residuals.start_states import Noise
 
 TRUTH = JointFrictionLoss(0.1)
 CATALOGUE = (
@@ -84,6 +85,20 @@ def test_noise_is_not_taken_for_an_error_of_the_simulator_because_steps_are_line
     once = Model.of(double_pendulum(), measured)
     assert twice.scores().mean() > once.scores().mean() + 0.3
     assert (twice.fit.starts.noise.step < 0.5 * once.fit.starts.noise.step).all()
+
+
+def test_a_reading_that_surprises_moves_no_coordinate_that_is_simulated_and_not_measured():
+    """The depth of a contact must not explain what a wrong set of effects leaves."""
+    simulation = Simulation.from_env(WheelLeggedEnv())
+    data = record(WheelLeggedEnv(), noisy_balance_controller(), 500, seed=0, progress=False)
+    doubts = []
+    for error in (0.0, 0.05):
+        measured = Measured.from_ted(data, simulation)
+        measured.observation[5:300:10, 1] += error
+        measured.following[4:299:10, 1] += error
+        starts = Model.of(simulation, measured, Noise(np.full(4, 1e-6), np.full(7, 1e-4))).fit.starts
+        doubts.append(np.einsum("brii->bri", starts.covariance)[..., starts.record.settled].max())
+    assert doubts[1] == pytest.approx(doubts[0], rel=0.1)
 
 
 def test_an_effect_too_many_predicts_no_better(measured):

@@ -16,6 +16,7 @@ from torchrl_h2o.effects import (
     BodyMass,
     Gravity,
     JointDamping,
+    JointForce,
     JointFrictionLoss,
     JointSpring,
     ResidualForce,
@@ -23,12 +24,13 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.explanation import Tried
+from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.refit import flat
 from torchrl_h2o.residuals.search import known_set, with_intervals
-from torchrl_h2o.residuals.sweep import sweep
+from torchrl_h2o.residuals.sweep import Direction, sweep
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -205,6 +207,23 @@ def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():
     assert lead.gain == pytest.approx(rough.score([gravity]) - rough.score(), rel=0.1)
 
 
+def test_two_candidates_are_tried_together_that_explain_little_one_by_one():
+    rng, size = np.random.default_rng(0), 400
+    common, apart, other = rng.standard_normal((3, size))
+    changes = {"Gravity": common + 0.3 * apart, "BodyMass lower": common - 0.3 * apart, "BodyMass upper": other}
+    trials = {entry.name: entry for entry in SIMULATION.catalogue()}
+    directions = [Direction(trials[name], trials[name].trials[-1], change) for name, change in changes.items()]
+    block, group = np.repeat(np.arange(20), size // 20), np.zeros(size, int)
+    ones, none = np.ones(size), np.zeros((size, 0))
+    gains = Gains(changes["BodyMass lower"] - changes["Gravity"] + 0.3 * other, ones, ones, none, block, group, ones)
+    leads = gains.leads(directions)
+    best, *_ = gains.pairs(leads)
+    assert leads[0].names == {"BodyMass upper"}
+    assert best.names == {"Gravity", "BodyMass lower"}
+    assert best.gain > 2.0 * leads[0].gain
+    assert best.shares == pytest.approx((1.0, -1.0), abs=0.2) or best.shares == pytest.approx((-1.0, 1.0), abs=0.2)
+
+
 def test_the_present_values_are_readjusted_to_a_candidate_before_it_is_simulated():
     """Damping that was fitted in the place of a gravity is too large beside this gravity."""
     measured = recorded(SIMULATION.with_effects(Gravity(0.7), JointDamping(0.02, "elbow")), 1200, noise=0.001)
@@ -280,5 +299,7 @@ def test_effects_of_a_size_that_no_row_shows_are_listed_where_nothing_is_found(s
 def test_the_most_unusual_of_a_kind_counts_and_each_term_of_a_force():
     assert surprise_of([JointFrictionLoss(0.1, "shoulder"), ActionBias(0.1)]) == 0
     assert surprise_of([BodyMass(1.1, "upper"), BodyMass(1.2, "lower")]) == surprise_of([BodyMass(1.1, "upper")]) == 1
+    one, two = (JointForce(0.1, "shoulder"),), (JointForce(0.1, "shoulder"), JointForce(0.2, "elbow"))
+    assert surprise_of(two) == 2 * surprise_of(one)  # joints have friction in common, but not forces
     one, two = (ResidualForce(("torque on elbow: 0.1 · t",) * n) for n in (1, 2))
     assert 0 < surprise_of([one]) < surprise_of([two])

@@ -79,7 +79,7 @@ def grow(
     advance: Callable[[Found, Found], object],
     tried: dict[str, Tried],
 ) -> Found:
-    """Adds candidates one after another while the rows for selection are predicted better.
+    """Adds candidates, or two together, while the rows are predicted better; see :meth:`Ground.adds`.
 
     Args:
         ground: where sets are compared.
@@ -135,7 +135,7 @@ def _remember(tried: dict[str, Tried], more: Found, less: Found) -> None:
 def with_force(
     ground: Ground, found: Found, catalogue: Sequence[CatalogueEntry], advance: Callable[[Found, Found], object]
 ) -> Found:
-    """Adds terms of a force outside the catalogue while the rows for selection are predicted better."""
+    """Adds terms of a force outside the catalogue while the rows are predicted better; see :meth:`Ground.adds`."""
     for _ in range(MOST_TERMS):
         starts = ground.model(found.effects).fit.starts
         rows, states = starts.of_rows

@@ -19,7 +19,7 @@ SWAPS = 4  # largest number of effects that are replaced by others
 
 
 def prune(ground: Ground, found: Found) -> Found:
-    """Drops effects without which the rows for selection are predicted as well, the least needed ones first."""
+    """Drops effects without which the rows are predicted as well, the least needed ones first."""
     before, kept = found, set[str]()
     pairs = zip(found.entries, found.effects, strict=True)
     if idle := {entry.name for entry, effect in pairs if is_negligible(effect, entry.trials)}:
@@ -47,7 +47,7 @@ def prune(ground: Ground, found: Found) -> Found:
 
 
 def _without_needless_kinds(ground: Ground, found: Found) -> Found:
-    """Drops an effect on all of its joints or motors if the rows for selection are predicted as well without it."""
+    """Drops an effect on all of its joints or motors if the rows are predicted as well without it."""
     for kind in dict.fromkeys(map(kind_of, found.effects)):
         same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if kind_of(effect) == kind}
         if len(same) > 1:
