@@ -37,8 +37,8 @@ SWEEPS = 6  # largest number of sweeps
 def stop_test(level: float) -> str:
     """Description of the test by which the search for effects stops."""
     return (
-        "log density of the rows, predicted 1, 2, 4, ... rows ahead: a further effect must raise it, paired over blocks of "
-        f"rows, by a likelihood ratio of {1.0 / level:.0f}, more if it is unusual, and also in the rows that no fit of it used"
+        "log density of the rows, predicted 1, 2, 4, ... rows ahead: paired over blocks of rows, a further effect must "
+        f"raise it by a likelihood ratio of {1.0 / level:.0f}, more if it is unusual, also in rows not used for its fit"
     )
 
 
