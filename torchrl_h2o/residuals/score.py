@@ -307,7 +307,7 @@ class Model:
         return self._scored(tuple(effects))[0]
 
     def one_step_ahead(self, effects: Sequence[Effect] = ()) -> tuple[np.ndarray, bool]:
-        """Scores of the blocks one step ahead, (F + S), and whether these errors are noise of the motion.
+        """Score of the blocks for selection one step ahead, (S), and whether these errors are noise of the motion.
 
         They are if they are larger than the sensors' noise, and independent in successive rows.
         """
@@ -318,12 +318,10 @@ class Model:
             errors, ahead = self.fit.errors(effects), self.selection.errors(effects)
             scales = fitted_scales(self.fit, errors)
             by_block = np.append(scores(self.fit, errors, scales), scores(self.selection, ahead, scales))
-            parts, one_step = zip((self.fit, self.selection), (errors, ahead), strict=True), []
-            for part, error in parts:
-                windows, known = part.blocks.windows[0], part.variances[0][:, 0]
-                density = _density(error[0][:, 0], known + scales[0][0]).sum(1)
-                one_step.append(np.bincount(windows.block, density) / np.bincount(windows.block))
+            windows, known = self.selection.blocks.windows[0], self.selection.variances[0][:, 0]
+            density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
+            one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
             is_larger = np.median(scales[0][0] / np.median(known, axis=0)) > 1.0
             is_white = self.fit.effective_counts(errors)[0][0] > WHITE
-            self._found[effects] = by_block, np.concatenate(one_step), bool(is_larger and is_white)
+            self._found[effects] = by_block, one_step, bool(is_larger and is_white)
         return self._found[effects]
