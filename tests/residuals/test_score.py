@@ -87,7 +87,7 @@ def test_noise_is_not_taken_for_an_error_of_the_simulator_because_steps_are_line
     assert (twice.fit.starts.noise.step < 0.5 * once.fit.starts.noise.step).all()
 
 
-def test_a_reading_that_surprises_moves_no_coordinate_that_is_simulated_and_not_measured():
+def test_readings_that_surprise_leave_the_doubt_of_a_coordinate_that_is_simulated_and_not_measured():
     """The depth of a contact must not explain what a wrong set of effects leaves."""
     simulation = Simulation.from_env(WheelLeggedEnv())
     data = record(WheelLeggedEnv(), noisy_balance_controller(), 500, seed=0, progress=False)

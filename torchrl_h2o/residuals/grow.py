@@ -92,10 +92,9 @@ def grow(
     among = max(1, len({one.entry.name for one in directions}))
     candidates = Candidates.of(ground, found, directions)
     while len(found.entries) < MOST_EFFECTS:
-        singly = len(refused) < MOST_REFUSED
-        fitted = with_one_more(ground, candidates, refused) if singly else []
-        if not fitted:  # no candidate suffices by itself
-            singly = False
+        fitted = with_one_more(ground, candidates, refused) if len(refused) < MOST_REFUSED else []
+        singly = bool(fitted)
+        if not singly:  # no candidate suffices by itself
             fitted = with_one_more(ground, candidates, pairs=True)
         for one in fitted:
             _remember(tried, one, found)
@@ -117,7 +116,8 @@ def grow(
 def _choices(among: int, more: Found, less: Found) -> int:
     """Number of sets of which a larger one is the best: 1 for what each of several joints has."""
     added = more.without(less.names)[1]
-    return among ** len(added) if len({*map(kind_of, added)}) == len(added) else 1
+    kinds = {*map(kind_of, added)}
+    return 1 if _is_many(more, less) and len(kinds) < len(added) else among ** len(kinds)
 
 
 def _is_many(more: Found, less: Found) -> bool:
