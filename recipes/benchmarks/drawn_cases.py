@@ -21,6 +21,7 @@ from systems import SYSTEMS
 from undeclared_effects import CubicWind, DriftingTorque, LateForce, MovingSpring, PlaceFriction, TorqueRipple
 
 from torchrl_h2o.effects import (
+    ActionDelay,
     ActionGain,
     Armature,
     BodyMass,
@@ -126,7 +127,9 @@ def several(number: int, rng: np.random.Generator) -> Case:
 
 def drawn_effect(entry: CatalogueEntry, rng: np.random.Generator) -> Effect | None:
     """Draw a catalogue entry with a value 0.5 to 1.5 times as far from neutral as one of its trial values."""
-    trial = entry.trials[rng.integers(len(entry.trials))]
+    # the longest delay came into the catalogue later, and these draws are to stay comparable
+    trials = entry.trials[:3] if isinstance(entry.effect, ActionDelay) else entry.trials
+    trial = trials[rng.integers(len(trials))]
     neutral = {name: entry.effect.parameters[name].neutral for name in trial}
     share = rng.uniform(0.5, 1.5)
     values = {
