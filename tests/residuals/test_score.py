@@ -16,7 +16,7 @@ from torchrl_h2o.effects import (
     ObservationGain,
 )
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
-from torchrl_h2o.residuals import Measured, Simulation, start_states
+from torchrl_h2o.residuals import Measured, Simulation, StateMap, start_states
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.refit import fit_set, slopes_of, variables_of
@@ -99,6 +99,18 @@ def test_readings_that_surprise_leave_the_doubt_of_a_coordinate_that_is_simulate
         starts = Model.of(simulation, measured, Noise(np.full(4, 1e-6), np.full(7, 1e-4))).fit.starts
         doubts.append(np.einsum("brii->bri", starts.covariance)[..., starts.record.settled].max())
     assert doubts[1] == pytest.approx(doubts[0], rel=0.1)
+
+
+def test_the_velocity_of_a_measured_position_is_filtered_and_not_simulated():
+    simulation = double_pendulum()
+    positions = replace(StateMap.of_coordinates(("shoulder", "elbow"), ("rad", "rad"), (0, 1), 4), hidden=(2, 3))
+    whole = recorded(simulation, 300, 1e-4)
+    measured = replace(whole, observation=whole.observation[:, :2], following=whole.following[:, :2])
+    record = Model.of(replace(simulation, state_map=positions), measured).fit.record
+    assert record.positions_of_velocities == {2: 0, 3: 1}
+    assert not record.settled.any()
+    rates = record.states[0][:, 2:]
+    assert np.abs(rates - whole.observation[:, 2:]).mean() < 0.1 * whole.observation[:, 2:].std()
 
 
 def test_an_effect_too_many_predicts_no_better(measured):

@@ -18,7 +18,8 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 DERIVATIVE_ROWS = 7  # rows from which an unobserved velocity is computed: a parabola through the positions
 STILL = 1e-12  # standard deviation below which a coordinate counts as constant
 
-_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+# numbers, because a type read from a model is in no tuple of members of the enumeration
+_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclass(frozen=True, eq=False)
