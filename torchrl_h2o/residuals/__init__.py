@@ -1,10 +1,10 @@
 """Closing the loop with measured data: residual, effects that explain it, held-out errors, report."""
 
 from torchrl_h2o.residuals.close_the_loop import close_the_loop, explain
+from torchrl_h2o.residuals.estimated_states import estimate_states
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.floor import explainable_floor
-from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.outside import outside_intervals, outside_rows
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.simulated_transitions import simulate_transitions

@@ -16,12 +16,12 @@ from torchrl.envs import EnvBase
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.effects import CatalogueEntry, Effect
 from torchrl_h2o.provenance import cpu_seconds, provenance
+from torchrl_h2o.residuals.action_noise import add_action_noise
 from torchrl_h2o.residuals.compose_report import compose_report, inconclusive_report, unfinished_report
 from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_conclusion
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
-from torchrl_h2o.residuals.noise.add_action_noise import add_action_noise
 from torchrl_h2o.residuals.offered import offered_entries
 from torchrl_h2o.residuals.progress import NOISE, REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.document import Report
@@ -193,7 +193,7 @@ def explain(
     progress.stage(NOISE)
     so_far(found, "action noise was looked for")
     try:
-        return add_action_noise(simulation, measured, found, settings)
+        return add_action_noise(simulation, measured, found, settings.level)
     except OutOfTimeError:
         return replace(found, ended_in=NOISE)
     except FAILURES as error:  # a constant action makes the equations singular

@@ -229,25 +229,6 @@ class Gains:
         pull = np.linalg.pinv(self._inverse[np.ix_(own, own)]) @ moves
         return self._inverse[:, own] @ pull, float(moves @ pull)
 
-    def least_needed(self, variables: Sequence[Variable]) -> list[tuple[int, float]]:
-        """Present effects in the order in which they may be dropped, with the evidence for each beside the later ones.
-
-        The others are readjusted; the errors are taken as linear in all variables.
-        """
-        left, found, before = {one.effect for one in variables}, [], np.zeros(len(self.white))
-        while left:
-            dropped = [effect for effect, _ in found]
-            results = {effect: self.readjusted({*dropped, effect}, variables) for effect in left}
-            effect = min(left, key=lambda one: results[one][1])
-            moves, loss = results[effect]
-            if math.isinf(loss):
-                return [*found, *((other, math.inf) for other in left)]
-            gains = self._gains(self.beside @ moves)
-            found.append((effect, -self._evidence(gains - before)))
-            before = gains
-            left.remove(effect)
-        return found
-
     @cached_property
     def _readjust(self) -> np.ndarray:
         """(p, N): moves of the values of the present effects that make up for a whitened change."""

@@ -2,99 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
 
 from torchrl_h2o.effects import is_negligible
-from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import ALIKE, Candidates, gains_beside, is_preferred, most_usual, with_one_more
-from torchrl_h2o.residuals.refit import Variable, variables_of, with_values
-from torchrl_h2o.residuals.score import Difference, Predictions
+from torchrl_h2o.residuals.refit import variables_of, with_values
+from torchrl_h2o.residuals.score import Difference
 from torchrl_h2o.residuals.sweep import Direction
 
-SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
-MOST_KEPT = 3  # effects that were needed when they were dropped, after which no more are
 SWAPS = 4  # largest number of effects that are replaced by others
 
 
 def prune(ground: Ground, found: Found) -> Found:
-    """Drops effects without which the rows are predicted as well, the least needed ones first."""
-    before, kept = found, set[str]()
+    """Drops effects without which the rows are predicted as well, those first that are estimated to matter least.
+
+    What several joints or motors have, such as friction, is dropped on all of them or on none: they resemble each
+    other, and the log says little about some of them.
+    """
+    before, kept = found, set[frozenset[str]]()
     pairs = zip(found.entries, found.effects, strict=True)
     if idle := {entry.name for entry, effect in pairs if is_negligible(effect, entry.trials)}:
         found = ground.found(*found.without(idle))
-    found = _without_needless_kinds(ground, found)
-    while found.names - kept and len(kept) < MOST_KEPT:
-        linear = _Linear.about(ground, found)
-        estimates = [one for one in linear.estimates if one[0] not in kept]
-        cost = {name: ground.needed(found, Found(*found.without({name}), found.scores)) for name, _ in estimates}
-        weak = [name for name, estimate in estimates if estimate < 0.5 * cost[name]]
-        if not weak and (open_ := [name for name, estimate in estimates if estimate < SURE * cost[name]]):
-            weak = open_[:1]
-        count = len(weak)
-        while count:
-            fewer = linear.without(ground, weak[:count])
-            if fewer is not None and not ground.adds(found, fewer):
-                found = fewer
-                break
-            count //= 2
+    while others := [names for names in _of_each_kind(found) if names not in kept]:
+        part = ground.fit_part(found.effects)
+        variables = variables_of(part, found.entries, found.effects)
+        gains = gains_beside(part, found, found.slopes)
+        moved = {
+            names: gains.readjusted([i for i, one in enumerate(found.entries) if one.name in names], variables)
+            for names in others
+        }
+        least = min(others, key=lambda names: moved[names][1])
+        slopes = gains.slopes[:, [found.entries[one.effect].name not in least for one in variables]]
+        moves, _ = moved[least]
+        readjusted = replace(found, effects=with_values(found.effects, variables, moves))
+        try:
+            fewer = ground.sketched(part, *readjusted.without(least), GROWN, slopes)
+        except ValueError:  # the model rejects the others alone
+            kept.add(least)
+            continue
+        if ground.adds(found, fewer):
+            kept.add(least)
         else:
-            if not weak:
-                break
-            kept.add(weak[0])
+            found = fewer
     return found if found is before else ground.fitted(found.entries, found.effects)
 
 
-def _without_needless_kinds(ground: Ground, found: Found) -> Found:
-    """Drops an effect on all of its joints or motors if the rows are predicted as well without it."""
-    for kind in dict.fromkeys(map(kind_of, found.effects)):
-        same = {e.name for e, effect in zip(found.entries, found.effects, strict=True) if kind_of(effect) == kind}
-        if len(same) > 1:
-            fewer = _Linear.about(ground, found).without(ground, same)
-            if fewer is not None and not ground.adds(found, fewer):
-                found = fewer
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Linear:
-    """A set with the changes of the errors by its values.
-
-    Args:
-        found: the set.
-        part: predictions on the rows for fits.
-        variables: its values.
-        gains: the changes.
-    """
-
-    found: Found
-    part: Predictions
-    variables: Sequence[Variable]
-    gains: Gains
-
-    @classmethod
-    def about(cls, ground: Ground, found: Found) -> _Linear:
-        part = ground.fit_part(found.effects)
-        variables = variables_of(part, found.entries, found.effects)
-        return cls(found, part, variables, gains_beside(part, found, found.slopes))
-
-    @property
-    def estimates(self) -> list[tuple[str, float]]:
-        """Effects in the order in which they may be dropped, with the estimated evidence for each."""
-        order = self.gains.least_needed(self.variables)
-        return [(self.found.entries[index].name, evidence) for index, evidence in order]
-
-    def without(self, ground: Ground, names: Collection[str]) -> Found | None:
-        """The set without some effects, fitted from readjusted values; None if the model rejects the others alone."""
-        dropped = [index for index, entry in enumerate(self.found.entries) if entry.name in names]
-        moves, _ = self.gains.readjusted(dropped, self.variables)
-        effects = with_values(self.found.effects, self.variables, moves)
-        slopes = self.gains.slopes[:, [one.effect not in dropped for one in self.variables]]
-        try:
-            return ground.sketched(self.part, *replace(self.found, effects=effects).without(names), GROWN, slopes)
-        except ValueError:
-            return None
+def _of_each_kind(found: Found) -> list[frozenset[str]]:
+    """Names of the entries of each kind of effects."""
+    kinds: dict[Hashable, set[str]] = {}
+    for entry, effect in zip(found.entries, found.effects, strict=True):
+        kinds.setdefault(kind_of(effect), set()).add(entry.name)
+    return [frozenset(names) for names in kinds.values()]
 
 
 def replaced(

@@ -8,8 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 
 import numpy as np
+from scipy.stats import norm
 
 from torchrl_h2o.residuals.blocks import LENGTHS, Blocks, Windows
 from torchrl_h2o.residuals.record import Record
@@ -25,7 +28,6 @@ LINEARISED = 2  # times that the steps of the simulation are linearised, about b
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
 USUAL_FACTORS = np.array([0.0, -0.7])
 SPACINGS = (2.0, 1.0, 0.5, 0.2, 0.07)  # of the logarithms that are tried, one grid after another
-AROUND = np.array([[a, b] for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
 
 
@@ -36,14 +38,17 @@ class Noise:
     Args:
         sensor: (n), of each reading.
         step: (m), of the simulator's error in one control step, for each coordinate.
+        action: of the executed actions about the commanded ones, in their unit.
     """
 
     sensor: np.ndarray
     step: np.ndarray
+    action: float = 0.0
 
-    def scaled(self, sensor: float, step: float) -> Noise:
-        """Both multiplied by a factor, and at least rounding."""
-        return Noise(np.maximum(sensor * self.sensor, ROUNDING), np.maximum(step * self.step, 0.1 * ROUNDING))
+    def scaled(self, sensor: float, step: float, action: float = 0.0) -> Noise:
+        """Each multiplied by a factor, and at least rounding."""
+        least = np.maximum(sensor * self.sensor, ROUNDING), np.maximum(step * self.step, 0.1 * ROUNDING)
+        return Noise(*least, action * self.action)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +92,16 @@ class StartStates:
                 changes the scores of all blocks alike, as a better explanation does.
         """
 
-        def filtered(steps: _Steps) -> tuple[Noise, np.ndarray, np.ndarray, np.ndarray]:
+        def filtered(steps: Steps) -> tuple[Noise, np.ndarray, np.ndarray, np.ndarray]:
             factors = USUAL_FACTORS if noise else steps.fitted_factors() if similar is None else similar.factors
             own = noise or steps.noise(factors)
             (mean,), (covariance,), _ = steps.filtered([own])
             return own, factors, mean, covariance
 
-        steps = _Steps.of(record, blocks, *(() if similar is None else (similar.about, similar.slope)))
+        steps = Steps.of(record, blocks, *(() if similar is None else (similar.about, similar.slope)))
         own, factors, mean, covariance = filtered(steps)
         for _ in range(LINEARISED - 1 if similar is None else 0):
-            steps = _Steps.of(record, blocks, mean)
+            steps = Steps.of(record, blocks, mean)
             own, factors, mean, covariance = filtered(steps)
         before = _rows_before(blocks)
         return cls(record, blocks, own, mean[:, before:], covariance[:, before:], steps.about, steps.slope, factors)
@@ -136,13 +141,14 @@ class StartStates:
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class Steps:
     """One control step linearised in each row of the blocks: ``next = slope @ deviation + miss``, in spreads.
 
     Deviations are those from the measured coordinates.
 
     Args:
         record: the log and the simulation.
+        rows: (B, L), rows of the log.
         about: (B, L, m), deviations about which it is linearised.
         slope: (B, L, m, m).
         miss: (B, L, m), simulated minus measured coordinates after a step from the measured ones.
@@ -152,6 +158,7 @@ class _Steps:
     """
 
     record: Record
+    rows: np.ndarray
     about: np.ndarray
     slope: np.ndarray
     miss: np.ndarray
@@ -162,51 +169,74 @@ class _Steps:
     @classmethod
     def of(
         cls, record: Record, blocks: Blocks, about: np.ndarray | None = None, slope: np.ndarray | None = None
-    ) -> _Steps:
-        measured, spread, m = record.measured, record.spread, len(record.spread)
+    ) -> Steps:
+        measured, m = record.measured, len(record.spread)
         begins = np.empty(len(measured), int)
         for run in measured.runs:
             begins[run] = run.start
         rows = blocks.first[:, None] + np.arange(-_rows_before(blocks), blocks.steps)
         live = rows >= begins[blocks.first][:, None]
         rows = np.maximum(rows, begins[blocks.first][:, None])
-        flat, size = rows.ravel(), rows.shape
-        about = np.zeros((*size, m)) if about is None else np.where(live[..., None], about, 0.0)
-        states = record.states[0][flat] + (about.reshape(-1, m) * spread) @ record.into_state.T
-        actions = record.executed[flat][:, None]
-        at = {"time": measured.time[flat], "activations": record.activations[flat]}
-
-        def reached(simulation: Simulation, start: np.ndarray) -> np.ndarray:
-            return simulation.rollout(start, actions, **at)[:, 0] @ record.from_state.T / spread
-
-        base = reached(record.simulation, states)
+        about = np.zeros((*rows.shape, m)) if about is None else np.where(live[..., None], about, 0.0)
+        base = _reached(record, record.simulation, rows, about)
         if slope is None:
-            slope, quick = np.empty((*size, m, m)), record.simulation.quick
-            before = base if quick is record.simulation else reached(quick, states)
-            for index in range(m):
-                moved = states + NUDGE * spread[index] * record.into_state[:, index]
-                slope[..., index] = ((reached(quick, moved) - before) / NUDGE).reshape(*size, m)
-        miss = (base - record.states[1][flat] @ record.from_state.T / spread).reshape(*size, m)
-        miss = miss - (slope @ about[..., None])[..., 0]
+            slope, quick = np.empty((*rows.shape, m, m)), record.simulation.quick
+            before = base if quick is record.simulation else _reached(record, quick, rows, about)
+            for index, nudge in enumerate(NUDGE * np.eye(m)):
+                slope[..., index] = (_reached(record, quick, rows, about + nudge) - before) / NUDGE
+        after = record.states[1][rows] @ record.from_state.T / record.spread
+        miss = base - after - (slope @ about[..., None])[..., 0]
         known = np.asarray(np.isfinite(slope).all((2, 3)) & np.isfinite(miss).all(2))
         slope, miss = np.where(known[..., None, None], slope, np.eye(m)), np.where(known[..., None], miss, 0.0)
-        third = np.abs(np.diff(record.readings[0][rows], 3, axis=1) / spread[: record.num_readings])
+        third = np.abs(np.diff(record.readings[0][rows], 3, axis=1) / record.spread[: record.num_readings])
         jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
-        return cls(record, about, slope, miss, live, known, jerk)
+        return cls(record, rows, about, slope, miss, live, known, jerk)
 
     def noise(self, factors: np.ndarray) -> Noise:
         """The noise with given logarithms of its two factors on :meth:`_typical_noise`."""
         return self._typical_noise().scaled(*np.exp(factors))
 
-    def fitted_factors(self) -> np.ndarray:
-        """Logarithms of the two factors of the noise under which the next readings are most likely."""
-        typical, best = self._typical_noise(), USUAL_FACTORS
+    def fitted_factors(self, usual: np.ndarray = USUAL_FACTORS) -> np.ndarray:
+        """Logarithms of the factors of the noise under which the next readings are most likely.
+
+        Args:
+            usual: logarithms from which the search begins: of two factors, or of three with that of the action noise.
+        """
+        typical, best = self._typical_noise(), usual
+        around = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(usual))))
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
         for spacing in SPACINGS:
-            tried = best + spacing * AROUND
-            densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2]
+            tried = best + spacing * around
+            densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2].sum(1)
             best = tried[densities.argmax()]
-        return tried[len(tried) // 2] + spacing * _highest(densities)
+        return tried[len(tried) // 2] + spacing * _highest(around, densities)
+
+    @cached_property
+    def by_action(self) -> np.ndarray:
+        """Derivative of the coordinates one control step later by the executed actions, (B, L, m, nu)."""
+        actions = self.record.executed[self.rows]
+        before = _reached(self.record, self.record.simulation, self.rows, self.about)
+        found = np.zeros((*before.shape, actions.shape[-1]))
+        for index in range(actions.shape[-1]):
+            # a step towards zero, because the control range may clamp a step outwards
+            step = np.zeros_like(actions)
+            size = NUDGE * (np.abs(actions[..., index]).max() + ROUNDING)
+            step[..., index] = np.where(actions[..., index] > 0.0, -size, size)
+            after = _reached(self.record, self.record.simulation, self.rows, self.about, actions + step)
+            found[..., index] = (after - before) / step[..., index, None]
+        return np.nan_to_num(found)
+
+    def _by_actions(self, std: float, row: int, some: slice) -> np.ndarray:
+        """Covariance of the coordinates by noise of the actions, (B, m, m): the control range clamps some of it."""
+        model, actions = self.record.simulation.model, self.record.executed[self.rows[some, row]]
+        limits = np.where(model.actuator_ctrllimited.astype(bool)[:, None], model.actuator_ctrlrange, [-np.inf, np.inf])
+        actions = np.clip(actions, *limits.T)
+        low, high = (np.clip((limit - actions) / std, -40.0, 40.0) for limit in limits.T)
+        # second moment of a normal variable that is clamped to two limits
+        inside = norm.cdf(high) - norm.cdf(low) - high * norm.pdf(high) + low * norm.pdf(low)
+        left = np.maximum(inside + low**2 * norm.cdf(low) + high**2 * norm.sf(high), 0.0)
+        change = std * self.by_action[some, row] * np.sqrt(left)[:, None]
+        return change @ change.swapaxes(-1, -2)
 
     def _typical_noise(self) -> Noise:
         """Noise of the sensors by the products of successive misses, and the size of the misses.
@@ -214,24 +244,24 @@ class _Steps:
         Noise of a row enters the step that ends at this row and the step that starts there, with opposite signs. Where
         velocities are not measured, the third differences of the positions tell the noise.
         """
-        n = self.record.num_readings
+        n, action = self.record.num_readings, float(self.record.measured.action.std(0).mean())
         miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
         size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
         if self.record.positions_of_velocities:
-            return Noise(self.jerk, size)
+            return Noise(self.jerk, size, action)
         clipped = np.clip(miss / size, -CLIP, CLIP)[..., :n]
         slope = self.slope[:, 1:, :n, :n] * size[:n] / size[:n, None]
         products = clipped[:, 1:, :, None] * clipped[:, :-1, None, :]
         weight = np.isfinite(products) / (1.0 + (slope**2).sum(2, keepdims=True))
         shared = -(weight * slope * np.nan_to_num(products)).sum((0, 1, 2))
         share = np.maximum(shared / np.maximum((weight * slope**2).sum((0, 1, 2)), 1e-12), 0.0)
-        return Noise(np.sqrt(share) * size[:n], size)
+        return Noise(np.sqrt(share) * size[:n], size, action)
 
     def filtered(self, noises: Sequence[Noise], some: slice = slice(None)) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Filters blocks under each of K noises.
 
         Returns:
-            Means, (K, B, L, m), covariances, (K, B, L, m, m), and the mean log density of the next readings, (K).
+            Means, (K, B, L, m), covariances, (K, B, L, m, m), and the log density of the next readings, (K, B).
         """
         n, m = self.record.num_readings, self.miss.shape[-1]
         slope, miss, live, known = (values[some] for values in (self.slope, self.miss, self.live, self.known))
@@ -242,17 +272,20 @@ class _Steps:
         begin = np.pad(sensor, ((0, 0), (0, 0), (0, m - n), (0, m - n))) + np.diag(np.arange(m) >= n)
         mean, covariance = np.zeros((len(noises), *live.shape, m)), np.zeros((len(noises), *live.shape, m, m))
         x, doubt = np.zeros((len(noises), len(live), m)), np.repeat(begin, len(live), axis=1)
-        density, most = np.zeros(len(noises)), np.where(np.arange(m) < n, MOST_DOUBT, 1.0)
+        density, most = np.zeros((len(noises), len(live))), np.where(np.arange(m) < n, MOST_DOUBT, 1.0)
         follows = ~self.record.settled
         for row in range(live.shape[1]):
             mean[:, :, row], covariance[:, :, row] = x, doubt
             guess = (slope[:, row] @ x[..., None])[..., 0] + miss[:, row]
             doubt = slope[:, row] @ doubt @ slope[:, row].transpose(0, 2, 1) + step
+            for one, noise in enumerate(noises):
+                if noise.action:
+                    doubt[one] += self._by_actions(noise.action, row, some)
             factor = np.linalg.cholesky(doubt[..., :n, :n] + sensor)
             white = np.linalg.solve(factor, -guess[..., :n, None])[..., 0]
             square, valid = (white**2).mean(-1), live[:, row] & known[:, row]
             log_det = np.log(np.einsum("kbii->kbi", factor)).sum(-1)
-            density += (log_density(white).sum(-1) - log_det).sum(-1, where=valid)
+            density += np.where(valid, log_density(white).sum(-1) - log_det, 0.0)
             # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
             trust = np.where(known[:, row], np.where(square > SURPRISE, square, 1.0), 1.0 / ROUNDING**2)
             inflated = np.where(follows, np.sqrt(trust)[..., None], 1.0)
@@ -262,17 +295,32 @@ class _Steps:
             left = np.eye(m) - np.pad(gain, ((0, 0), (0, 0), (0, 0), (0, m - n)))
             doubt = left @ doubt @ left.swapaxes(-1, -2) + gain @ sensor @ gain.swapaxes(-1, -2)
             x[:, ~live[:, row]], doubt[:, ~live[:, row]] = 0.0, begin
-        return mean, covariance, density / max(1, int((live & known).sum()))
+        return mean, covariance, density
 
 
-def _highest(values: np.ndarray) -> np.ndarray:
-    """Where a quadratic function through values at ``AROUND`` is highest, (2), within this grid."""
-    a, b = AROUND.T
-    terms = np.stack([a, b, 0.5 * a**2, a * b, 0.5 * b**2, np.ones(len(a))], axis=1)
-    (p, q, pp, pq, qq, _), *_ = np.linalg.lstsq(terms, values, rcond=None)
-    if pp >= 0.0 or pp * qq <= pq**2:  # it has no highest point
-        return AROUND[values.argmax()]
-    return np.clip(-np.linalg.solve([[pp, pq], [pq, qq]], [p, q]), -1.0, 1.0)
+def _reached(
+    record: Record, simulation: Simulation, rows: np.ndarray, moved: np.ndarray, actions: np.ndarray | None = None
+) -> np.ndarray:
+    """Coordinates one control step after rows (B, L) with deviations (B, L, m), in spreads."""
+    flat, executed = rows.ravel(), record.executed[rows] if actions is None else actions
+    states = record.states[0][flat] + (moved.reshape(len(flat), -1) * record.spread) @ record.into_state.T
+    at = {"time": record.measured.time[flat], "activations": record.activations[flat]}
+    reached = simulation.rollout(states, executed.reshape(len(flat), 1, -1), **at)[:, 0]
+    return (reached @ record.from_state.T / record.spread).reshape(moved.shape)
+
+
+def _highest(around: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Where a quadratic function through values (K) at places ``around`` (K, d) is highest, (d), within this grid."""
+    d = around.shape[1]
+    i, j = np.triu_indices(d)
+    terms = np.hstack([around, around[:, i] * around[:, j], np.ones((len(around), 1))])
+    coefficients, *_ = np.linalg.lstsq(terms, values, rcond=None)
+    curvature = np.zeros((d, d))
+    curvature[i, j] = coefficients[d : d + len(i)]
+    curvature = curvature + curvature.T
+    if np.linalg.eigvalsh(curvature).max() >= 0.0:  # it has no highest point
+        return around[values.argmax()]
+    return np.clip(-np.linalg.solve(curvature, coefficients[:d]), -1.0, 1.0)
 
 
 def _bounded(doubt: np.ndarray, most: np.ndarray | float) -> np.ndarray:

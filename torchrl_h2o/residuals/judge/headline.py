@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_h2o.residuals.estimated_states import sensor_noise
 from torchrl_h2o.residuals.measured.error_over_noise import error_over_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.transitions import Measured, thinned
 from torchrl_h2o.residuals.report.errors import HeadlineError
 from torchrl_h2o.residuals.simulation.simulation import Simulation

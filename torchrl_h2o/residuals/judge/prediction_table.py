@@ -13,11 +13,10 @@ from scipy.stats import t as student
 from torch import nn
 
 from torchrl_h2o.effects import Effect, selection
+from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
 from torchrl_h2o.residuals.judge.headline import HEADLINE_WINDOWS
 from torchrl_h2o.residuals.measured.in_motion import in_motion
-from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.residual import residuals, start_states, undelayed_following
-from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.significance import p_value_of_losses
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.errors import PredictedRow, Prediction, PredictionTable
@@ -151,10 +150,10 @@ def predicted(
     noisy = sensor_noise(mended, measured) is not None
 
     def errors(which: Simulation, starts: np.ndarray) -> np.ndarray:
-        states = estimate_states(which, measured) if noisy else None
+        states = estimate_states(which, measured, starts) if noisy else None
         return residuals(which, measured, starts, steps, states=states)[:, -1] / spread
 
-    states = (estimate_states(mended, measured) if noisy else start_states(mended, measured, judged))[judged]
+    states = (estimate_states if noisy else start_states)(mended, measured, judged)[judged]
     stays = undelayed_following(mended, measured)[judged + steps - 1] - at_constant_velocity(mended, states, steps)
     left, learned = errors(mended, judged), np.zeros((len(judged), len(spread)))
     if len(fitted) >= FEWEST_LEARNT:

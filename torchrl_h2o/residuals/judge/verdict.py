@@ -8,15 +8,14 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect, JointRange
+from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
 from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios, short_delays
 from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, NEGLIGIBLE_ERROR, made_worse
 from torchrl_h2o.residuals.judge.prediction_table import Predicted
 from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
-from torchrl_h2o.residuals.measured.initial_states import estimate_states
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.sensor_noise import sensor_noise
 from torchrl_h2o.residuals.measured.significance import WORST, p_value_of_losses
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import (
@@ -211,7 +210,7 @@ def _lowers_the_error(
         starts = measured.reported_on(steps)
         sizes = []
         for which in (simulation, mended):
-            states = estimate_states(which, measured) if noisy else None
+            states = estimate_states(which, measured, starts) if noisy else None
             missed = residuals(which, measured, starts, steps, states=states)[:, -1] / spread
             sizes.append(np.nan_to_num(np.abs(missed), nan=WORST).mean(1))
         level = settings.level / len(ahead)

@@ -9,7 +9,7 @@ import torch
 from torchrl_h2o.effects import ActionDelay, JointFrictionLoss, ObservationGain
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
-from torchrl_h2o.residuals.measured.initial_states import estimate_states, noise_levels
+from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
 from torchrl_h2o.residuals.measured.residual import start_states
 
 NOISE = np.array([0.005, 0.05, 0.001, 0.03])  # rad, rad/s, m, m/s
@@ -42,8 +42,8 @@ def test_estimates_are_far_nearer_to_the_truth_than_what_was_measured(simulation
 
 def test_the_sensors_noise_is_found_beside_a_wrong_model(simulation, recorded):
     lacking = simulation.with_effects(JointFrictionLoss(0.3, joints="axle"))
-    levels = noise_levels(lacking, with_noise(Measured.from_ted(recorded, simulation)))
-    np.testing.assert_allclose(levels.sensor, NOISE, rtol=0.25)
+    found = sensor_noise(lacking, with_noise(Measured.from_ted(recorded, simulation)))
+    np.testing.assert_allclose(found, NOISE, rtol=0.25)
 
 
 def test_a_wrong_model_does_not_make_estimates_worse_than_what_was_measured(simulation, recorded):
@@ -52,6 +52,19 @@ def test_a_wrong_model_does_not_make_estimates_worse_than_what_was_measured(simu
     for scale in (0.1, 1.0):
         estimate = estimate_states(lacking, with_noise(true, scale))
         assert (error(simulation, estimate, true) < 1.1 * scale * NOISE).all()
+
+
+def test_estimated_columns_are_at_least_as_noisy_as_is_known(simulation, recorded):
+    """Successive residuals do not show errors that are alike in successive rows, as those of a smoother."""
+    measured = with_noise(Measured.from_ted(recorded, simulation), 0.1)
+    found = sensor_noise(simulation, measured)
+    known = np.array([0.0, 10.0 * found[1], 0.0, 0.0])
+    expected = [found[0], known[1], found[2], found[3]]
+    assert sensor_noise(simulation, replace(measured, estimated_std=known)) == pytest.approx(expected)
+
+
+def test_readings_without_noise_have_none(simulation, recorded):
+    assert sensor_noise(simulation, Measured.from_ted(recorded, simulation)) is None
 
 
 def test_without_noise_the_measured_states_come_out(simulation, recorded):
@@ -84,9 +97,7 @@ def test_later_rows_and_other_runs_do_not_change_an_estimate(simulation, recorde
     half["next", "truncated"][-1] = half["next", "done"][-1] = True
     noisy = with_noise(Measured.from_ted(torch.cat([half, recorded[400:]]), simulation, held_out=0.4))
     other = replace(noisy, observation=noisy.observation.copy(), following=noisy.following.copy())
-    other.observation[701:] += 1.0
-    other.following[700:] += 1.0
+    other.observation[701:] = other.following[700:-1] = noisy.observation[:700:-1]  # with the same spread
     first, second = (estimate_states(simulation, data) for data in (noisy, other))
-    # differences in rounding, because the filter divides by the spread of the whole run
-    np.testing.assert_allclose(first[:701], second[:701], atol=1e-4)
+    np.testing.assert_allclose(first[:701], second[:701], atol=2e-3)  # the spread of simulated coordinates differs
     assert (np.abs(first[701:] - second[701:]).max(0) > 0.1).any()

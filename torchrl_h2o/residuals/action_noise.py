@@ -1,0 +1,113 @@
+"""Noise of the executed action: found where it makes the next readings likelier, and put into the explanation."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from torchrl_h2o.effects import ActionNoise
+from torchrl_h2o.residuals.explanation import Explanation, Part
+from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.refit import CONFIDENCE
+from torchrl_h2o.residuals.score import WHITE, Difference, Model
+from torchrl_h2o.residuals.settings import DEFAULTS
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.start_states import USUAL_FACTORS, Steps
+
+MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
+LEAST, MOST = 1e-3, 2.0  # plausible sizes: of the control range, and of the actions' root mean square
+WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
+OF_NORMAL = 1.175  # standard deviation of the likeliest t-distribution for normal noise; see ``TAIL``
+NUDGE = 0.1  # step of the logarithm of the noise for the curvature of the likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseEstimate:
+    """Estimated noise of the executed action.
+
+    Args:
+        std: standard deviation of the executed action about the commanded one, in units of the action, the same for all
+            actuators.
+        half_width: half-width of its 95 % interval.
+        evidence: evidence for it, in nats, in all rows that fits and the selection of effects use.
+        confirmed: evidence in the rows for selection alone.
+        is_white: whether the errors of successive rows are independent, as noise of the actions makes them.
+    """
+
+    std: float
+    half_width: float
+    evidence: float
+    confirmed: float
+    is_white: bool
+
+
+def add_action_noise(
+    simulation: Simulation, measured: Measured, explanation: Explanation, level: float = DEFAULTS.level
+) -> Explanation:
+    """Adds the action noise that the simulator lacks, or removes the noise that it has in excess.
+
+    Args:
+        simulation: the simulator without the effects found.
+        measured: the data.
+        explanation: effects found so far.
+        level: significance level.
+
+    Returns:
+        The explanation with an :class:`~torchrl_h2o.effects.ActionNoise`, whose standard deviation is negative where
+        the simulator has too much noise; unchanged if the difference is negligible or not significant.
+    """
+    if not simulation.model.nu:
+        return explanation  # a free motion
+    own = [effect for effect in simulation.effects if isinstance(effect, ActionNoise) and effect.actuators is None]
+    own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
+    mended = simulation.with_effects(*explanation.effects)
+    noise = estimate_noise(mended, measured)
+    is_likely = noise.is_white and noise.evidence > -math.log(level) and noise.confirmed > 0.0
+    is_found = is_likely and _is_plausible(mended, measured, noise.std)
+    missing = (noise.std**2 if is_found else 0.0) - own_variance
+    if abs(missing) <= MIN_CHANGE * own_variance:
+        return explanation
+    std = math.copysign(math.sqrt(abs(missing)), missing)
+    half = noise.half_width if is_found else 0.0
+    part = Part(ActionNoise(std), True, {"std": (std - half, std + half)})
+    return explanation.with_parts((*explanation.parts, part))
+
+
+def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
+    """Estimates the noise of the executed action beside that of the sensors and errors of the simulator.
+
+    A Kalman filter predicts the next readings, with noise of the actions and without it. Each time, the factors on the
+    noise of the sensors and on the simulator's errors are those under which the readings for fits are likeliest. The
+    evidence is the difference of the log densities, paired over blocks. MuJoCo clamps controls at the ends of their
+    range, and so the noise.
+
+    Args:
+        simulation: the simulator with all effects found so far; its own action noise is left out.
+        measured: the data.
+    """
+    model = Model.of(simulation, measured)
+    record, parts = model.fit.record, (model.fit.starts, model.selection.starts)
+    fit, selection = (Steps.of(record, starts.blocks, starts.about, starts.slope) for starts in parts)
+    noisy, silent = (fit.noise(fit.fitted_factors(usual)) for usual in (WITH_ACTION, USUAL_FACTORS))
+    less, more = (replace(noisy, action=noisy.action * math.exp(step)) for step in (-NUDGE, NUDGE))
+    densities = [steps.filtered([silent, noisy, less, more])[2] for steps in (fit, selection)]
+    without, found, below, above = np.concatenate(densities, axis=1)
+    curvature = float((above + below - 2.0 * found).sum()) / NUDGE**2
+    scatter = float(np.sqrt((((above - below) / (2.0 * NUDGE)) ** 2).sum()))
+    std = noisy.action / OF_NORMAL
+    half_width = CONFIDENCE * std * scatter / -curvature if curvature < 0.0 else math.inf
+    gain = found - without
+    is_white = model.fit.effective_counts(model.fit.errors())[0][0] > WHITE
+    return NoiseEstimate(
+        std, half_width, Difference(gain).evidence, Difference(gain[len(fit.rows) :]).evidence, bool(is_white)
+    )
+
+
+def _is_plausible(simulation: Simulation, measured: Measured, std: float) -> bool:
+    """Whether noise is neither next to nothing nor larger than the actions."""
+    low, high = simulation.model.actuator_ctrlrange.T
+    reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
+    asked = float(np.sqrt((measured.action**2).mean()))
+    return bool(LEAST * reach < std < MOST * asked)

@@ -1,0 +1,78 @@
+"""Start states and sensor noise estimated with the Kalman filter of the score, for predictions from noisy readings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_h2o.residuals.blocks import Blocks, block_steps
+from torchrl_h2o.residuals.measured.residual import start_states
+from torchrl_h2o.residuals.measured.settling import settle
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
+from torchrl_h2o.residuals.record import Record
+from torchrl_h2o.residuals.score import FIT_ROWS
+from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.start_states import Noise, StartStates
+
+# sensor noise, in spreads, up to which a reading counts as free of noise
+NOISELESS = 1e-4
+
+
+def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray | None = None) -> np.ndarray:
+    """Estimates the states of rows from the rows up to and including them; see :class:`StartStates`.
+
+    The noise is estimated from the rows for fits.
+
+    Args:
+        simulation: simulator with its sensors, delays and unobserved coordinates.
+        measured: the data.
+        rows: (W), rows that are needed; all by default. The others have their measured states.
+
+    Returns:
+        (T, nq + nv).
+
+    Examples:
+        >>> from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
+        >>> from torchrl_h2o.residuals import Measured, Simulation
+        >>> data = record(WheelLeggedEnv(), noisy_balance_controller(), 300, seed=0)
+        >>> simulation = Simulation.from_env(WheelLeggedEnv())
+        >>> estimate_states(simulation, Measured.from_ted(data, simulation)).shape
+        (300, 8)
+    """
+    states, steps = start_states(simulation, measured), block_steps(measured, simulation.control_step)
+    needed = np.isin(np.arange(len(measured)), np.arange(len(measured)) if rows is None else rows)
+    first = [row for run in measured.runs for row in _firsts(run, steps) if needed[row : row + steps].any()]
+    if not first:
+        return states
+    record = Record(simulation, measured)
+    starts = StartStates.of(record, Blocks(np.array(first), steps), _noise(simulation, measured))
+    _, filtered = starts.of_rows
+    simulated = np.array(simulation.state_map.hidden, int)[record.settled[record.num_readings :]]
+    filtered[:, simulated] = settle(simulation, measured, filtered, record.executed, np.flatnonzero(needed))[
+        :, simulated
+    ]
+    return filtered
+
+
+def _firsts(run: slice, steps: int) -> list[int]:
+    """First rows of blocks that cover a run; the last two blocks may share rows."""
+    last = run.stop - steps
+    return [] if last < run.start else sorted({*range(run.start, last, steps), last})
+
+
+def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
+    """Standard deviation of each sensor's noise, (n), in its unit; None if all of them are negligible.
+
+    It is not less than the known error of columns that were estimated from others.
+    """
+    spread = measured.observation.std(0)
+    known = 0.0 if measured.estimated_std is None else measured.estimated_std
+    std = np.maximum(_noise(simulation, measured).sensor * spread, known)
+    return std if (std > NOISELESS * spread).any() else None
+
+
+def _noise(simulation: Simulation, measured: Measured) -> Noise:
+    def compute() -> Noise:
+        steps = block_steps(measured, simulation.control_step)
+        return StartStates.of(Record(simulation, measured), Blocks.of(measured, Split.FIT, steps, FIT_ROWS)).noise
+
+    return measured.remembered("noise", simulation, compute)

@@ -1,1 +1,0 @@
-"""Noise of the executed action: its estimate, and its place in an explanation."""
