@@ -54,13 +54,11 @@ def test_a_wrong_model_does_not_make_estimates_worse_than_what_was_measured(simu
         assert (error(simulation, estimate, true) < 1.1 * scale * NOISE).all()
 
 
-def test_estimated_columns_are_at_least_as_noisy_as_is_known(simulation, recorded):
-    """Successive residuals do not show errors that are alike in successive rows, as those of a smoother."""
-    measured = with_noise(Measured.from_ted(recorded, simulation), 0.1)
+def test_columns_that_were_estimated_from_others_have_the_noise_that_is_known_of_them(simulation, recorded):
+    known = np.array([0.0, 0.2, 0.0, 0.0])
+    measured = replace(with_noise(Measured.from_ted(recorded, simulation)), estimated_std=known)
     found = sensor_noise(simulation, measured)
-    known = np.array([0.0, 10.0 * found[1], 0.0, 0.0])
-    expected = [found[0], known[1], found[2], found[3]]
-    assert sensor_noise(simulation, replace(measured, estimated_std=known)) == pytest.approx(expected)
+    np.testing.assert_allclose(found, np.where(known > 0.0, known, NOISE), rtol=0.3)
 
 
 def test_readings_without_noise_have_none(simulation, recorded):

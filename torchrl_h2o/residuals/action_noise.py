@@ -17,7 +17,8 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import USUAL_FACTORS, Steps
 
 MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
-LEAST, MOST = 1e-3, 2.0  # plausible sizes: of the control range, and of the actions' root mean square
+# plausible noise, in root mean squares of the actions: less is not told from small errors of the simulator
+LEAST, MOST = 0.05, 2.0
 WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
 OF_NORMAL = 1.175  # standard deviation of the likeliest t-distribution for normal noise; see ``TAIL``
 NUDGE = 0.1  # step of the logarithm of the noise for the curvature of the likelihood
@@ -65,7 +66,7 @@ def add_action_noise(
     mended = simulation.with_effects(*explanation.effects)
     noise = estimate_noise(mended, measured)
     is_likely = noise.is_white and noise.evidence > -math.log(level) and noise.confirmed > 0.0
-    is_found = is_likely and _is_plausible(mended, measured, noise.std)
+    is_found = is_likely and _is_plausible(measured, noise.std)
     missing = (noise.std**2 if is_found else 0.0) - own_variance
     if abs(missing) <= MIN_CHANGE * own_variance:
         return explanation
@@ -105,9 +106,7 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     )
 
 
-def _is_plausible(simulation: Simulation, measured: Measured, std: float) -> bool:
+def _is_plausible(measured: Measured, std: float) -> bool:
     """Whether noise is neither next to nothing nor larger than the actions."""
-    low, high = simulation.model.actuator_ctrlrange.T
-    reach = np.where(high > low, high - low, 2.0 * np.abs(measured.action).max(0) + 1e-12).mean()
     asked = float(np.sqrt((measured.action**2).mean()))
-    return bool(LEAST * reach < std < MOST * asked)
+    return LEAST * asked < std < MOST * asked

@@ -46,7 +46,7 @@ def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray
     record = Record(simulation, measured)
     starts = StartStates.of(record, Blocks(np.array(first), steps), _noise(simulation, measured))
     _, filtered = starts.of_rows
-    simulated = np.array(simulation.state_map.hidden, int)[record.settled[record.num_readings :]]
+    simulated = np.array(simulation.state_map.hidden, int)[record.settled[len(simulation.state_map.names) :]]
     filtered[:, simulated] = settle(simulation, measured, filtered, record.executed, np.flatnonzero(needed))[
         :, simulated
     ]
@@ -62,11 +62,12 @@ def _firsts(run: slice, steps: int) -> list[int]:
 def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | None:
     """Standard deviation of each sensor's noise, (n), in its unit; None if all of them are negligible.
 
-    It is not less than the known error of columns that were estimated from others.
+    That of columns that were estimated from others is the error known of them.
     """
     spread = measured.observation.std(0)
-    known = 0.0 if measured.estimated_std is None else measured.estimated_std
-    std = np.maximum(_noise(simulation, measured).sensor * spread, known)
+    std = np.zeros(len(spread)) if measured.estimated_std is None else measured.estimated_std.copy()
+    seen = Record(simulation, measured).seen
+    std[seen] = _noise(simulation, measured).sensor * spread[seen]
     return std if (std > NOISELESS * spread).any() else None
 
 

@@ -26,7 +26,8 @@ _SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 class Record:
     """A log as states of a simulation.
 
-    The coordinates of a record are the n readings, followed by the unobserved coordinates that affect later readings.
+    The coordinates of a record are the n readings, followed by what no sensor reads: columns that were estimated from
+    others, such as velocities from positions, and unobserved coordinates that affect later readings.
 
     Args:
         simulation: the simulator with its effects.
@@ -39,7 +40,13 @@ class Record:
     @property
     def num_readings(self) -> int:
         """n, the number of readings."""
-        return len(self.simulation.state_map.names)
+        return len(self.seen)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Indices of the columns that sensors read, (n): those estimated from others say nothing new."""
+        std = self.measured.estimated_std
+        return np.flatnonzero(std == 0.0) if std is not None else np.arange(len(self.simulation.state_map.names))
 
     @cached_property
     def executed(self) -> np.ndarray:
@@ -61,13 +68,24 @@ class Record:
         """(nq + nv, m): the change of the state by each coordinate."""
         state_map = self.simulation.state_map
         hidden = np.eye(len(state_map.offset))[:, list(state_map.hidden)]
-        return np.hstack([state_map.restore_observed, hidden])
+        return np.hstack([state_map.restore_observed[:, self._columns], hidden])
 
     @cached_property
     def from_state(self) -> np.ndarray:
         """(m, nq + nv): the coordinates of a state."""
         state_map = self.simulation.state_map
-        return np.vstack([state_map.observe, np.eye(len(state_map.offset))[list(state_map.hidden)]])
+        hidden = np.eye(len(state_map.offset))[list(state_map.hidden)]
+        return np.vstack([state_map.observe[self._columns], hidden])
+
+    @property
+    def _columns(self) -> np.ndarray:
+        """Indices of the columns, those first that sensors read."""
+        return np.append(self.seen, np.delete(np.arange(len(self.simulation.state_map.names)), self.seen))
+
+    @property
+    def without_velocities(self) -> bool:
+        """Whether velocities are known from positions alone."""
+        return bool(self.positions_of_velocities) or len(self.seen) < len(self.simulation.state_map.names)
 
     @cached_property
     def positions_of_velocities(self) -> dict[int, int]:
@@ -85,7 +103,7 @@ class Record:
     def settled(self) -> np.ndarray:
         """Whether a coordinate is one that a simulation along the data reaches, such as the depth of a contact, (m)."""
         hidden = [index not in self.positions_of_velocities for index in self.simulation.state_map.hidden]
-        return np.array([False] * self.num_readings + hidden)
+        return np.array([False] * len(self.simulation.state_map.names) + hidden)
 
     @cached_property
     def states(self) -> tuple[np.ndarray, np.ndarray]:
@@ -113,7 +131,7 @@ class Record:
     def spread(self) -> np.ndarray:
         """Standard deviation of each coordinate, (m), in its unit; those of the readings are those of the log."""
         spread = np.nanstd(self.states[0] @ self.from_state.T, axis=0)
-        spread[: self.num_readings] = self.measured.observation.std(0)
+        spread[: self.num_readings] = self.measured.observation[:, self.seen].std(0)
         return np.where(spread > STILL, spread, 1.0)
 
 

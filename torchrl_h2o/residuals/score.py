@@ -127,7 +127,7 @@ class Predictions:
                 shift = np.nan_to_num(other - record.readings[0]) @ record.simulation.state_map.restore_observed.T
                 states = [s + shift[windows.rows] for windows, s in zip(self.blocks.windows, states, strict=True)]
             predicted = self._predicted(simulation, states)
-        after = undelayed_following(simulation, record.measured)
+        after = undelayed_following(simulation, record.measured)[:, record.seen]
         spread = record.spread[: record.num_readings]
         return [
             np.nan_to_num(after[windows.rows[:, None] + windows.horizons - 1] / spread - one, nan=DIVERGED)
@@ -139,8 +139,8 @@ class Predictions:
         """Variance of the errors by sensor noise and uncertain start states, (W, h, n) for each kind of windows."""
         record, noise = self.record, self.starts.noise
         observed = record.simulation.pipeline.observe_memoryless
-        zeros, step = np.zeros(len(noise.sensor)), record.simulation.control_step
-        gain = observed(zeros + 1.0, step) - observed(zeros, step)
+        zeros, step = np.zeros(len(record.simulation.state_map.names)), record.simulation.control_step
+        gain = (observed(zeros + 1.0, step) - observed(zeros, step))[record.seen]
         floor = np.zeros((self.blocks.num_horizons, len(noise.sensor))) if self.floor is None else self.floor
         return [
             gain**2 * (self.starts.spread_ahead(windows) + noise.sensor**2)
@@ -171,7 +171,7 @@ class Predictions:
                 time=measured.time[windows.rows],
                 activations=active[windows.rows],
             )
-            found.append(simulation.observed(reached[:, windows.horizons - 1]) / record.spread[:n])
+            found.append(simulation.observed(reached[:, windows.horizons - 1])[..., record.seen] / record.spread[:n])
         return found
 
 

@@ -188,7 +188,9 @@ class Steps:
         miss = base - after - (slope @ about[..., None])[..., 0]
         known = np.asarray(np.isfinite(slope).all((2, 3)) & np.isfinite(miss).all(2))
         slope, miss = np.where(known[..., None, None], slope, np.eye(m)), np.where(known[..., None], miss, 0.0)
-        third = np.abs(np.diff(record.readings[0][rows], 3, axis=1) / record.spread[: record.num_readings])
+        third = np.abs(
+            np.diff(record.readings[0][:, record.seen][rows], 3, axis=1) / record.spread[: record.num_readings]
+        )
         jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
         return cls(record, rows, about, slope, miss, live, known, jerk)
 
@@ -247,7 +249,7 @@ class Steps:
         n, action = self.record.num_readings, float(self.record.measured.action.std(0).mean())
         miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
         size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
-        if self.record.positions_of_velocities:
+        if self.record.without_velocities:
             return Noise(self.jerk, size, action)
         clipped = np.clip(miss / size, -CLIP, CLIP)[..., :n]
         slope = self.slope[:, 1:, :n, :n] * size[:n] / size[:n, None]
