@@ -211,11 +211,17 @@ def with_intervals(
 ) -> tuple[Found, Sequence[Mapping[str, float]], Sequence[Sequence[Found]]]:
     """A set fitted to the rows for fits and for selection, with half-widths of its intervals, and its alternatives.
 
-    Effects whose interval holds their neutral value are left out, the least certain ones first, while there is time.
+    Every horizon counts alike in this fit: values hold for simulations of any length, and small errors in the many
+    short windows do not outweigh large ones far ahead. Effects whose interval holds their neutral value are left out,
+    the least certain ones first, while there is time.
     """
-    model = ground.model(found.effects)
-    parts = [replace(part, floor=None).of_simulation(ground.simulation) for part in (model.fit, model.selection)]
-    fit = fit_set(parts, found.entries, found.effects, most_steps=GROWN, intervals=True)
+    effects = found.effects
+    for is_last in (False, True):
+        model = ground.model(effects)
+        both = (replace(part, floor=None, counts=()) for part in (model.fit, model.selection))
+        parts = [part.of_simulation(ground.simulation) for part in both]
+        fit = fit_set(parts, found.entries, effects, most_steps=GROWN, intervals=is_last)
+        effects = fit.effects
     for _ in range(MOST_LEFT_OUT):
         sizes = [_certainty(effect, half) for effect, half in zip(fit.effects, fit.half_widths, strict=True)]
         least = max(NEUTRAL, min(sizes, default=math.inf))
