@@ -1,11 +1,12 @@
-"""The entries that a search tries: late velocities only where the positions show them."""
+"""Late velocities are read off the data, where the positions show them."""
 
 import numpy as np
 import pytest
 
 from tests.data.audit.recorded import arm, changed, recording
 from torchrl_h2o.effects import ActionNoise, ObservationDelay
-from torchrl_h2o.residuals.offered import offered_entries
+from torchrl_h2o.residuals.offered import late_velocities, offered_entries
+from torchrl_h2o.residuals.record import Record
 
 
 def filtered(rows: np.ndarray) -> np.ndarray:
@@ -15,17 +16,24 @@ def filtered(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-@pytest.mark.parametrize(
-    ("data", "late"),
-    [
-        (recording(noise=0.0), False),
-        (recording(noise=0.01), False),
-        (recording(ActionNoise(0.2), noise=0.0), False),
-        (changed(recording(noise=0.0), filtered), True),
-    ],
-)
-def test_velocities_may_be_late_if_the_positions_show_it(data, late):
-    delays = [
-        entry.effect.entries for entry in offered_entries(arm(), data) if isinstance(entry.effect, ObservationDelay)
-    ]
-    assert delays == ([None, (2, 3)] if late else [None])
+def test_some_sensors_alone_are_not_late_in_a_search():
+    delays = [entry.effect for entry in offered_entries(arm()) if isinstance(entry.effect, ObservationDelay)]
+    assert [delay.entries for delay in delays] == [None]
+
+
+@pytest.mark.parametrize("data", [recording(noise=0.0), recording(noise=0.01), recording(ActionNoise(0.2), noise=0.0)])
+def test_velocities_that_are_not_late_stay_readings(data):
+    delay, same = late_velocities(arm(), data)
+    assert delay is None
+    assert same is data
+
+
+def test_filtered_velocities_are_late_and_say_nothing_new():
+    data = changed(recording(noise=0.0), filtered)
+    delay, without = late_velocities(arm(), data)
+    assert delay.effect.entries == (2, 3)
+    low, high = delay.ci95["delay"]
+    assert low < delay.effect.delay < high
+    assert low < 0.6 * arm().control_step < high
+    assert without.estimated_std[:2].max() == 0.0 < without.estimated_std[2:].min()
+    assert Record(arm(), without).seen.tolist() == [0, 1]

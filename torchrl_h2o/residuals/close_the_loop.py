@@ -22,7 +22,7 @@ from torchrl_h2o.residuals.evidence import Evidence, gather_evidence, why_no_con
 from torchrl_h2o.residuals.explanation import Explanation
 from torchrl_h2o.residuals.judge.judgement import judge
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT, Measured
-from torchrl_h2o.residuals.offered import offered_entries
+from torchrl_h2o.residuals.offered import late_velocities, offered_entries
 from torchrl_h2o.residuals.progress import NOISE, REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.search import search
@@ -96,7 +96,7 @@ def close_the_loop(
             if (reason := why_no_conclusion(simulation, measured)) is not None:
                 return inconclusive_report(simulation, measured, reason, audit)
             bar.keep_for_report(time.perf_counter() - begin)
-            entries = offered_entries(simulation, measured) if catalogue is None else catalogue
+            entries = offered_entries(simulation) if catalogue is None else catalogue
             evidence = gather_evidence(simulation, measured, audit=audit)
             explanation = explain(
                 evidence,
@@ -105,6 +105,7 @@ def close_the_loop(
                 known=known,
                 so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
                 settings=settings,
+                late=catalogue is None,
             )
         except OutOfTimeError as end:
             reason = f"the time was up while {end}, before there was a first result; give more minutes"
@@ -159,6 +160,7 @@ def explain(
     known: Sequence[Effect] = (),
     so_far: Callable[[Explanation, str], object] = lambda explanation, stage: None,
     settings: LoopSettings = DEFAULTS,
+    late: bool = False,
 ) -> Explanation:
     """Explains the residual: effects of the catalogue and forces outside it, then action noise.
 
@@ -169,11 +171,13 @@ def explain(
         known: effects from which the search begins.
         so_far: called with a preliminary explanation, as it grows, and the current stage.
         settings: significance level.
+        late: whether to read off the data how late velocities are against their positions.
 
     Returns:
         The explanation, without any parts if nothing is missing; the one so far if the time of ``progress`` is up.
     """
     simulation, measured = evidence.simulation, evidence.undisturbed
+    delay, measured = late_velocities(simulation, measured) if late else (None, measured)
     explanations: list[Explanation] = []
 
     def better(explanation: Explanation) -> None:
@@ -188,6 +192,8 @@ def explain(
         if not explanations:  # the data cannot be searched at all
             raise
         found = explanations[-1].with_failure(f"the search for further effects failed: {error}")
+    if delay is not None:
+        found = found.with_parts((*found.parts, delay))
     if found.ended_in is not None or progress.time_is_up:
         return replace(found, ended_in=found.ended_in or NOISE)
     progress.stage(NOISE)

@@ -1,33 +1,52 @@
-"""The entries of the catalogue that a search tries on given data."""
+"""What a search tries on given data: the catalogue, but for late velocities, which are read off the data."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
 
 from torchrl_h2o.data.audit.derivative import fit_derivative
 from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.effects import CatalogueEntry, ObservationDelay
+from torchrl_h2o.residuals.explanation import Part
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+LATE = 0.5  # rows by which a velocity is late against the derivative of its position if a filter computed it
+LAG_ERROR = 0.25  # rows by which this lag is uncertain at least
 
-def offered_entries(simulation: Simulation, measured: Measured) -> tuple[CatalogueEntry, ...]:
-    """Returns the catalogue of a simulator; with a delay of the velocities only if the data alone show it.
 
-    Undoing a delay of some sensors averages neighbouring rows. This also lowers the residual of a noisy process, so the
-    held-out loss does not tell whether there is such a delay. The positions do: their derivative is then early.
+def offered_entries(simulation: Simulation) -> tuple[CatalogueEntry, ...]:
+    """The catalogue of a simulator without delays of some sensors; see :func:`late_velocities`."""
+    return tuple(
+        entry
+        for entry in simulation.catalogue()
+        if not (isinstance(entry.effect, ObservationDelay) and entry.effect.entries is not None)
+    )
+
+
+def late_velocities(simulation: Simulation, measured: Measured) -> tuple[Part | None, Measured]:
+    """A delay of the velocities that are late against their positions, and the data in which they say nothing new.
+
+    A filter computed such velocities from the positions. Errors of successive rows are then alike, and no effect of the
+    machine explains them.
 
     Args:
         simulation: the simulator.
         measured: the data.
+
+    Returns:
+        The delay, None without one, and the data with these columns as ones that were estimated from others.
     """
-    entries = simulation.catalogue()
-    return entries if velocities_are_late(simulation, measured) else tuple(e for e in entries if not _is_partial(e))
-
-
-def velocities_are_late(simulation: Simulation, measured: Measured) -> bool:
-    """Whether a velocity is late against the derivative of its position, by more than half a row."""
     log = Log.of(measured, simulation)
-    return any(fit_derivative(log, pair).lag > 0.5 for pair in log.pairs)
-
-
-def _is_partial(entry: CatalogueEntry) -> bool:
-    return isinstance(entry.effect, ObservationDelay) and entry.effect.entries is not None
+    late = [found for found in (fit_derivative(log, pair) for pair in log.pairs) if found.lag > LATE]
+    if not late:
+        return None, measured
+    lags = np.array([found.lag for found in late])
+    delay, half = (simulation.control_step * rows for rows in (lags.mean(), max(LAG_ERROR, np.ptp(lags) / 2.0)))
+    std = np.zeros(len(log.names)) if measured.estimated_std is None else measured.estimated_std.copy()
+    columns = tuple(sorted(found.pair.velocity for found in late))
+    std[list(columns)] = [max(found.velocity_noise, 1e-12) for found in sorted(late, key=lambda one: one.pair.velocity)]
+    part = Part(ObservationDelay(delay, columns), True, {"delay": (delay - half, delay + half)})
+    return part, replace(measured, estimated_std=std)

@@ -82,22 +82,18 @@ class Record:
         """Indices of the columns, those first that sensors read."""
         return np.append(self.seen, np.delete(np.arange(len(self.simulation.state_map.names)), self.seen))
 
-    @property
-    def without_velocities(self) -> bool:
-        """Whether velocities are known from positions alone."""
-        return bool(self.positions_of_velocities) or len(self.seen) < len(self.simulation.state_map.names)
-
     @cached_property
     def positions_of_velocities(self) -> dict[int, int]:
-        """Index of the observed position of each unobserved velocity."""
+        """Index of the position that a sensor reads of each velocity that none reads."""
         model, state_map = self.simulation.model, self.simulation.state_map
-        observed = np.asarray(state_map.observe.any(0))
+        read, known = (np.asarray(state_map.observe[rows].any(0)) for rows in (self.seen, slice(None)))
         pairs = {
             int(model.nq + model.jnt_dofadr[joint]): int(model.jnt_qposadr[joint])
             for joint in range(model.njnt)
             if model.jnt_type[joint] in _SINGLE
         }
-        return {index: pairs[index] for index in state_map.hidden if index in pairs and observed[pairs[index]]}
+        unread = {*state_map.hidden, *np.flatnonzero(known & ~read).tolist()}
+        return {index: pairs[index] for index in sorted(unread) if index in pairs and read[pairs[index]]}
 
     @cached_property
     def settled(self) -> np.ndarray:
@@ -109,8 +105,8 @@ class Record:
     def states(self) -> tuple[np.ndarray, np.ndarray]:
         """States before and after each step, each (T, nq + nv).
 
-        An unobserved velocity is the derivative of its position, if that is observed. Other unobserved coordinates are
-        those that a simulation along the data reaches.
+        A velocity that no sensor reads is the derivative of its position, if one reads that. Other unobserved
+        coordinates are those that a simulation along the data reaches.
         """
         simulation, measured = self.simulation, self.measured
         before, after = (simulation.state_map.states(readings) for readings in self.readings)

@@ -249,7 +249,7 @@ class Steps:
         n, action = self.record.num_readings, float(self.record.measured.action.std(0).mean())
         miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
         size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
-        if self.record.without_velocities:
+        if self.record.positions_of_velocities:
             return Noise(self.jerk, size, action)
         clipped = np.clip(miss / size, -CLIP, CLIP)[..., :n]
         slope = self.slope[:, 1:, :n, :n] * size[:n] / size[:n, None]
