@@ -198,7 +198,7 @@ def test_action_noise_that_was_found_is_not_missing():
 def test_friction_beside_noise_of_its_size_gets_a_caveat():
     found = JointFrictionLoss(0.15), ActionNoise(0.2)
     (caveat,) = verdict(found, found).caveats
-    assert "such noise can raise the dry friction" in caveat
+    assert "such noise can change the dry friction" in caveat
     assert verdict(found, found[:1]).caveats == ()
 
 

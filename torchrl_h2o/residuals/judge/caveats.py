@@ -1,4 +1,4 @@
-"""What a reader must know of an explanation's values: delays, friction, masses and gains that may be something else."""
+"""What a reader must know of an explanation's values: friction, masses and gains that may be something else."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import (
-    ActionDelay,
     ActionGain,
-    ActionLag,
     ActionNoise,
     BodyMass,
     Effect,
-    ObservationDelay,
     Parameter,
     selection,
 )
@@ -23,44 +20,8 @@ from torchrl_h2o.effects.effect import EntryNames
 from torchrl_h2o.effects.force.residual_force import degrees_of_freedom
 from torchrl_h2o.effects.selection import entry_mask
 from torchrl_h2o.residuals.explanation import Part
-from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.words import effect_words, number, quantity
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-
-def short_delays(effects: Sequence[Effect], measured: Measured, control_step: float) -> tuple[str, ...]:
-    """Says of delays shorter than a control step that the velocities may cause them.
-
-    A velocity that was filtered, or estimated from positions, is an average over neighbouring rows. Part of an action's
-    effect then shows one row later, as with a delay of a fraction of a row.
-
-    Args:
-        effects: the effects found.
-        measured: the data.
-        control_step: the time between two rows, in s.
-
-    Returns:
-        One sentence, or nothing without such a delay or with directly measured velocities.
-    """
-    estimated = measured.estimated_std is not None and bool(measured.estimated_std.any())
-    filtered = any(isinstance(effect, ObservationDelay) and effect.entries is not None for effect in effects)
-    short = [effect for effect in effects if 0.0 < _time(effect) < control_step]
-    if not short or not (estimated or filtered):
-        return ()
-    words = " and ".join(map(effect_words, short))
-    if estimated:
-        return (f"Estimated velocities, too, can look like this: {words}.",)
-    return (f"Filtered velocities, too, can look like this: {words}; better have them estimated (derivative_of).",)
-
-
-def _time(effect: Effect) -> float:
-    """Delay or time constant, in s, of the actuators or of all sensors; 0 for other effects."""
-    if isinstance(effect, ActionLag):
-        return effect.time_constant
-    if isinstance(effect, ActionDelay) or (isinstance(effect, ObservationDelay) and effect.entries is None):
-        return effect.delay
-    return 0.0
-
 
 # share of a dry friction from which noise of the actions at its joint makes its value doubtful
 NOISE_BESIDE_FRICTION = 0.8
@@ -96,8 +57,8 @@ def friction_beside_noise(
     if not doubtful:
         return ()
     return (
-        f"Noise of the actions was found as well, {', '.join(doubtful)}. On a light link, such noise can raise the dry "
-        "friction that is found, in a simulated leg by half; the interval of the friction does not include this error.",
+        f"Noise of the actions was found as well, {', '.join(doubtful)}. On a light link, such noise can change the "
+        "dry friction that is found, in a simulated leg by a fifth; its interval does not include this error.",
     )
 
 

@@ -9,7 +9,7 @@ from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect, JointRange
 from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
-from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios, short_delays
+from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios
 from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, NEGLIGIBLE_ERROR, made_worse
 from torchrl_h2o.residuals.judge.prediction_table import Predicted
 from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
@@ -85,7 +85,6 @@ def reach_verdict(
         else:
             signs = (*worse, *signs)
     caveats = (
-        *short_delays(effects, measured, simulation.control_step),
         *friction_beside_noise(simulation, mended, effects),
         *only_ratios(simulation, effects),
     )
