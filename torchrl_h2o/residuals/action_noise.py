@@ -20,6 +20,7 @@ MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the 
 # plausible noise, in root mean squares of the actions: less is not told from small errors of the simulator
 LEAST, MOST = 0.05, 2.0
 WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
+MOST_LEFT = 1.0 / 3.0  # share of the simulator's error in one step beside which noise of the actions is credible
 OF_NORMAL = 1.175  # standard deviation of the likeliest t-distribution for normal noise; see ``TAIL``
 NUDGE = 0.1  # step of the logarithm of the noise for the curvature of the likelihood
 
@@ -35,6 +36,7 @@ class NoiseEstimate:
         evidence: evidence for it, in nats, in all rows that fits and the selection of effects use.
         confirmed: evidence in the rows for selection alone.
         is_white: whether the errors of successive rows are independent, as noise of the actions makes them.
+        left: share of the simulator's error in one step that the noise does not stand for.
     """
 
     std: float
@@ -42,6 +44,7 @@ class NoiseEstimate:
     evidence: float
     confirmed: float
     is_white: bool
+    left: float
 
 
 def add_action_noise(
@@ -65,7 +68,9 @@ def add_action_noise(
     own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
     mended = simulation.with_effects(*explanation.effects)
     noise = estimate_noise(mended, measured)
-    is_likely = noise.is_white and noise.evidence > -math.log(level) and noise.confirmed > 0.0
+    is_likely = (
+        noise.is_white and noise.left < MOST_LEFT and noise.evidence > -math.log(level) and noise.confirmed > 0.0
+    )
     is_found = is_likely and _is_plausible(measured, noise.std)
     missing = (noise.std**2 if is_found else 0.0) - own_variance
     if abs(missing) <= MIN_CHANGE * own_variance:
@@ -100,9 +105,13 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     std = noisy.action / OF_NORMAL
     half_width = CONFIDENCE * std * scatter / -curvature if curvature < 0.0 else math.inf
     gain = found - without
-    is_white = model.fit.effective_counts(model.fit.errors())[0][0] > WHITE
     return NoiseEstimate(
-        std, half_width, Difference(gain).evidence, Difference(gain[len(fit.rows) :]).evidence, bool(is_white)
+        std,
+        half_width,
+        evidence=Difference(gain).evidence,
+        confirmed=Difference(gain[len(fit.rows) :]).evidence,
+        is_white=bool(model.fit.effective_counts(model.fit.errors())[0][0] > WHITE),
+        left=float(np.median(noisy.step / silent.step)),
     )
 
 

@@ -222,7 +222,7 @@ class Steps:
         for index in range(actions.shape[-1]):
             # a step towards zero, because the control range may clamp a step outwards
             step = np.zeros_like(actions)
-            size = NUDGE * (np.abs(actions[..., index]).max() + ROUNDING)
+            size = NUDGE * (np.abs(actions[..., index]).max(initial=0.0) + ROUNDING)
             step[..., index] = np.where(actions[..., index] > 0.0, -size, size)
             after = _reached(self.record, self.record.simulation, self.rows, self.about, actions + step)
             found[..., index] = (after - before) / step[..., index, None]
@@ -305,9 +305,9 @@ def _reached(
 ) -> np.ndarray:
     """Coordinates one control step after rows (B, L) with deviations (B, L, m), in spreads."""
     flat, executed = rows.ravel(), record.executed[rows] if actions is None else actions
-    states = record.states[0][flat] + (moved.reshape(len(flat), -1) * record.spread) @ record.into_state.T
+    states = record.states[0][flat] + (moved.reshape(-1, len(record.spread)) * record.spread) @ record.into_state.T
     at = {"time": record.measured.time[flat], "activations": record.activations[flat]}
-    reached = simulation.rollout(states, executed.reshape(len(flat), 1, -1), **at)[:, 0]
+    reached = simulation.rollout(states, executed.reshape(len(flat), 1, executed.shape[-1]), **at)[:, 0]
     return (reached @ record.from_state.T / record.spread).reshape(moved.shape)
 
 
