@@ -67,6 +67,12 @@ def test_the_simulator_s_own_noise_is_left_out():
     assert noisy.std == plain.std
 
 
+@pytest.mark.parametrize("std", [0.02, 0.3])
+def test_a_simulator_with_the_noise_of_the_data_lacks_none(std):
+    simulation = pendulum().with_effects(ActionNoise(std))
+    assert noise_found(simulation, recorded(simulation, 3000))[0] == 0.0
+
+
 def test_derivatives_are_those_of_one_step():
     simulation, measured = pendulum(), recorded(pendulum(), 300)
     record = Record(simulation, measured)

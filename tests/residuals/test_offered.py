@@ -37,3 +37,11 @@ def test_filtered_velocities_are_late_and_say_nothing_new():
     assert low < 0.6 * arm().control_step < high
     assert without.estimated_std[:2].max() == 0.0 < without.estimated_std[2:].min()
     assert Record(arm(), without).seen.tolist() == [0, 1]
+
+
+def test_a_delay_that_the_simulator_has_is_not_found_again():
+    data = changed(recording(noise=0.0), filtered)
+    delay, _ = late_velocities(arm(), data)
+    again, without = late_velocities(arm(delay.effect), data)
+    assert again is None
+    assert without.estimated_std[2:].min() > 0.0

@@ -17,7 +17,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import USUAL_FACTORS, Steps
 
 MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
-# plausible noise, in root mean squares of the actions: less is not told from small errors of the simulator
+# plausible noise, in root mean squares of the actions: a smaller change is not told from errors of the simulator
 LEAST, MOST = 0.05, 2.0
 WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
 MOST_LEFT = 1.0 / 3.0  # share of the simulator's error in one step beside which noise of the actions is credible
@@ -66,17 +66,16 @@ def add_action_noise(
         return explanation  # a free motion
     own = [effect for effect in simulation.effects if isinstance(effect, ActionNoise) and effect.actuators is None]
     own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
-    mended = simulation.with_effects(*explanation.effects)
-    noise = estimate_noise(mended, measured)
-    is_likely = (
-        noise.is_white and noise.left < MOST_LEFT and noise.evidence > -math.log(level) and noise.confirmed > 0.0
-    )
-    is_found = is_likely and _is_plausible(measured, noise.std)
+    noise = estimate_noise(simulation.with_effects(*explanation.effects), measured)
+    asked = float(np.sqrt((measured.action**2).mean()))
+    if not noise.is_white or noise.left > MOST_LEFT or noise.std > MOST * asked:
+        return explanation  # the data do not tell
+    is_found = noise.evidence > -math.log(level) and noise.confirmed > 0.0
     missing = (noise.std**2 if is_found else 0.0) - own_variance
-    if abs(missing) <= MIN_CHANGE * own_variance:
+    if abs(missing) <= max(MIN_CHANGE * own_variance, (LEAST * asked) ** 2):
         return explanation
     std = math.copysign(math.sqrt(abs(missing)), missing)
-    half = noise.half_width if is_found else 0.0
+    half = noise.half_width * noise.std / abs(std) if is_found else 0.0
     part = Part(ActionNoise(std), True, {"std": (std - half, std + half)})
     return explanation.with_parts((*explanation.parts, part))
 
@@ -98,7 +97,8 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     fit, selection = (Steps.of(record, starts.blocks, starts.about, starts.slope) for starts in parts)
     noisy, silent = (fit.noise(fit.fitted_factors(usual)) for usual in (WITH_ACTION, USUAL_FACTORS))
     less, more = (replace(noisy, action=noisy.action * math.exp(step)) for step in (-NUDGE, NUDGE))
-    densities = [steps.filtered([silent, noisy, less, more])[2] for steps in (fit, selection)]
+    noises = [silent, noisy, less, more]
+    densities = [steps.filtered(noises)[2][..., steps.before :].sum(-1) for steps in (fit, selection)]
     without, found, below, above = np.concatenate(densities, axis=1)
     curvature = float((above + below - 2.0 * found).sum()) / NUDGE**2
     scatter = float(np.sqrt((((above - below) / (2.0 * NUDGE)) ** 2).sum()))
@@ -113,9 +113,3 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
         is_white=bool(model.fit.effective_counts(model.fit.errors())[0][0] > WHITE),
         left=float(np.median(noisy.step / silent.step)),
     )
-
-
-def _is_plausible(measured: Measured, std: float) -> bool:
-    """Whether noise is neither next to nothing nor larger than the actions."""
-    asked = float(np.sqrt((measured.action**2).mean()))
-    return LEAST * asked < std < MOST * asked

@@ -193,7 +193,7 @@ def explain(
             raise
         found = explanations[-1].with_failure(f"the search for further effects failed: {error}")
     if delay is not None:
-        found = found.with_parts((*found.parts, delay))
+        found = found.beside(delay)
     if found.ended_in is not None or progress.time_is_up:
         return replace(found, ended_in=found.ended_in or NOISE)
     progress.stage(NOISE)

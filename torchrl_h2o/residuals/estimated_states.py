@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_h2o.residuals.blocks import Blocks, block_steps
+from torchrl_h2o.residuals.blocks import SHORTEST, Blocks, block_steps
 from torchrl_h2o.residuals.measured.residual import start_states
 from torchrl_h2o.residuals.measured.settling import settle
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
@@ -25,7 +25,7 @@ def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray
     Args:
         simulation: simulator with its sensors, delays and unobserved coordinates.
         measured: the data.
-        rows: (W), rows that are needed; all by default. The others have their measured states.
+        rows: (W), rows that are needed; all by default. Others may have their measured states.
 
     Returns:
         (T, nq + nv).
@@ -40,6 +40,9 @@ def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray
     """
     states, steps = start_states(simulation, measured), block_steps(measured, simulation.control_step)
     needed = np.isin(np.arange(len(measured)), np.arange(len(measured)) if rows is None else rows)
+    shortest = min((run.stop - run.start for run in measured.runs if needed[run].any()), default=steps)
+    while steps > max(SHORTEST, shortest):
+        steps //= 2
     first = [row for run in measured.runs for row in _firsts(run, steps) if needed[row : row + steps].any()]
     if not first:
         return states

@@ -92,6 +92,16 @@ class Explanation:
         """The explanation with other parts."""
         return replace(self, parts=tuple(parts))
 
+    def beside(self, part: Part) -> Explanation:
+        """The explanation with a further part, which stands in all alternatives, too."""
+
+        def both(other: Alternative) -> Alternative:
+            return replace(other, together=(*other.together, (part.effect, part.ci95)))
+
+        parts = [replace(one, alike=tuple(map(both, one.alike))) for one in self.parts]
+        others = tuple((*effects, part.effect) for effects in self.others)
+        return replace(self, parts=(*parts, part), others=others)
+
     @property
     def effects(self) -> tuple[Effect, ...]:
         """The effects with their fitted values."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,11 @@ from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.effects import CatalogueEntry, ObservationDelay
 from torchrl_h2o.residuals.explanation import Part
 from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.refit import interval
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 LATE = 0.5  # rows by which a velocity is late against the derivative of its position if a filter computed it
-LAG_ERROR = 0.25  # rows by which this lag is uncertain at least
+LAG_ERROR = 0.5  # rows by which this lag is uncertain at least
 
 
 def offered_entries(simulation: Simulation) -> tuple[CatalogueEntry, ...]:
@@ -39,14 +41,26 @@ def late_velocities(simulation: Simulation, measured: Measured) -> tuple[Part | 
     Returns:
         The delay, None without one, and the data with these columns as ones that were estimated from others.
     """
-    log = Log.of(measured, simulation)
+    log, step = Log.of(measured, simulation), simulation.control_step
     late = [found for found in (fit_derivative(log, pair) for pair in log.pairs) if found.lag > LATE]
     if not late:
         return None, measured
-    lags = np.array([found.lag for found in late])
-    delay, half = (simulation.control_step * rows for rows in (lags.mean(), max(LAG_ERROR, np.ptp(lags) / 2.0)))
+    known = simulation.pipeline.of_kind(ObservationDelay)
+    lags = [
+        found.lag - (_delay(known, found.pair.velocity) - _delay(known, found.pair.position)) / step for found in late
+    ]
+    rows, half = float(np.mean(lags)), max(LAG_ERROR, float(np.ptp(lags)) / 2.0)
     std = np.zeros(len(log.names)) if measured.estimated_std is None else measured.estimated_std.copy()
     columns = tuple(sorted(found.pair.velocity for found in late))
     std[list(columns)] = [max(found.velocity_noise, 1e-12) for found in sorted(late, key=lambda one: one.pair.velocity)]
-    part = Part(ObservationDelay(delay, columns), True, {"delay": (delay - half, delay + half)})
-    return part, replace(measured, estimated_std=std)
+    measured = replace(measured, estimated_std=std)
+    if rows <= LATE:  # the simulator has this delay
+        return None, measured
+    most = ObservationDelay().parameters["delay"].bounds[1]
+    delay = ObservationDelay(min(step * rows, most), columns)
+    return Part(delay, True, {"delay": interval(delay.parameters["delay"], step * half)}), measured
+
+
+def _delay(effects: Sequence[ObservationDelay], column: int) -> float:
+    """Delay of a column by some effects, in s."""
+    return sum(effect.delay for effect in effects if effect.entries is None or column in effect.entries)

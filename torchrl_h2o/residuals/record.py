@@ -102,20 +102,25 @@ class Record:
         return np.array([False] * len(self.simulation.state_map.names) + hidden)
 
     @cached_property
+    def read_states(self) -> tuple[np.ndarray, np.ndarray]:
+        """As :attr:`states`, but without the coordinates that a simulation reaches."""
+        before, after = (self.simulation.state_map.states(readings) for readings in self.readings)
+        for run in self.measured.runs:
+            for velocity, position in self.positions_of_velocities.items():
+                path = np.append(before[run, position], after[run.stop - 1, position])
+                rate = _derivative(path, self.simulation.control_step)
+                before[run, velocity], after[run, velocity] = rate[:-1], rate[1:]
+        return before, after
+
+    @cached_property
     def states(self) -> tuple[np.ndarray, np.ndarray]:
         """States before and after each step, each (T, nq + nv).
 
         A velocity that no sensor reads is the derivative of its position, if one reads that. Other unobserved
         coordinates are those that a simulation along the data reaches.
         """
-        simulation, measured = self.simulation, self.measured
-        before, after = (simulation.state_map.states(readings) for readings in self.readings)
-        derived = self.positions_of_velocities
-        for run in measured.runs:
-            for velocity, position in derived.items():
-                path = np.append(before[run, position], after[run.stop - 1, position])
-                rate = _derivative(path, simulation.control_step)
-                before[run, velocity], after[run, velocity] = rate[:-1], rate[1:]
+        simulation, measured, derived = self.simulation, self.measured, self.positions_of_velocities
+        before, after = (states.copy() for states in self.read_states)
         if others := [index for index in simulation.state_map.hidden if index not in derived]:
             reached = settle(simulation, measured, before.copy(), self.executed, np.arange(len(measured)))
             before[:, others] = after[:, others] = reached[:, others]

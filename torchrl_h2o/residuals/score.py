@@ -18,7 +18,7 @@ from torchrl_h2o.residuals.blocks import Blocks, block_steps
 from torchrl_h2o.residuals.measured.residual import executed_actions, undelayed_following
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
-from torchrl_h2o.residuals.record import Record, true_readings
+from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates, log_density
 
@@ -78,11 +78,10 @@ class Predictions:
     def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Predictions:
         """The same windows from the same start states, predicted by another simulation, or with other commands."""
         own, record = self.record, Record(simulation, measured or self.record.measured)
-        shifts = [np.nan_to_num(new - old) for new, old in zip(record.readings, own.readings, strict=True)]
-        restore = simulation.state_map.restore_observed.T
         # unobserved coordinates stay those that the present simulation has reached
         record.__dict__["states"] = tuple(
-            states + shift @ restore for states, shift in zip(own.states, shifts, strict=True)
+            states + np.nan_to_num(new - old)
+            for states, new, old in zip(own.states, record.read_states, own.read_states, strict=True)
         )
         record.__dict__["spread"] = own.spread
         return replace(self, starts=replace(self.starts, record=record))
@@ -123,8 +122,7 @@ class Predictions:
         else:
             simulation, states = record.simulation.with_effects(*effects), self._states
             if any(isinstance(effect, ObservationEffect) for effect in effects):
-                other, _ = true_readings(simulation, record.measured)
-                shift = np.nan_to_num(other - record.readings[0]) @ record.simulation.state_map.restore_observed.T
+                shift = np.nan_to_num(Record(simulation, record.measured).read_states[0] - record.read_states[0])
                 states = [s + shift[windows.rows] for windows, s in zip(self.blocks.windows, states, strict=True)]
             predicted = self._predicted(simulation, states)
         after = undelayed_following(simulation, record.measured)[:, record.seen]

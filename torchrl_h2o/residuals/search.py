@@ -216,7 +216,7 @@ def with_intervals(
     the least certain ones first, while there is time.
     """
     effects = found.effects
-    for is_last in (False, True):
+    for is_last in (False, True) if effects else (True,):
         model = ground.model(effects)
         both = (replace(part, floor=None, counts=()) for part in (model.fit, model.selection))
         parts = [part.of_simulation(ground.simulation) for part in both]

@@ -148,6 +148,7 @@ class Steps:
 
     Args:
         record: the log and the simulation.
+        blocks: the blocks.
         rows: (B, L), rows of the log.
         about: (B, L, m), deviations about which it is linearised.
         slope: (B, L, m, m).
@@ -158,6 +159,7 @@ class Steps:
     """
 
     record: Record
+    blocks: Blocks
     rows: np.ndarray
     about: np.ndarray
     slope: np.ndarray
@@ -192,10 +194,15 @@ class Steps:
             np.diff(record.readings[0][:, record.seen][rows], 3, axis=1) / record.spread[: record.num_readings]
         )
         jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
-        return cls(record, rows, about, slope, miss, live, known, jerk)
+        return cls(record, blocks, rows, about, slope, miss, live, known, jerk)
+
+    @property
+    def before(self) -> int:
+        """Number of rows before each block, which belong to the block before it."""
+        return self.rows.shape[1] - self.blocks.steps
 
     def noise(self, factors: np.ndarray) -> Noise:
-        """The noise with given logarithms of its two factors on :meth:`_typical_noise`."""
+        """The noise with given logarithms of its two or three factors on :meth:`_typical_noise`."""
         return self._typical_noise().scaled(*np.exp(factors))
 
     def fitted_factors(self, usual: np.ndarray = USUAL_FACTORS) -> np.ndarray:
@@ -209,7 +216,7 @@ class Steps:
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
         for spacing in SPACINGS:
             tried = best + spacing * around
-            densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2].sum(1)
+            densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2].sum((1, 2))
             best = tried[densities.argmax()]
         return tried[len(tried) // 2] + spacing * _highest(around, densities)
 
@@ -228,7 +235,7 @@ class Steps:
             found[..., index] = (after - before) / step[..., index, None]
         return np.nan_to_num(found)
 
-    def _by_actions(self, std: float, row: int, some: slice) -> np.ndarray:
+    def _covariance_by_actions(self, std: float, row: int, some: slice) -> np.ndarray:
         """Covariance of the coordinates by noise of the actions, (B, m, m): the control range clamps some of it."""
         model, actions = self.record.simulation.model, self.record.executed[self.rows[some, row]]
         limits = np.where(model.actuator_ctrllimited.astype(bool)[:, None], model.actuator_ctrlrange, [-np.inf, np.inf])
@@ -246,7 +253,8 @@ class Steps:
         Noise of a row enters the step that ends at this row and the step that starts there, with opposite signs. Where
         velocities are not measured, the third differences of the positions tell the noise.
         """
-        n, action = self.record.num_readings, float(self.record.measured.action.std(0).mean())
+        n, actions = self.record.num_readings, self.record.measured.action
+        action = float(np.sqrt((actions**2).mean())) if actions.size else 0.0
         miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
         size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
         if self.record.positions_of_velocities:
@@ -263,7 +271,7 @@ class Steps:
         """Filters blocks under each of K noises.
 
         Returns:
-            Means, (K, B, L, m), covariances, (K, B, L, m, m), and the log density of the next readings, (K, B).
+            Means, (K, B, L, m), covariances, (K, B, L, m, m), and log densities of the next readings, (K, B, L).
         """
         n, m = self.record.num_readings, self.miss.shape[-1]
         slope, miss, live, known = (values[some] for values in (self.slope, self.miss, self.live, self.known))
@@ -274,7 +282,7 @@ class Steps:
         begin = np.pad(sensor, ((0, 0), (0, 0), (0, m - n), (0, m - n))) + np.diag(np.arange(m) >= n)
         mean, covariance = np.zeros((len(noises), *live.shape, m)), np.zeros((len(noises), *live.shape, m, m))
         x, doubt = np.zeros((len(noises), len(live), m)), np.repeat(begin, len(live), axis=1)
-        density, most = np.zeros((len(noises), len(live))), np.where(np.arange(m) < n, MOST_DOUBT, 1.0)
+        density, most = np.zeros(mean.shape[:-1]), np.where(np.arange(m) < n, MOST_DOUBT, 1.0)
         follows = ~self.record.settled
         for row in range(live.shape[1]):
             mean[:, :, row], covariance[:, :, row] = x, doubt
@@ -282,12 +290,12 @@ class Steps:
             doubt = slope[:, row] @ doubt @ slope[:, row].transpose(0, 2, 1) + step
             for one, noise in enumerate(noises):
                 if noise.action:
-                    doubt[one] += self._by_actions(noise.action, row, some)
+                    doubt[one] += self._covariance_by_actions(noise.action, row, some)
             factor = np.linalg.cholesky(doubt[..., :n, :n] + sensor)
             white = np.linalg.solve(factor, -guess[..., :n, None])[..., 0]
             square, valid = (white**2).mean(-1), live[:, row] & known[:, row]
             log_det = np.log(np.einsum("kbii->kbi", factor)).sum(-1)
-            density += np.where(valid, log_density(white).sum(-1) - log_det, 0.0)
+            density[:, :, row] = np.where(valid, log_density(white).sum(-1) - log_det, 0.0)
             # where the simulator is wrong, such as at an impact, or unknown, the filter follows the readings
             trust = np.where(known[:, row], np.where(square > SURPRISE, square, 1.0), 1.0 / ROUNDING**2)
             inflated = np.where(follows, np.sqrt(trust)[..., None], 1.0)
