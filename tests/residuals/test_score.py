@@ -113,16 +113,6 @@ def test_the_velocity_of_a_measured_position_is_filtered_and_not_simulated():
     assert np.abs(rates - whole.observation[:, 2:]).mean() < 0.1 * whole.observation[:, 2:].std()
 
 
-def test_a_sensor_s_gain_is_as_good_a_candidate_as_it_is_in_the_simulator():
-    """Where velocities are estimated from positions, a wrong gain changes these velocities, too."""
-    simulation, gain = double_pendulum(), ObservationGain(1.25, (0,))
-    known = np.array([0.0, 0.0, 0.1, 0.1])
-    measured = replace(recorded(simulation.with_effects(gain), 1500, 1e-3), estimated_std=known)
-    ground = Ground.of(simulation, measured, (gain,))
-    within = ground.model((gain,)).fit.score()
-    assert ground.fit_part((gain,)).score((gain,)) == pytest.approx(within, rel=0.02)
-
-
 def test_an_effect_too_many_predicts_no_better(measured):
     more = difference(measured, (TRUTH, Gravity(1.02)), (TRUTH,))
     assert np.isfinite(more.by_block).all()

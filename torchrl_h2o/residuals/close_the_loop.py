@@ -52,8 +52,8 @@ def close_the_loop(
     Args:
         simulator: a TorchRL env of a Gymnasium MuJoCo task, with its gaps, or a :class:`Simulation`.
         data: transitions (T,) in TED, as the readers of :mod:`torchrl_h2o.data` return them, or :class:`Measured`.
-        catalogue: effects to try; by default those of :meth:`Simulation.catalogue`, with a delay of the velocities only
-            if they are late against their positions.
+        catalogue: effects to try; by default those of :meth:`Simulation.catalogue`, but a delay of
+            the velocities is read off the data.
         source: name of the data in the report.
         held_out: share of the transitions, taken from the end, on which errors are reported, or the indices of the
             logs on which they are, where the data have the entry ``"log"``; see :meth:`Measured.from_ted`.
@@ -182,7 +182,7 @@ def explain(
 
     def better(explanation: Explanation) -> None:
         explanations.append(explanation)
-        so_far(explanation, "effects were tried")
+        so_far(explanation if delay is None else explanation.beside(delay), "effects were tried")
 
     try:
         found = search(
@@ -202,5 +202,5 @@ def explain(
         return add_action_noise(simulation, measured, found, settings.level)
     except OutOfTimeError:
         return replace(found, ended_in=NOISE)
-    except FAILURES as error:  # a constant action makes the equations singular
+    except FAILURES as error:
         return found.with_failure(f"the search for action noise failed: {error}")

@@ -195,10 +195,6 @@ class Measured:
         """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``max_windows``."""
         return self.spread_windows(Split.FIT, horizon)
 
-    def selected_on(self, horizon: int = 1) -> np.ndarray:
-        """First rows, (W), of the windows by which effects are chosen, as :meth:`fitted`."""
-        return self.spread_windows(Split.SELECTION, horizon)
-
     def reported_on(self, horizon: int = 1) -> np.ndarray:
         """First rows, (W), of the windows on which errors are reported, as :meth:`fitted`."""
         return self.spread_windows(Split.REPORT, horizon)
