@@ -19,6 +19,7 @@ from torchrl_h2o.residuals.start_states import USUAL_FACTORS, Steps
 MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
 # plausible noise, in root mean squares of the actions: a smaller change is not told from errors of the simulator
 LEAST, MOST = 0.05, 2.0
+CLEARLY_LESS = 0.25  # share of the simulator's own variance below which any estimate says that it has too much
 WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
 MOST_LEFT = 1.0 / 3.0  # share of the simulator's error in one step beside which noise of the actions is credible
 OF_NORMAL = 1.175  # standard deviation of the likeliest t-distribution for normal noise; see ``TAIL``
@@ -68,9 +69,10 @@ def add_action_noise(
     own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
     noise = estimate_noise(simulation.with_effects(*explanation.effects), measured)
     asked = float(np.sqrt((measured.action**2).mean()))
-    if not noise.is_white or noise.left > MOST_LEFT or noise.std > MOST * asked:
+    is_credible = noise.is_white and noise.left < MOST_LEFT and noise.std < MOST * asked
+    if not is_credible and noise.std**2 > CLEARLY_LESS * own_variance:
         return explanation  # the data do not tell
-    is_found = noise.evidence > -math.log(level) and noise.confirmed > 0.0
+    is_found = is_credible and noise.evidence > -math.log(level) and noise.confirmed > 0.0
     missing = (noise.std**2 if is_found else 0.0) - own_variance
     if abs(missing) <= max(MIN_CHANGE * own_variance, (LEAST * asked) ** 2):
         return explanation
