@@ -229,6 +229,10 @@ class Gains:
         pull = np.linalg.pinv(self._inverse[np.ix_(own, own)]) @ moves
         return self._inverse[:, own] @ pull, float(moves @ pull)
 
+    def evidence_for(self, moves: np.ndarray) -> float:
+        """Evidence for present effects that moves of the variables (p) take to neutral, if errors are linear."""
+        return -self._evidence(self._gains(self.beside @ moves))
+
     @cached_property
     def _readjust(self) -> np.ndarray:
         """(p, N): moves of the values of the present effects that make up for a whitened change."""

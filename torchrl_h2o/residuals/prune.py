@@ -12,6 +12,7 @@ from torchrl_h2o.residuals.refit import variables_of, with_values
 from torchrl_h2o.residuals.score import Difference
 from torchrl_h2o.residuals.sweep import Direction
 
+SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
 SWAPS = 4  # largest number of effects that are replaced by others
 
 
@@ -36,6 +37,10 @@ def prune(ground: Ground, found: Found) -> Found:
         least = min(others, key=lambda names: moved[names][1])
         slopes = gains.slopes[:, [found.entries[one.effect].name not in least for one in variables]]
         moves, _ = moved[least]
+        fewer = Found(*found.without(least), found.scores)
+        if gains.evidence_for(moves) > SURE * ground.needed(found, fewer):
+            kept.add(least)
+            continue
         readjusted = replace(found, effects=with_values(found.effects, variables, moves))
         try:
             fewer = ground.sketched(part, *readjusted.without(least), GROWN, slopes)
