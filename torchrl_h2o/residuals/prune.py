@@ -37,8 +37,8 @@ def prune(ground: Ground, found: Found) -> Found:
         least = min(others, key=lambda names: moved[names][1])
         slopes = gains.slopes[:, [found.entries[one.effect].name not in least for one in variables]]
         moves, _ = moved[least]
-        fewer = Found(*found.without(least), found.scores)
-        if gains.evidence_for(moves) > SURE * ground.needed(found, fewer):
+        entries, effects = found.without(least)
+        if gains.evidence_for(moves) > SURE * ground.needed(found, Found(entries, effects, found.scores)):
             kept.add(least)
             continue
         readjusted = replace(found, effects=with_values(found.effects, variables, moves))
