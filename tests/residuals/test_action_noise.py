@@ -1,5 +1,7 @@
 """Action noise is found where it makes the readings likelier, beside noise of the sensors, and not elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -26,7 +28,7 @@ def noise_found(simulation, measured):
 def test_noise_of_the_action_is_found_on_a_pendulum(std, sensors):
     simulation = pendulum()
     found, _ = noise_found(simulation, recorded(simulation.with_effects(ActionNoise(std)), 3000, noise=sensors))
-    assert found == pytest.approx(std, rel=0.15)
+    assert found == pytest.approx(std, rel=0.1)
 
 
 @pytest.mark.slow
@@ -37,7 +39,7 @@ def test_noise_of_the_action_is_found_on_hopper():
     data = env.rollout(1500, break_when_any_done=False)
     simulation = Simulation.from_env(GymEnv("Hopper-v5"))
     found, _ = noise_found(simulation, Measured.from_ted(data, simulation))
-    assert found == pytest.approx(0.2, rel=0.15)
+    assert found == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -91,3 +93,12 @@ def test_noise_is_that_before_the_control_range_cuts_it_off():
     std, half_width = noise_found(simulation, recorded(real, 4000))
     assert std == pytest.approx(0.5, rel=0.1)
     assert abs(std - 0.5) < 2.0 * half_width < 0.1
+
+
+def test_what_scatters_more_than_the_actuators_do_is_not_theirs():
+    """A velocity from a slow encoder has coloured noise, which neither noise model describes."""
+    simulation = pendulum()
+    measured = recorded(simulation.with_effects(ActionNoise(0.2)), 3000)
+    weak = replace(measured, action=0.1 * measured.action)
+    assert noise_found(simulation, measured)[0] > 0.0
+    assert noise_found(simulation.with_effects(ActionGain(10.0)), weak)[0] == 0.0

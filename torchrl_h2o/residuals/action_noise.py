@@ -14,7 +14,7 @@ from torchrl_h2o.residuals.refit import CONFIDENCE
 from torchrl_h2o.residuals.score import WHITE, Difference, Model
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.start_states import USUAL_FACTORS, Steps
+from torchrl_h2o.residuals.start_states import OF_NORMAL, USUAL_FACTORS, Steps
 
 MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
 # plausible noise, in root mean squares of the actions: a smaller change is not told from errors of the simulator
@@ -22,7 +22,6 @@ LEAST, MOST = 0.05, 2.0
 CLEARLY_LESS = 0.25  # share of the simulator's own variance below which any estimate says that it has too much
 WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
 MOST_LEFT = 1.0 / 3.0  # share of the simulator's error in one step beside which noise of the actions is credible
-OF_NORMAL = 1.175  # standard deviation of the likeliest t-distribution for normal noise; see ``TAIL``
 NUDGE = 0.1  # step of the logarithm of the noise for the curvature of the likelihood
 
 
@@ -97,7 +96,7 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     model = Model.of(simulation, measured)
     record, parts = model.fit.record, (model.fit.starts, model.selection.starts)
     fit, selection = (Steps.of(record, starts.blocks, starts.about, starts.slope) for starts in parts)
-    noisy, silent = (fit.noise(fit.fitted_factors(usual)) for usual in (WITH_ACTION, USUAL_FACTORS))
+    noisy, silent = (fit.noise(factors) for factors in (fit.fitted_factors(WITH_ACTION), model.fit.starts.factors))
     less, more = (replace(noisy, action=noisy.action * math.exp(step)) for step in (-NUDGE, NUDGE))
     noises = [silent, noisy, less, more]
     densities = [steps.filtered(noises)[2][..., steps.before :].sum(-1) for steps in (fit, selection)]

@@ -11,7 +11,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.score import FIT_ROWS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.start_states import Noise, StartStates
+from torchrl_h2o.residuals.start_states import OF_NORMAL, Noise, StartStates
 
 # sensor noise, in spreads, up to which a reading counts as free of noise
 NOISELESS = 1e-4
@@ -38,21 +38,21 @@ def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray
         >>> estimate_states(simulation, Measured.from_ted(data, simulation)).shape
         (300, 8)
     """
-    states, steps = start_states(simulation, measured), block_steps(measured, simulation.control_step)
+    steps = block_steps(measured, simulation.control_step)
     needed = np.isin(np.arange(len(measured)), np.arange(len(measured)) if rows is None else rows)
     shortest = min((run.stop - run.start for run in measured.runs if needed[run].any()), default=steps)
     while steps > max(SHORTEST, shortest):
         steps //= 2
     first = [row for run in measured.runs for row in _firsts(run, steps) if needed[row : row + steps].any()]
     if not first:
-        return states
+        return start_states(simulation, measured, rows)
     record = Record(simulation, measured)
     starts = StartStates.of(record, Blocks(np.array(first), steps), _noise(simulation, measured))
     _, filtered = starts.of_rows
     simulated = np.array(simulation.state_map.hidden, int)[record.settled[len(simulation.state_map.names) :]]
-    filtered[:, simulated] = settle(simulation, measured, filtered, record.executed, np.flatnonzero(needed))[
-        :, simulated
-    ]
+    if len(simulated):
+        reached = settle(simulation, measured, filtered, record.executed, np.flatnonzero(needed))
+        filtered[:, simulated] = reached[:, simulated]
     return filtered
 
 
@@ -70,7 +70,7 @@ def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | Non
     spread = measured.observation.std(0)
     std = np.zeros(len(spread)) if measured.estimated_std is None else measured.estimated_std.copy()
     seen = Record(simulation, measured).seen
-    std[seen] = _noise(simulation, measured).sensor * spread[seen]
+    std[seen] = _noise(simulation, measured).sensor * spread[seen] / OF_NORMAL
     return std if (std > NOISELESS * spread).any() else None
 
 

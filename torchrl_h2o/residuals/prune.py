@@ -26,32 +26,35 @@ def prune(ground: Ground, found: Found) -> Found:
     pairs = zip(found.entries, found.effects, strict=True)
     if idle := {entry.name for entry, effect in pairs if is_negligible(effect, entry.trials)}:
         found = ground.found(*found.without(idle))
-    while others := [names for names in _of_each_kind(found) if names not in kept]:
-        part = ground.fit_part(found.effects)
-        variables = variables_of(part, found.entries, found.effects)
-        gains = gains_beside(part, found, found.slopes)
-        moved = {
-            names: gains.readjusted([i for i, one in enumerate(found.entries) if one.name in names], variables)
-            for names in others
-        }
-        least = min(others, key=lambda names: moved[names][1])
-        slopes = gains.slopes[:, [found.entries[one.effect].name not in least for one in variables]]
-        moves, _ = moved[least]
-        entries, effects = found.without(least)
+    while (fewer := _smaller(ground, found, kept)) is not None:
+        found = fewer
+    return found if found is before else ground.fitted(found.entries, found.effects)
+
+
+def _smaller(ground: Ground, found: Found, kept: set[frozenset[str]]) -> Found | None:
+    """The set without the first kind of effects that the rows do not need; each that was tried is added to ``kept``."""
+    part = ground.fit_part(found.effects)
+    variables = variables_of(part, found.entries, found.effects)
+    gains = gains_beside(part, found, found.slopes)
+    tried = []
+    for names in _of_each_kind(found):
+        if names not in kept:
+            dropped = [index for index, entry in enumerate(found.entries) if entry.name in names]
+            tried.append((names, *gains.readjusted(dropped, variables)))
+    for names, moves, _ in sorted(tried, key=lambda one: one[2]):
+        kept.add(names)
+        entries, effects = found.without(names)
         if gains.evidence_for(moves) > SURE * ground.needed(found, Found(entries, effects, found.scores)):
-            kept.add(least)
             continue
         readjusted = replace(found, effects=with_values(found.effects, variables, moves))
+        slopes = gains.slopes[:, [found.entries[one.effect].name not in names for one in variables]]
         try:
-            fewer = ground.sketched(part, *readjusted.without(least), GROWN, slopes)
+            fewer = ground.sketched(part, *readjusted.without(names), GROWN, slopes)
         except ValueError:  # the model rejects the others alone
-            kept.add(least)
             continue
-        if ground.adds(found, fewer):
-            kept.add(least)
-        else:
-            found = fewer
-    return found if found is before else ground.fitted(found.entries, found.effects)
+        if not ground.adds(found, fewer):
+            return fewer
+    return None
 
 
 def _of_each_kind(found: Found) -> list[frozenset[str]]:

@@ -12,7 +12,7 @@ from scipy.signal import savgol_filter
 from torchrl_h2o.effects import ObservationEffect
 from torchrl_h2o.residuals.measured.residual import executed_actions
 from torchrl_h2o.residuals.measured.settling import activations, settle
-from torchrl_h2o.residuals.measured.transitions import Measured
+from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 DERIVATIVE_ROWS = 7  # rows from which an unobserved velocity is computed: a parabola through the positions
@@ -130,8 +130,9 @@ class Record:
 
     @cached_property
     def spread(self) -> np.ndarray:
-        """Standard deviation of each coordinate, (m), in its unit; those of the readings are those of the log."""
-        spread = np.nanstd(self.states[0] @ self.from_state.T, axis=0)
+        """Standard deviation of each coordinate, (m), in its unit: of a reading in the log, else in rows for fits."""
+        fitted = self.measured.split == Split.FIT
+        spread = np.nanstd(self.states[0][fitted] @ self.from_state.T, axis=0)
         spread[: self.num_readings] = self.measured.observation[:, self.seen].std(0)
         return np.where(spread > STILL, spread, 1.0)
 

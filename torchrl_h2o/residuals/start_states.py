@@ -22,6 +22,7 @@ BEFORE = 16  # largest number of rows before each block on which the filter sett
 NUDGE = 1e-3  # step of the finite differences, in spreads
 ROUNDING = 1e-6  # rounding of a reading, in spreads: that of single precision, with a margin
 TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
+OF_NORMAL = 1.175  # standard deviation of the likeliest such distribution for normal noise, in that of the noise
 CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
 LINEARISED = 2  # times that the steps of the simulation are linearised, about better states each time

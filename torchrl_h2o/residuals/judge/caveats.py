@@ -58,7 +58,7 @@ def friction_beside_noise(
         return ()
     return (
         f"Noise of the actions was found as well, {', '.join(doubtful)}. On a light link, such noise can change the "
-        "dry friction that is found, in a simulated leg by a fifth; its interval does not include this error.",
+        "dry friction that is found, in a simulated leg by a quarter; its interval does not include this error.",
     )
 
 
