@@ -79,7 +79,7 @@ def test_parts_of_the_report_for_which_there_is_no_time_are_named():
 
 def test_a_search_whose_time_is_up_does_not_say_that_nothing_is_missing():
     """No test on so few and noisy rows shows this gravity; the whole search finds it."""
-    measured = recorded(SIMULATION.with_effects(Gravity(1.07)), 600, noise=0.02)
+    measured = recorded(SIMULATION.with_effects(Gravity(1.06)), 600, noise=0.02)
     report, _ = closed_within(3000, measured, [GRAVITY], slow=20.0)
     assert report.verdict.kind == UNDECIDED
     assert not report.verdict.undetectable
