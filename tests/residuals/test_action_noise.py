@@ -52,6 +52,20 @@ def test_a_missing_force_is_no_noise():
     assert noise_found(pendulum(), recorded(pendulum().with_effects(Gravity(1.1)), 3000, noise=0.002))[0] == 0.0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_force_too_small_to_be_found_is_no_noise(seed):
+    """One per cent of sensor noise hides that its errors last, but noise of the actions does not explain them."""
+    measured = recorded(pendulum().with_effects(Gravity(1.03)), 600, noise=0.01, seed=seed)
+    assert noise_found(pendulum(), measured)[0] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_beside_a_force_too_small_to_be_found_is_found(seed):
+    real = pendulum().with_effects(Gravity(1.03), ActionNoise(0.1))
+    found, half_width = noise_found(pendulum(), recorded(real, 3000, noise=0.01, seed=seed))
+    assert abs(found - 0.1) < max(0.03, half_width)
+
+
 def test_steps_that_are_wrong_because_sensors_are_noisy_are_no_noise_of_the_actions():
     """A double pendulum is chaotic: noise of the sensors makes the linearised steps wrong."""
     assert noise_found(double_pendulum(), recorded(double_pendulum(), 3000, noise=0.005))[0] == 0.0

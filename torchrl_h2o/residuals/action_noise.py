@@ -11,17 +11,17 @@ from torchrl_h2o.effects import ActionNoise
 from torchrl_h2o.residuals.explanation import Explanation, Part
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import CONFIDENCE
-from torchrl_h2o.residuals.score import WHITE, Difference, Model
+from torchrl_h2o.residuals.score import Difference, Model
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.start_states import OF_NORMAL, USUAL_FACTORS, Steps
+from torchrl_h2o.residuals.start_states import OF_NORMAL, USUAL_FACTORS, Noise, Steps
 
 MIN_CHANGE = 0.1  # smallest reported change, as a share of the variance of the simulator's own action noise
 # plausible noise, in root mean squares of the actions: a smaller change is not told from errors of the simulator
 LEAST, MOST = 0.05, 2.0
 CLEARLY_LESS = 0.25  # share of the simulator's own variance below which any estimate says that it has too much
-WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
 MOST_LEFT = 1.0 / 3.0  # share of the simulator's error in one step beside which noise of the actions is credible
+WITH_ACTION = np.append(USUAL_FACTORS, -2.0)  # logarithms of factors of the noise from which a fit begins
 NUDGE = 0.1  # step of the logarithm of the noise for the curvature of the likelihood
 
 
@@ -33,9 +33,9 @@ class NoiseEstimate:
         std: standard deviation of the executed action about the commanded one, in units of the action, the same for all
             actuators.
         half_width: half-width of its 95 % interval.
-        evidence: evidence for it, in nats, in all rows that fits and the selection of effects use.
+        evidence: evidence for it, in nats, in all rows that fits and the selection of effects use: against no noise of
+            the actions, and against errors of the actions that last for some rows, as a missing force is.
         confirmed: evidence in the rows for selection alone.
-        is_white: whether the errors of successive rows are independent, as noise of the actions makes them.
         left: share of the simulator's error in one step that the noise does not stand for.
     """
 
@@ -43,7 +43,6 @@ class NoiseEstimate:
     half_width: float
     evidence: float
     confirmed: float
-    is_white: bool
     left: float
 
 
@@ -68,7 +67,7 @@ def add_action_noise(
     own_variance = sum(math.copysign(effect.std**2, effect.std) for effect in own)
     noise = estimate_noise(simulation.with_effects(*explanation.effects), measured)
     asked = float(np.sqrt((measured.action**2).mean()))
-    is_credible = noise.is_white and noise.left < MOST_LEFT and noise.std < MOST * asked
+    is_credible = noise.left < MOST_LEFT and noise.std < MOST * asked
     if not is_credible and noise.std**2 > CLEARLY_LESS * own_variance:
         return explanation  # the data do not tell
     is_found = is_credible and noise.evidence > -math.log(level) and noise.confirmed > 0.0
@@ -84,8 +83,9 @@ def add_action_noise(
 def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     """Estimates the noise of the executed action beside that of the sensors and errors of the simulator.
 
-    A Kalman filter predicts the next readings, with noise of the actions and without it. Each time, the factors on the
-    noise of the sensors and on the simulator's errors are those under which the readings for fits are likeliest. The
+    A Kalman filter predicts the next readings under three hypotheses: noise of the actions, none, and errors of the
+    actions that last for some rows, as those of a missing force do. The factors on the noise of the sensors, on the
+    simulator's errors and on the noise of the actions are those under which the readings for fits are likeliest. The
     evidence is the difference of the log densities, paired over blocks. MuJoCo clamps controls at the ends of their
     range, and so the noise.
 
@@ -99,18 +99,25 @@ def estimate_noise(simulation: Simulation, measured: Measured) -> NoiseEstimate:
     noisy, silent = (fit.noise(factors) for factors in (fit.fitted_factors(WITH_ACTION), model.fit.starts.factors))
     less, more = (replace(noisy, action=noisy.action * math.exp(step)) for step in (-NUDGE, NUDGE))
     noises = [silent, noisy, less, more]
-    densities = [steps.filtered(noises)[2][..., steps.before :].sum(-1) for steps in (fit, selection)]
+    densities = [[_density(steps, one) for one in noises] for steps in (fit, selection)]
     without, found, below, above = np.concatenate(densities, axis=1)
     curvature = float((above + below - 2.0 * found).sum()) / NUDGE**2
     scatter = float(np.sqrt((((above - below) / (2.0 * NUDGE)) ** 2).sum()))
     std = noisy.action / OF_NORMAL
     half_width = CONFIDENCE * std * scatter / -curvature if curvature < 0.0 else math.inf
-    gain = found - without
+    forces = [steps.with_lasting(noisy.action) for steps in (fit, selection)]
+    lasting = forces[0].noise(forces[0].fitted_factors(np.append(model.fit.starts.factors, 0.0)))
+    likeliest = np.concatenate([_density(steps, lasting) for steps in forces])
+    gains = found - without, found - likeliest
     return NoiseEstimate(
         std,
         half_width,
-        evidence=Difference(gain).evidence,
-        confirmed=Difference(gain[len(fit.rows) :]).evidence,
-        is_white=bool(model.fit.effective_counts(model.fit.errors())[0][0] > WHITE),
+        evidence=min(Difference(gain).evidence for gain in gains),
+        confirmed=min(Difference(gain[len(fit.rows) :]).evidence for gain in gains),
         left=float(np.median(noisy.step / silent.step)),
     )
+
+
+def _density(steps: Steps, noise: Noise) -> np.ndarray:
+    """Log density of the next readings under a noise, in each block, (B)."""
+    return steps.filtered([noise])[2][0, :, steps.before :].sum(-1)

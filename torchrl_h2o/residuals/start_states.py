@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -29,6 +29,7 @@ LINEARISED = 2  # times that the steps of the simulation are linearised, about b
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
 USUAL_FACTORS = np.array([0.0, -0.7])
 SPACINGS = (2.0, 1.0, 0.5, 0.2, 0.07)  # of the logarithms that are tried, one grid after another
+LASTS = 0.95  # correlation of lasting errors of the actions in successive rows
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
 
 
@@ -157,6 +158,7 @@ class Steps:
         live: (B, L), False before the beginning of a run.
         known: (B, L), False where the simulation diverges.
         jerk: (n), size of the third differences of the readings over that of white noise.
+        lasting: number of coordinates that are errors of the actions, which last for some rows.
     """
 
     record: Record
@@ -168,6 +170,7 @@ class Steps:
     live: np.ndarray
     known: np.ndarray
     jerk: np.ndarray
+    lasting: int = 0
 
     @classmethod
     def of(
@@ -203,8 +206,15 @@ class Steps:
         return self.rows.shape[1] - self.blocks.steps
 
     def noise(self, factors: np.ndarray) -> Noise:
-        """The noise with given logarithms of its two or three factors on :meth:`_typical_noise`."""
-        return self._typical_noise().scaled(*np.exp(factors))
+        """The noise with given logarithms of its two or three factors on :meth:`_typical_noise`.
+
+        The third is that of the noise of the actions, or of their errors that last.
+        """
+        noise = self._typical_noise.scaled(*np.exp(factors))
+        if not self.lasting:
+            return noise
+        lasting = np.full(self.lasting, noise.action * math.sqrt(1.0 - LASTS**2))
+        return Noise(noise.sensor, np.append(noise.step[: -self.lasting], lasting))
 
     def fitted_factors(self, usual: np.ndarray = USUAL_FACTORS) -> np.ndarray:
         """Logarithms of the factors of the noise under which the next readings are most likely.
@@ -212,12 +222,12 @@ class Steps:
         Args:
             usual: logarithms from which the search begins: of two factors, or of three with that of the action noise.
         """
-        typical, best = self._typical_noise(), usual
+        best = usual
         around = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(usual))))
         some = slice(None, None, max(1, len(self.miss) // NOISE_BLOCKS))
         for spacing in SPACINGS:
             tried = best + spacing * around
-            densities = self.filtered([typical.scaled(*np.exp(one)) for one in tried], some)[2].sum((1, 2))
+            densities = self.filtered([self.noise(one) for one in tried], some)[2].sum((1, 2))
             best = tried[densities.argmax()]
         return tried[len(tried) // 2] + spacing * _highest(around, densities)
 
@@ -236,18 +246,27 @@ class Steps:
             found[..., index] = (after - before) / step[..., index, None]
         return np.nan_to_num(found)
 
-    def _covariance_by_actions(self, std: float, row: int, some: slice) -> np.ndarray:
-        """Covariance of the coordinates by noise of the actions, (B, m, m): the control range clamps some of it."""
-        model, actions = self.record.simulation.model, self.record.executed[self.rows[some, row]]
+    def by_noise(self, std: float, some: slice = slice(None)) -> np.ndarray:
+        """Change of the coordinates by one standard deviation of action noise, (B, L, m, nu): the range clamps some."""
+        model, actions = self.record.simulation.model, self.record.executed[self.rows[some]]
         limits = np.where(model.actuator_ctrllimited.astype(bool)[:, None], model.actuator_ctrlrange, [-np.inf, np.inf])
         actions = np.clip(actions, *limits.T)
         low, high = (np.clip((limit - actions) / std, -40.0, 40.0) for limit in limits.T)
         # second moment of a normal variable that is clamped to two limits
         inside = norm.cdf(high) - norm.cdf(low) - high * norm.pdf(high) + low * norm.pdf(low)
         left = np.maximum(inside + low**2 * norm.cdf(low) + high**2 * norm.sf(high), 0.0)
-        change = std * self.by_action[some, row] * np.sqrt(left)[:, None]
-        return change @ change.swapaxes(-1, -2)
+        return std * self.by_action[some] * np.sqrt(left)[..., None, :]
 
+    def with_lasting(self, std: float) -> Steps:
+        """The same steps, in which errors of the actions last for some rows: further coordinates, in units of std."""
+        change, m = self.by_noise(std), self.miss.shape[-1]
+        nu = change.shape[-1]
+        slope = np.zeros((*self.miss.shape[:2], m + nu, m + nu))
+        slope[..., :m, :m], slope[..., :m, m:] = self.slope, change
+        slope[..., range(m, m + nu), range(m, m + nu)] = LASTS
+        return replace(self, slope=slope, miss=np.pad(self.miss, ((0, 0), (0, 0), (0, nu))), lasting=nu)
+
+    @cached_property
     def _typical_noise(self) -> Noise:
         """Noise of the sensors by the products of successive misses, and the size of the misses.
 
@@ -255,7 +274,7 @@ class Steps:
         velocities are not measured, the third differences of the positions tell the noise.
         """
         n, actions = self.record.num_readings, self.record.measured.action
-        action = float(np.sqrt((actions**2).mean())) if actions.size else 0.0
+        action = 1.0 if self.lasting else float(np.sqrt((actions**2).mean())) if actions.size else 0.0
         miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
         size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
         if self.record.positions_of_velocities:
@@ -283,15 +302,17 @@ class Steps:
         begin = np.pad(sensor, ((0, 0), (0, 0), (0, m - n), (0, m - n))) + np.diag(np.arange(m) >= n)
         mean, covariance = np.zeros((len(noises), *live.shape, m)), np.zeros((len(noises), *live.shape, m, m))
         x, doubt = np.zeros((len(noises), len(live), m)), np.repeat(begin, len(live), axis=1)
-        density, most = np.zeros(mean.shape[:-1]), np.where(np.arange(m) < n, MOST_DOUBT, 1.0)
-        follows = ~self.record.settled
+        density, follows = np.zeros(mean.shape[:-1]), np.append(~self.record.settled, np.zeros(self.lasting, bool))
+        most = np.full(m, MOST_DOUBT)
+        most[n : m - self.lasting] = 1.0
+        changes = [self.by_noise(noise.action, some) if noise.action else None for noise in noises]
         for row in range(live.shape[1]):
             mean[:, :, row], covariance[:, :, row] = x, doubt
             guess = (slope[:, row] @ x[..., None])[..., 0] + miss[:, row]
             doubt = slope[:, row] @ doubt @ slope[:, row].transpose(0, 2, 1) + step
-            for one, noise in enumerate(noises):
-                if noise.action:
-                    doubt[one] += self._covariance_by_actions(noise.action, row, some)
+            for one, change in enumerate(changes):
+                if change is not None:
+                    doubt[one] += change[:, row] @ change[:, row].swapaxes(-1, -2)
             factor = np.linalg.cholesky(doubt[..., :n, :n] + sensor)
             white = np.linalg.solve(factor, -guess[..., :n, None])[..., 0]
             square, valid = (white**2).mean(-1), live[:, row] & known[:, row]
