@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ def provenance(since: float = 0.0) -> dict[str, Any]:
 
 def cpu_seconds() -> float:
     """CPU time that this process and its ended children have used, in s."""
-    return sum(os.times()[:4])
+    return time.process_time() + sum(os.times()[2:4])
 
 
 def _versions() -> dict[str, str]:

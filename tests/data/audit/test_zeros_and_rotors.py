@@ -1,5 +1,6 @@
 """Angles counted from elsewhere, encoders that slip, and rotors that a model lacks, in logs of a motored arm."""
 
+import re
 from dataclasses import replace
 
 import mujoco
@@ -15,7 +16,7 @@ from torchrl_h2o.residuals import Simulation, StateMap
 def test_zero_on_the_other_side_of_the_turn(good, simulation):
     (found,) = audit(changed(good, lambda rows: rows - np.array([np.pi, 0, 0, 0])), simulation).severe
     words = found.words
-    assert "if the zero of shoulder is shifted by -3.1" in words
+    assert re.search("if the zero of shoulder is shifted by -?3.1", words)  # both are half a turn
     assert "half a turn" in words
 
 

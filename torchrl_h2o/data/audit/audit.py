@@ -16,8 +16,7 @@ from torchrl_h2o.data.audit.excitation import check_excitation
 from torchrl_h2o.data.audit.finding import SEVERITIES, Finding
 from torchrl_h2o.data.audit.kinematics import check_kinematics
 from torchrl_h2o.data.audit.log import AuditedSimulation, Log
-from torchrl_h2o.data.audit.model import check_belonging, check_model
-from torchrl_h2o.data.audit.regression import with_rotors
+from torchrl_h2o.data.audit.model import check_model
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.audit.rows import check_rows
 from torchrl_h2o.data.audit.time import check_step, check_time
@@ -116,17 +115,11 @@ def audit(measured: TensorDictBase | Any, simulation: AuditedSimulation) -> Audi
         words = "the data hold too few unbroken rows of positions and velocities to compare them with the simulator"
         words += ", contacts left out" if touching.any() else ""
         return ordered([*found, Finding("model", "note", words), *check_actions(log, None)])
-    (response, said), known = with_rotors(response), response.simulation
-    found += said
-    if any(finding.severity == "warning" for finding in said):
-        return ordered(found)
-    found += check_model(response)
+    found += check_actions(log, response)
     if not any(finding.severity == "severe" for finding in found):
-        # a rotor of another size looks like another gain
-        gains = response.simulation is known
-        found += check_actions(log, response, lateness=lateness(derivatives), gains=gains)
+        found += check_model(response, lateness(derivatives))
     if not any(finding.severity == "severe" for finding in found):
-        found += [*check_belonging(response), *check_excitation(response)]
+        found += check_excitation(response)
     return ordered(found)
 
 

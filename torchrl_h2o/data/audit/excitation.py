@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.data.audit.finding import Finding
-from torchrl_h2o.data.audit.regression import NEGLIGIBLE
 from torchrl_h2o.data.audit.response import Response
 
 CHECK = "excitation"
+NEGLIGIBLE = 0.02  # size of a response, in usual changes of the velocities, below which it shows nothing
 ALIKE = 0.9  # cosine of the angle between two effects' sensitivities from which they look alike
 COMBINED = 0.92  # correlation with the other effects of a joint from which an effect looks like their combination
 _JOINT = ("dry friction", "viscous friction", "armature")

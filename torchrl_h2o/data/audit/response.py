@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,7 +17,7 @@ LONGEST_STEPS = 200  # physics steps of a window up to which MIN_WINDOWS are sim
 HYPOTHESIS_WINDOWS = 200  # windows on which a hypothesis such as exchanged joints is simulated at most
 HYPOTHESIS_STEPS = 1_000  # physics steps of one hypothesis at most
 LONGEST_WINDOW = 0.1  # s
-SIGNAL_TO_NOISE = 4.0  # change of the velocities within a window, in standard deviations of their noise
+SIGNAL_TO_NOISE = 4.0  # change of the velocities within a window, in standard deviations of their noise, as a rule
 DROWNED = 0.6  # noise of a change, in usual changes, above which a bad fit is no evidence against the data
 SETTLING_STEPS = 12  # control steps from which unobserved coordinates are simulated
 NUDGE = 0.02  # step of derivatives, in ranges or spreads of an action
@@ -38,6 +38,9 @@ class Response:
         activations: activations of the actuators before each row, (T, na).
         moving: columns of the observed velocities, (m,).
         noise: standard deviation of the noise of each observation, (n,); None if it is not known.
+        like: similar windows, whose derivatives are taken for those of these windows; None to compute them.
+        held: usual effect of the actions on each velocity, in its usual changes, (m,), at least 1.
+        is_known: whether the simulator is that of the user, without rotors of a size that was tried.
     """
 
     log: Log
@@ -49,20 +52,26 @@ class Response:
     activations: np.ndarray
     moving: np.ndarray
     noise: np.ndarray | None = None
+    like: Response | None = None
+    held: np.ndarray = field(default_factory=lambda: np.ones(1))
+    is_known: bool = True
 
     @classmethod
-    def of(cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None) -> Response | None:
+    def of(
+        cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None, signal: float = SIGNAL_TO_NOISE
+    ) -> Response | None:
         """Chooses windows in which the velocities change by more than their noise; None without enough of them.
 
         Args:
             log: the data.
             simulation: the simulator.
             noise: standard deviation of the noise of each observation, (n,); None for windows of one step.
+            signal: change of the velocities within a window, in standard deviations of their noise.
         """
         moving = np.array([velocity.column for velocity in log.velocities], int)
         if not len(moving):
             return None
-        horizon = 1 if noise is None else _horizon(log, moving, noise)
+        horizon = 1 if noise is None else _horizon(log, moving, noise, signal)
         margin = SETTLING_STEPS if simulation.state_map.hidden else 0
         length = simulation.frame_skip * horizon
         fewest = MIN_WINDOWS if length <= LONGEST_STEPS else 0
@@ -89,20 +98,34 @@ class Response:
 
     def thinned(self, most: int) -> Response:
         """At most ``most`` of the windows, evenly spread."""
-        chosen = np.unique(np.linspace(0, len(self.starts) - 1, min(most, len(self.starts))).round().astype(int))
-        return replace(self, starts=self.starts[chosen], states=self.states[chosen])
+        return self.at(np.unique(np.linspace(0, len(self.starts) - 1, min(most, len(self.starts))).round().astype(int)))
+
+    def at(self, windows: np.ndarray) -> Response:
+        """Some of the windows: indices or a mask."""
+        return replace(self, starts=self.starts[windows], states=self.states[windows])
 
     def for_hypotheses(self) -> Response:
         """As many of the windows as a hypothesis may simulate."""
         most = HYPOTHESIS_STEPS // (self.simulation.frame_skip * self.horizon)
-        return self.thinned(int(np.clip(most, 30, HYPOTHESIS_WINDOWS)))
+        return self.thinned(int(np.clip(most, MIN_WINDOWS, HYPOTHESIS_WINDOWS)))
 
     def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Response:
-        """The same windows with changed observations (..., n)."""
+        """The same windows with changed observations (..., n), and with the derivatives of these windows."""
         observation, following = change(self.log.observation), change(self.log.following)
         moved = observation[self.starts] - self.log.observation[self.starts]
         states = self.states + moved @ self.simulation.state_map.restore.T
-        return replace(self, log=replace(self.log, observation=observation, following=following), states=states)
+        return replace(
+            self, log=replace(self.log, observation=observation, following=following), states=states, like=self
+        )
+
+    def shifted(self, shifts: np.ndarray, windows: np.ndarray | None = None) -> Response:
+        """The same windows with shifts of the positions of the pairs, (pairs,), in some windows, (W,), or in all."""
+        states = self.states.copy()
+        moved = np.broadcast_to(shifts, (len(states), len(shifts)))
+        states[:, [pair.coordinate for pair in self.log.pairs]] += (
+            moved if windows is None else moved * windows[:, None]
+        )
+        return replace(self, states=states, like=self)
 
     @property
     def before(self) -> np.ndarray:
@@ -140,6 +163,8 @@ class Response:
         The logged actions, or zero if they do not reduce the simulator's error: linearising about wrong actions adds an
         error correlated with them.
         """
+        if self.like is not None and self.like.actions is self.actions:
+            return self.like.anchor
         logged = self.limited[self.rows]
         without = self.misfit(actions=np.zeros_like)
         return logged if without > self.misfit() else np.zeros_like(logged)
@@ -164,14 +189,13 @@ class Response:
         actions: np.ndarray,
         applied: np.ndarray | None = None,
         simulation: AuditedSimulation | None = None,
-        lag: int = 0,
     ) -> np.ndarray:
         """Simulated observations at the end of windows, (B, n), from states (B, nq + nv) and actions (B, H, nu).
 
-        The states are those of all windows, once or several times; their activations are those ``lag`` rows before.
+        The states are those of all windows, once or several times.
         """
         chosen = self.simulation if simulation is None else simulation
-        activations = self.activations[np.clip(self.starts - lag, 0, len(self.log) - 1)]
+        activations = self.activations[self.starts]
         activations = np.tile(activations, (len(states) // len(self.starts), 1))
         end = chosen.rollout(states, actions, activations=activations, applied=applied)[:, -1]
         return self.simulation.state_map.observations(end)
@@ -205,6 +229,8 @@ class Response:
     @cached_property
     def by_action(self) -> np.ndarray:
         """Derivative of the change by a constant offset of each action, (W, m, nu), by differences inside its range."""
+        if self.like is not None:
+            return self.like.by_action
         base, number = self.anchor, self.anchor.shape[-1]
         if not number:  # a model without actuators
             return np.zeros((*self.change.shape, 0))
@@ -221,6 +247,8 @@ class Response:
     @cached_property
     def by_force(self) -> np.ndarray:
         """Derivative of the change by a constant force on each velocity's degree of freedom, (W, m, m)."""
+        if self.like is not None:
+            return self.like.by_force
         dofs, model = [velocity.dof for velocity in self.log.velocities], self.simulation.model
         inertia = 1.0 / np.maximum(model.dof_invweight0[dofs], 1e-9)  # diagonal
         size = np.maximum(NUDGE * inertia * self.scale / (self.horizon * self.log.dt), 1e-9)
@@ -233,6 +261,8 @@ class Response:
     @cached_property
     def by_zero(self) -> np.ndarray:
         """Derivative of the change by the zero of each pair's position, (W, m, pairs)."""
+        if self.like is not None:
+            return self.like.by_zero
         pairs = self.log.pairs
         if not pairs:  # of wheels, whose speed alone is measured
             return np.zeros((*self.change.shape, 0))
@@ -251,29 +281,23 @@ class Response:
         known &= self.log.run[inside + self.horizon - 1] == self.log.run[self.starts]
         return (sums[inside + self.horizon] - sums[inside]) / self.horizon, known
 
-    def misfit_at_lag(self, lag: int) -> float:
-        """:meth:`misfit` if actions act some rows later than their rows say."""
-        rows = np.clip(self.rows - lag, 0, len(self.log) - 1)
-        return self.misfit(actions=lambda _: self.limited[rows], lag=lag)
-
-    def misfit(self, actions: Callable[[np.ndarray], np.ndarray] | None = None, lag: int = 0) -> float:
+    def misfit(self, actions: Callable[[np.ndarray], np.ndarray] | None = None) -> float:
         """Unexplained share of the change of the velocities: median error over median change, mean over velocities.
 
         Args:
             actions: changes the actions (W, H, nu) first, also to another number of steps; None for none.
-            lag: rows by which the actions are late, for the activations.
         """
         executed = self.limited[self.rows]
         if actions is not None:
             executed = np.clip(actions(executed), *self._range)
-        error = np.abs(self.change - (self.reached(self.states, executed, lag=lag)[:, self.moving] - self.before))
+        error = np.abs(self.change - (self.reached(self.states, executed)[:, self.moving] - self.before))
         error = np.where(np.isfinite(error), error, np.inf)
         usual = np.median(np.abs(self.change), axis=0)
         share = np.median(error, axis=0) / np.where(usual > 0.0, usual, np.inf)
         return float(np.minimum(share, 3.0).mean())
 
 
-def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray) -> int:
+def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, signal: float) -> int:
     """Shortest window in which the median velocity changes by a multiple of its noise."""
     longest = max(1, int(LONGEST_WINDOW / log.dt))
     horizon = 1
@@ -283,7 +307,7 @@ def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray) -> int:
             break
         change = (log.following[starts + horizon - 1] - log.observation[starts])[:, moving]
         usual = np.median(np.abs(change), axis=0)
-        if np.median(usual / np.maximum(noise[moving], 1e-12)) >= SIGNAL_TO_NOISE:
+        if np.median(usual / np.maximum(noise[moving], 1e-12)) >= signal:
             break
         horizon = min(2 * horizon, longest)
     return horizon

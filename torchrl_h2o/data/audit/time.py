@@ -10,7 +10,7 @@ import numpy as np
 from torchrl_h2o.data.audit.derivative import KNOWN_FACTOR, RELATED, SCALE_SEVERE, SCALE_WARNING, Derivative
 from torchrl_h2o.data.audit.finding import Finding, Rows
 from torchrl_h2o.data.audit.log import AuditedSimulation, Log
-from torchrl_h2o.data.audit.regression import BETTER, MISFIT
+from torchrl_h2o.data.audit.physics import BETTER
 from torchrl_h2o.data.audit.response import MIN_WINDOWS, PHYSICS_STEPS, ZERO_NUDGE, Response
 
 CHECK = "time"
@@ -136,8 +136,6 @@ def check_step(step: Response | None) -> list[Finding]:
     columns = [column for pair in step.log.pairs for column in (pair.position, pair.velocity)]
     few = replace(step.for_hypotheses(), moving=np.array(columns))
     misfit = few.misfit()
-    if misfit <= MISFIT:
-        return []
     left = {
         number: few.misfit(actions=lambda actions, number=number: np.repeat(actions, number, axis=1))
         for number in STEP_MULTIPLES

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import takewhile
 
-from torchrl_h2o.data.audit.model import CHECK as MODEL_CHECK
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.effects.effect import EntryNames
 from torchrl_h2o.residuals.progress import FORCES, NOISE
@@ -28,6 +27,7 @@ from torchrl_h2o.residuals.report.words import (
     quantity,
 )
 
+MODEL_CHECK = "model"  # findings about the columns and the simulator
 NAMED = 4  # undetectable effects that the sentence names
 MIN_WORDS_ALIKE = 2  # words with which two phrases must begin to be put together
 NOT_IN_CATALOGUE, NOT_SO_FAR = "this catalogue does not explain", "the search has not explained"
