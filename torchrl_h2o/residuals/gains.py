@@ -303,8 +303,10 @@ class Gains:
         return shares, gram
 
     def _lead(self, directions: tuple[Direction, ...], shares: np.ndarray, change: np.ndarray) -> Lead:
-        gains = self._gains(change)
-        return Lead(directions, tuple(map(float, shares)), float(gains.sum()) / self.num_blocks, self._evidence(gains))
+        # errors of the estimate raise the likeliest variances, which all blocks share, also those without an error
+        gains, at_hand = self._gains(change), (log_density(self.white + change) - self._present) * self.share
+        evidence = max(self._evidence(gains), self._evidence(at_hand))
+        return Lead(directions, tuple(map(float, shares)), float(gains.sum()) / self.num_blocks, evidence)
 
     def moves_beside(self, lead: Lead) -> np.ndarray:
         """Estimated moves of the values of the present effects beside a candidate, (p)."""
