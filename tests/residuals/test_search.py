@@ -29,7 +29,7 @@ from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.refit import flat
-from torchrl_h2o.residuals.search import known_set, with_intervals
+from torchrl_h2o.residuals.search import disjoint, known_set, with_intervals
 from torchrl_h2o.residuals.sweep import Direction, sweep
 
 SIMULATION = double_pendulum()
@@ -205,6 +205,33 @@ def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():
     gravity = direction.effect(lead.shares[0])
     assert gravity.scale == pytest.approx(0.5, abs=0.01)
     assert lead.gain == pytest.approx(rough.score([gravity]) - rough.score(), rel=0.1)
+
+
+def test_a_lead_that_acts_in_few_blocks_counts_though_its_estimate_is_inexact():
+    """The other blocks have hardly any error, and lose by the variance that the errors of the estimate ask for."""
+    size, rng = 400, np.random.default_rng(0)
+    block, change = np.repeat(np.arange(20), size // 20), np.where(np.arange(size) < 100, 1e4, 0.0)
+    change *= rng.standard_normal(size)
+    ones, none = np.ones(size), np.zeros((size, 0))
+    entry = SIMULATION.catalogue()[0]
+    white = -change * (1.0 + 0.01 * rng.standard_normal(size)) + 1e-3 * rng.standard_normal(size)
+    (lead,) = Gains(white, ones, ones, none, block, np.zeros(size, int), ones).leads(
+        [Direction(entry, entry.trials[-1], change)]
+    )
+    assert lead.evidence > 3.0
+
+
+def test_one_effect_on_each_joint_stands_for_a_shared_one_and_a_further_one():
+    effects = JointDamping(0.01, "*"), Gravity(1.1), JointDamping(0.02, "elbow")
+    entries = [entry_of(one, SIMULATION.catalogue()) for one in effects]
+    assert None not in entries
+    sets = Found(tuple(one for one in entries if one), effects, np.zeros(0))
+    alike = [[sets], [], [sets]]
+    apart, others = disjoint(sets, alike, SIMULATION.catalogue(), SIMULATION)
+    assert values(apart.effects) == pytest.approx(
+        {("Gravity", None): 1.1, ("JointDamping", "shoulder"): 0.01, ("JointDamping", "elbow"): 0.03}
+    )
+    assert others == [[], [], []]
 
 
 def test_two_candidates_are_tried_together_that_explain_little_one_by_one():

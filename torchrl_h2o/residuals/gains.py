@@ -78,7 +78,7 @@ class Lead:
             alone = {entry.name for entry in entries if entry.name in self.names}
             for entry, effect in zip(entries, effects, strict=True):
                 own = [
-                    _sum(one, effect)
+                    summed(one, effect)
                     if type(one) is type(effect) and (entry.name == d.entry.name or entry.name not in alone)
                     else one
                     for d, one in zip(self.directions, own, strict=True)
@@ -90,8 +90,8 @@ class Lead:
         )
 
 
-def _sum(effect: Effect, present: Effect) -> Effect:
-    """An effect of one parameter with that of another one of its kind in it."""
+def summed(effect: Effect, present: Effect) -> Effect:
+    """An effect with the parameters of another one of its kind in it."""
     values = {}
     for name, parameter in effect.parameters.items():
         other = present.parameters[name].value

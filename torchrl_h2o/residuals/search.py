@@ -13,8 +13,10 @@ from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.effects.model.joint import LOCKED, JointRange
+from torchrl_h2o.residuals.elements import elements
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
 from torchrl_h2o.residuals.forces.candidates import force_entry
+from torchrl_h2o.residuals.gains import summed
 from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, grow, is_preferred, with_force
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -26,7 +28,7 @@ from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.score import Difference, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.sweep import Direction, sweep
+from torchrl_h2o.residuals.sweep import Direction, alone_on, sweep
 
 RESWEPT = 64  # entries of the largest estimated gain, which are simulated again in later sweeps
 NEUTRAL = 0.1  # half-widths from neutral up to which effects are left out together
@@ -92,7 +94,7 @@ def search(
         alike, unseen = _searched(grounds, measured, latest[0], catalogue, progress, better, tried)
     except OutOfTimeError as end:
         ended_in = str(end)
-    found = latest[-1]
+    found, alike = disjoint(latest[-1], alike, catalogue, simulation)
     progress.begin_last_fit(bool(found.entries))
     try:
         explanation = _explanation(*with_intervals(grounds[-1], found, alike))
@@ -204,6 +206,35 @@ def _unseen(
     effects = [largest[name] for name in missed]
     first = {type(effect): effect for effect in reversed(effects)}
     return tuple(sorted(effects, key=lambda effect: effect is not first[type(effect)]))
+
+
+def disjoint(
+    found: Found, alike: Sequence[Sequence[Found]], catalogue: Sequence[CatalogueEntry], simulation: Simulation
+) -> tuple[Found, Sequence[Sequence[Found]]]:
+    """A set and its alternatives, in which one effect on each joint stands for a shared one beside further ones.
+
+    *Stiffness of both feet + 60, stiffness of the back foot + 60* becomes 120 for the back foot and 60 for the front
+    foot. A set that would grow by this stays as it is.
+    """
+    alone = alone_on(catalogue, simulation)
+    for entry, effect in zip(found.entries, found.effects, strict=True):
+        own = [alone.get((type(effect), index)) for index in elements(effect, simulation)]
+        further = {one.name for one in own if one is not None} & found.names - {entry.name}
+        if len(effect.parameters) == 1 and further and None not in own and len(own) <= 1 + len(further):
+            present = dict(zip((one.name for one in found.entries), found.effects, strict=True))
+            singles = [one for one in own if one is not None]
+            shared = {name: parameter.value for name, parameter in effect.parameters.items()}
+            values = [one.effect.with_parameters(shared) for one in singles]
+            values = [
+                summed(value, present[one.name]) if one.name in further else value
+                for one, value in zip(singles, values, strict=True)
+            ]
+            left_out = further | {entry.name}
+            kept = found.without(left_out)
+            sets = [one for own_entry, one in zip(found.entries, alike, strict=False) if own_entry.name not in left_out]
+            entries, effects = (*kept[0], *singles), (*kept[1], *values)
+            return replace(found, entries=entries, effects=effects, slopes=None), [*sets, *([] for _ in singles)]
+    return found, alike
 
 
 def with_intervals(

@@ -91,7 +91,7 @@ def sweep(
     """
     quick, simulation = predictions.quick, predictions.record.simulation
     before = flat(quick.errors(beside))
-    alone = _alone(entries, simulation)
+    alone = alone_on(entries, simulation)
     found: dict[str, list[Direction]] = {}
     shared: list[tuple[CatalogueEntry, list[CatalogueEntry]]] = []
     for entry in entries:
@@ -122,7 +122,7 @@ def sweep(
     return [direction for directions in found.values() for direction in reversed(directions)]
 
 
-def _alone(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tuple[type, int], CatalogueEntry]:
+def alone_on(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tuple[type, int], CatalogueEntry]:
     """The entries that act on a single joint or motor, by kind and index."""
     found = {}
     for entry in entries:
