@@ -295,13 +295,12 @@ def _late(response: Response, lag: int, lateness: float) -> list[Finding]:
 def _columns(few: Response, plain: Explained) -> Iterator[Rival]:
     """The columns of positions and velocities in other units, with other signs, exchanged, or relative to the world.
 
-    All are tried in some of the windows, with the derivatives of the windows as they are; the best ones again in all.
+    All are tried with the derivatives of the columns as they are; the best ones again with their own.
     """
     changes = [*_hypotheses(few.log.pairs, few.log.observation), *absolute_angles(few.log.pairs, few.simulation.model)]
     tried = [few.changed(change) for change, _ in changes]
-    best = set(np.argsort([explain(one).share for one in tried])[:2]) | set(
-        np.argsort([one.misfit() for one in tried])[:2]
-    )
+    left = [explain(one).share for one in tried], [one.misfit() for one in tried]
+    best = {int(index) for shares in left for index in np.argsort(shares)[:2]}
     for change, words in (changes[index] for index in sorted(best)):
         explained = explain(replace(few.changed(change), like=None))
         words, remedy = _leaves(plain, explained) + words, "correct units, signs or order of the columns"
