@@ -1,13 +1,16 @@
 """Audits of good and of damaged logs of a motored arm."""
 
 import json
+from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 
 from tests.data.audit.recorded import (
     NAMES,
+    XML,
     arm,
     changed,
     holding,
@@ -26,7 +29,7 @@ from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.data.audit.response import Response
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, BodyMass, Gravity, JointDamping, JointFrictionLoss
-from torchrl_h2o.residuals import Simulation
+from torchrl_h2o.residuals import Simulation, StateMap
 
 DEGREES = 180.0 / np.pi
 
@@ -308,3 +311,39 @@ def test_actions_of_an_arm_with_heavy_rotors_are_not_exchanged(simulation):
     rows = np.vstack([np.zeros(4), reality.rollout(np.zeros((1, 4)), action[None])[0]])
     rows += 0.001 * rows.std(0) * rng.standard_normal(rows.shape)
     assert audit(measured(rows, action), simulation).severe == ()
+
+
+def test_actions_are_late_and_not_reversed_where_motors_have_a_filter():
+    """Activations follow the actions of each hypothesis."""
+    general = '<general name="m{}" joint="{}" dyntype="filter" dynprm="0.1"/>'
+    motors = "".join(general.format(*one) for one in ((1, "shoulder"), (2, "elbow")))
+    xml = f"{XML[: XML.index('<actuator>')]}<actuator>{motors}</actuator></mujoco>"
+    simulation, rng = replace(arm(), spec=lambda: mujoco.MjSpec.from_string(xml)), np.random.default_rng(0)
+    action = np.zeros((2000, 2))
+    for row in range(1, len(action)):
+        action[row] = 0.9 * action[row - 1] + np.array([2.0, 0.5]) * rng.standard_normal(2)
+    rows = np.vstack([np.zeros(4), simulation.rollout(np.zeros((1, 4)), action[None])[0][:, :4]])
+    rows += 0.005 * rows.std(0) * rng.standard_normal(rows.shape)
+    late = audit(measured(rows, np.roll(action, -6, axis=0)), simulation)
+    assert late.severe == ()
+    assert "6 rows (60 ms) later" in late.warnings[0].words
+    assert "m1 has the other sign" in severe(measured(rows, action * [-1.0, 1.0]), simulation, "actions")
+
+
+def test_a_motor_that_moves_nothing_observed_has_no_unit(good):
+    gripper = '<body><joint name="grip" type="slide"/><geom size="0.01" mass="0.1"/></body></worldbody>'
+    xml = XML.replace("</worldbody>", gripper).replace("</actuator>", '<motor name="m3" joint="grip"/></actuator>')
+    state_map = replace(StateMap.of_coordinates(NAMES, ("rad", "rad", "rad/s", "rad/s"), (0, 1, 3, 4), num_states=6))
+    simulation = replace(
+        arm(), spec=lambda: mujoco.MjSpec.from_string(xml), state_map=replace(state_map, hidden=(2, 5))
+    )
+    action = np.hstack([good.action * [-1.0, 1.0], np.random.default_rng(0).standard_normal((len(good), 1))])
+    found = audit(with_action(good, action), simulation)
+    assert [finding.words for finding in found.severe if "m1 has the other sign" in finding.words]
+    assert not [finding.words for finding in found.findings if "action of m3" in finding.words]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_short_good_log_has_no_warning(seed, simulation):
+    found = audit(recording(seed=seed, rows=70), simulation)
+    assert found.severe == found.warnings == ()

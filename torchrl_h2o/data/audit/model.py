@@ -195,7 +195,7 @@ def _signs(response: Response, plain: Explained) -> Iterator[Rival]:
     names = response.log.actuators
     for index, name in enumerate(names):
         sign = np.where(np.arange(len(names)) == index, -1.0, 1.0)
-        explained = explain(replace(response, actions=sign * response.actions, like=response))
+        explained = explain(response.driven_by(sign * response.actions))
         words = f"{_leaves(plain, explained)}the action of {name} has the other sign"
         yield Rival(explained, plain, lambda words=words: [Finding("actions", "severe", words, None, _SIGN)])
 
@@ -204,8 +204,11 @@ def _gains(response: Response, plain: Explained) -> Iterator[Rival]:
     """Gains of the actions that are negative, or far from the simulator's, in both fits."""
     findings, (low, high), (far_low, far_high) = [], USUAL_GAINS, UNIT_GAINS
     free = explain(response, gains=ANY_GAINS)
-    for name, gains in zip(response.log.actuators, free.gains.T, strict=True):
+    sizes = np.nanmedian(np.abs(response.by_gain) / (response.scale * response.held)[:, None], axis=0).max(0)
+    for name, gains, size in zip(response.log.actuators, free.gains.T, sizes, strict=True):
         gain = float(gains.mean())
+        if size < LITTLE:  # what moves nothing in the simulator has no gain
+            continue
         if gains.max() < 0.0:
             words = f"{_leaves(plain, free)}the action of {name} has the other sign"
             findings.append(Finding("actions", "severe", words, None, _SIGN))
@@ -227,11 +230,17 @@ def _lags(few: Response, lateness: float) -> Iterator[Rival]:
         if known.mean() > 0.5:
             few = few.at(known)
             for lag in range(first, last + 1):
-                found[lag] = explain(replace(few, actions=np.roll(few.actions, lag, axis=0), like=few))
+                found[lag] = explain(few.driven_by(_late_by(lag, few.actions, few.log.runs)))
             break
     best = min(found, key=lambda lag: found[lag].share, default=0)
     if best and (said := _late(few, best, lateness)):
         yield Rival(found[best], found[0], lambda: said)
+
+
+def _late_by(lag: int, actions: np.ndarray, runs: Sequence[slice]) -> np.ndarray:
+    """Actions some rows later in each run, (T, nu); the first or last ones of a run are repeated at its end."""
+    rows = [np.clip(np.arange(run.start, run.stop) - lag, run.start, run.stop - 1) for run in runs]
+    return actions[np.concatenate(rows)]
 
 
 def _lag_of_events(response: Response) -> int:

@@ -18,6 +18,7 @@ ROBUST = 3.0  # usual deviations from which a window loses weight, as in Huber's
 BETTER = 0.6  # share of what is left of one velocity at least that a hypothesis leaves at most
 EVIDENCE = 5.0  # nats
 LESS = 0.02  # usual changes of a velocity by which it leaves less at least
+LESS_AT_LEAST = 0.005  # the same where evidence is enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class Explained:
             other: the other explanation, of the same windows.
             enough: share of what is left of one velocity that this may leave; 1 if any share is enough.
         """
-        least = LESS * (1.0 - enough) / (1.0 - BETTER)
+        least = LESS if enough < 1.0 else LESS_AT_LEAST
         helps = (self.shares < enough * other.shares) & (other.shares - self.shares > least)
         return bool(helps.any()) and self.share < other.share and self.evidence(other) > EVIDENCE
 

@@ -80,7 +80,7 @@ class Response:
         if len(starts) < MIN_WINDOWS:
             return None
         actions = np.concatenate([simulation.executed(log.action[run]) for run in log.runs])
-        activations = np.concatenate([simulation.activations(actions[run]) for run in log.runs])
+        activations = _activations(log, simulation, actions)
         true = np.concatenate([simulation.true_observations(log.observation[run]) for run in log.runs])
         states = simulation.state_map.states(true)
         chosen = states[starts]
@@ -117,6 +117,11 @@ class Response:
         return replace(
             self, log=replace(self.log, observation=observation, following=following), states=states, like=self
         )
+
+    def driven_by(self, actions: np.ndarray) -> Response:
+        """The same windows with other executed actions, (T, nu), and with the derivatives of these windows."""
+        activations = _activations(self.log, self.simulation, actions)
+        return replace(self, actions=actions, activations=activations, like=self)
 
     def shifted(self, shifts: np.ndarray, windows: np.ndarray | None = None) -> Response:
         """The same windows with shifts of the positions of the pairs, (pairs,), in some windows, (W,), or in all."""
@@ -295,6 +300,11 @@ class Response:
         usual = np.median(np.abs(self.change), axis=0)
         share = np.median(error, axis=0) / np.where(usual > 0.0, usual, np.inf)
         return float(np.minimum(share, 3.0).mean())
+
+
+def _activations(log: Log, simulation: AuditedSimulation, actions: np.ndarray) -> np.ndarray:
+    """Activations of the actuators before each row, (T, na), if each run begins without any."""
+    return np.concatenate([simulation.activations(actions[run]) for run in log.runs])
 
 
 def _horizon(log: Log, moving: np.ndarray, noise: np.ndarray, signal: float) -> int:
