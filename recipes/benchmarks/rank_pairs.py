@@ -18,9 +18,10 @@ from pairs import Pair, read_pairs
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.effects import Effect
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals import Measured
 from torchrl_h2o.residuals.ground import NATS_OF_SURPRISE, Ground, surprise_of
-from torchrl_h2o.residuals.score import Difference, Model
+from torchrl_h2o.residuals.score import Model
 from torchrl_h2o.residuals.settings import DEFAULTS
 
 

@@ -16,11 +16,12 @@ from torchrl_h2o.effects import (
     ObservationGain,
 )
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals import Measured, Simulation, StateMap, start_states
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.refit import fit_set, slopes_of, variables_of
-from torchrl_h2o.residuals.score import Difference, Model, Predictions
+from torchrl_h2o.residuals.score import Model, Predictions
 from torchrl_h2o.residuals.search import search
 from torchrl_h2o.residuals.start_states import Noise
 

@@ -232,6 +232,7 @@ def test_one_effect_on_each_joint_stands_for_a_shared_one_and_a_further_one():
         {("Gravity", None): 1.1, ("JointDamping", "shoulder"): 0.01, ("JointDamping", "elbow"): 0.03}
     )
     assert others == [[], [], []]
+    assert disjoint(sets, [], SIMULATION.catalogue(), SIMULATION)[1] == ()  # where the time was up
 
 
 def test_two_candidates_are_tried_together_that_explain_little_one_by_one():

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchrl_h2o.effects import Armature, CatalogueEntry, Effect, JointDamping, JointFrictionLoss
+from torchrl_h2o.likelihood import FEWEST, Difference, log_density
 from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, flat, weights, whitened
-from torchrl_h2o.residuals.score import FEWEST, Difference, Predictions, fitted_scales
-from torchrl_h2o.residuals.start_states import log_density
+from torchrl_h2o.residuals.score import Predictions, fitted_scales
 from torchrl_h2o.residuals.sweep import Direction
 
 #: what every driven joint has, so that a machine may lack all of it

@@ -10,10 +10,11 @@ import numpy as np
 
 from torchrl_h2o.effects import ActionBias, CatalogueEntry, Effect, JointForce, ObservationBias, ResidualForce
 from torchrl_h2o.effects.catalogue.plausibility import surprise
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.command_noise import expected_commands
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import fit_set
-from torchrl_h2o.residuals.score import Difference, Model, Predictions
+from torchrl_h2o.residuals.score import Model, Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import ROUNDING

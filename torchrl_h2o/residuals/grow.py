@@ -10,12 +10,13 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce, is_negligible
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
 from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground, kind_of
 from torchrl_h2o.residuals.refit import FARTHEST, Variable, fit_set, slopes_of, variables_of, with_values
-from torchrl_h2o.residuals.score import Difference, Predictions
+from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.sweep import Direction
 
 TRIED = 16  # candidates of the largest estimated gain whose gain is then simulated

@@ -6,10 +6,10 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
 from torchrl_h2o.effects import is_negligible
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import ALIKE, Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.refit import variables_of, with_values
-from torchrl_h2o.residuals.score import Difference
 from torchrl_h2o.residuals.sweep import Direction
 
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
+from torchrl_h2o.likelihood import TAIL, log_density
 from torchrl_h2o.residuals.model_bounds import lowest_value
 from torchrl_h2o.residuals.score import Predictions, fitted_scales, scores
-from torchrl_h2o.residuals.start_states import TAIL, log_density
 
 STEP = 0.02  # step of the finite differences, in typical sizes of a parameter
 SMALLEST_GAIN = 1e-2  # gain of the score, in nats a block, below which a fit has converged

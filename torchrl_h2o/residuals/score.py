@@ -14,20 +14,18 @@ from functools import cached_property
 import numpy as np
 
 from torchrl_h2o.effects import Effect, ObservationEffect
+from torchrl_h2o.likelihood import log_density
 from torchrl_h2o.residuals.blocks import Blocks, block_steps
 from torchrl_h2o.residuals.measured.residual import executed_actions, undelayed_following
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates, log_density
+from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates
 
 FIT_ROWS, SELECTION_ROWS = 1536, 1024  # rows that are predicted for fits, and for comparisons
 FIT_BLOCKS, SELECTION_BLOCKS = 32, 24  # blocks of a long log for which more rows are predicted
 DIVERGED = 1e3  # error in spreads where a simulation diverges
-ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
-MOST_NATS = 20.0  # difference of a block beyond which it says no more
-FEWEST = 4  # blocks that must differ
 WHITE = 0.5  # effective share of a window from which neighbouring errors count as independent noise
 SCALED = 200  # windows from which these variances are fitted
 SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
@@ -202,47 +200,6 @@ def scores(predictions: Predictions, errors: Sequence[np.ndarray], scales: Seque
 
 def _density(error: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return log_density(error / np.sqrt(variance)) - 0.5 * np.log(variance)
-
-
-@dataclass(frozen=True, eq=False)
-class Difference:
-    """By how much one explanation predicts better than another, paired over blocks.
-
-    Args:
-        by_block: (B), in nats.
-    """
-
-    by_block: np.ndarray
-
-    @property
-    def mean(self) -> float:
-        """Mean over the blocks, in nats a block."""
-        return float(self.by_block.mean())
-
-    @property
-    def error(self) -> float:
-        """Standard error of the mean."""
-        return float(self.by_block.std(ddof=1) / np.sqrt(max(1, len(self.by_block))))
-
-    @property
-    def acting(self) -> int:
-        """Number of blocks that differ."""
-        return int((np.abs(self.by_block) > ACTS).sum())
-
-    @property
-    def evidence(self) -> float:
-        """Logarithm of the likelihood ratio of a positive mean and none, in nats; negative for a negative mean.
-
-        The differences are taken as normal, with the scatter that they have. An effect that acts rarely, such as the
-        end of a joint's range, leaves most blocks as they are, so only those count that differ.
-        """
-        alike = np.abs(self.by_block) <= ACTS  # False for NaN, which must not pass for no evidence
-        acting = np.clip(self.by_block[~alike], -MOST_NATS, MOST_NATS)
-        if len(acting) < FEWEST:
-            return 0.0
-        n = len(acting)
-        square = acting.mean() ** 2 / max(acting.var(ddof=1) / n, 1e-24)
-        return float(np.sign(acting.mean()) * 0.5 * n * np.log1p(square / (n - 1)))
 
 
 @dataclass(frozen=True, eq=False)

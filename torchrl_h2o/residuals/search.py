@@ -13,6 +13,7 @@ from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.effects.model.joint import LOCKED, JointRange
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.elements import elements
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
 from torchrl_h2o.residuals.forces.candidates import force_entry
@@ -25,7 +26,7 @@ from torchrl_h2o.residuals.prune import prune, replaced
 from torchrl_h2o.residuals.refit import fit_set, interval
 from torchrl_h2o.residuals.report.contents import SearchStep
 from torchrl_h2o.residuals.report.words import effect_words
-from torchrl_h2o.residuals.score import Difference, Predictions
+from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, alone_on, sweep
@@ -233,7 +234,8 @@ def disjoint(
             kept = found.without(left_out)
             sets = [one for own_entry, one in zip(found.entries, alike, strict=False) if own_entry.name not in left_out]
             entries, effects = (*kept[0], *singles), (*kept[1], *values)
-            return replace(found, entries=entries, effects=effects, slopes=None), [*sets, *([] for _ in singles)]
+            apart = replace(found, entries=entries, effects=effects, slopes=None)
+            return apart, [*sets, *([] for _ in singles)] if alike else ()
     return found, alike
 
 

@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import norm
 
+from torchrl_h2o.likelihood import log_density
 from torchrl_h2o.residuals.blocks import LENGTHS, Blocks, Windows
 from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -21,7 +22,6 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 BEFORE = 16  # largest number of rows before each block on which the filter settles
 NUDGE = 1e-3  # step of the finite differences, in spreads
 ROUNDING = 1e-6  # rounding of a reading, in spreads: that of single precision, with a margin
-TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 OF_NORMAL = 1.175  # standard deviation of the likeliest such distribution for normal noise, in that of the noise
 CLIP = 4.0  # robust standard deviations at which one-step errors are clipped
 SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trusts the reading
@@ -213,7 +213,7 @@ class Steps:
         noise = self._typical_noise.scaled(*np.exp(factors))
         if not self.lasting:
             return noise
-        lasting = np.full(self.lasting, noise.action * math.sqrt(1.0 - LASTS**2))
+        lasting = np.full(self.lasting, math.exp(factors[2]) * math.sqrt(1.0 - LASTS**2))
         return Noise(noise.sensor, np.append(noise.step[: -self.lasting], lasting))
 
     def fitted_factors(self, usual: np.ndarray = USUAL_FACTORS) -> np.ndarray:
@@ -274,7 +274,7 @@ class Steps:
         velocities are not measured, the third differences of the positions tell the noise.
         """
         n, actions = self.record.num_readings, self.record.measured.action
-        action = 1.0 if self.lasting else float(np.sqrt((actions**2).mean())) if actions.size else 0.0
+        action = float(np.sqrt((actions**2).mean())) if actions.size else 0.0
         miss = np.where((self.live & self.known)[..., None], self.miss, np.nan)
         size = np.nanmedian(np.abs(miss), axis=(0, 1)) / 0.6745 + 1e-9
         if self.record.positions_of_velocities:
@@ -363,9 +363,3 @@ def _bounded(doubt: np.ndarray, most: np.ndarray | float) -> np.ndarray:
 
 def _rows_before(blocks: Blocks) -> int:
     return min(BEFORE, blocks.steps // 2)
-
-
-def log_density(z: np.ndarray) -> np.ndarray:
-    """Log density of Student's t with ``TAIL`` degrees of freedom and variance 1."""
-    constant = math.lgamma((TAIL + 1.0) / 2.0) - math.lgamma(TAIL / 2.0) - 0.5 * math.log((TAIL - 2.0) * math.pi)
-    return constant - (TAIL + 1.0) / 2.0 * np.log1p(z**2 / (TAIL - 2.0))

@@ -8,8 +8,8 @@ import pytest
 
 from tests.data.audit.recorded import recording
 from torchrl_h2o.data.audit import audit
+from torchrl_h2o.data.audit.columns import absolute_angles
 from torchrl_h2o.data.audit.log import Log, Pair
-from torchrl_h2o.data.audit.model import absolute_angles
 from torchrl_h2o.effects import ActionGain, Armature, BodyMass, JointFrictionLoss
 
 JOINT = '<joint axis="0 1 0"/><geom size="0.02"/>'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,15 +11,19 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import lsq_linear
 
 from torchrl_h2o.data.audit.response import Response
+from torchrl_h2o.likelihood import Difference, log_density
 
 USUAL_GAINS = (0.4, 2.5)  # of motors whose units, signs and columns are right
 SMALL_ZERO = 0.1  # rad; a larger error of an angle's zero is a finding
 FOLD = 5  # successive windows that are fitted, or left out of a fit, together
 ROBUST = 3.0  # usual deviations from which a window loses weight, as in Huber's loss
 BETTER = 0.6  # share of what is left of one velocity at least that a hypothesis leaves at most
-EVIDENCE = 5.0  # nats
+EVIDENCE = math.log(100.0)  # nats: a likelihood ratio of 100, as in the search for effects
+MEDIAN = 0.6745  # median size of a normal variable, in standard deviations
+MEDIAN_OF_T = 0.524  # the same of Student's t of the log density
+DIVERGED = 3.0  # error of a simulation that diverges, and the largest that counts, in usual changes
 LESS = 0.02  # usual changes of a velocity by which it leaves less at least
-LESS_AT_LEAST = 0.005  # the same where evidence is enough
+LEAST = 0.005  # the same where evidence is enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +43,8 @@ class Explained:
 
     @cached_property
     def shares(self) -> np.ndarray:
-        """Usual share of the change of each velocity that is left, (m,), at most 3."""
-        return np.minimum(np.nan_to_num(np.nanmedian(np.abs(self.left), axis=0), nan=3.0), 3.0)
+        """Usual share of the change of each velocity that is left, (m,)."""
+        return np.median(np.minimum(np.nan_to_num(np.abs(self.left), nan=DIVERGED), DIVERGED), axis=0)
 
     @property
     def share(self) -> float:
@@ -47,21 +52,18 @@ class Explained:
         return float(self.shares.mean())
 
     def evidence(self, other: Explained) -> float:
-        """Logarithm of the likelihood ratio of this and another explanation, in nats.
+        """Evidence for this against another explanation, in nats, paired over groups of successive windows.
 
-        Errors have Student's distribution with the scale that they show. The log densities are paired and averaged over
-        groups of windows; their differences are taken as normal, with the scatter that they have.
+        Errors have Student's distribution with the scale that they show.
         """
         gained = self._log_density - other._log_density
-        groups = np.array([group.mean() for group in np.array_split(gained, max(2, len(gained) // FOLD))])
-        square = groups.mean() ** 2 / max(groups.var(ddof=1) / len(groups), 1e-24)
-        return float(np.sign(groups.mean()) * 0.5 * len(groups) * np.log1p(square / (len(groups) - 1)))
+        groups = np.array_split(gained, max(1, len(gained) // FOLD))
+        return Difference(np.array([group.mean() for group in groups])).evidence
 
     @cached_property
     def _log_density(self) -> np.ndarray:
-        scale = np.maximum(1.4826 * self.shares, 1e-6)
-        error = np.nan_to_num(self.left, nan=3.0) / scale
-        return (-2.5 * np.log1p(error**2 / 4.0) - np.log(scale)).sum(1)
+        scale = np.maximum(self.shares / MEDIAN_OF_T, 1e-6)
+        return (log_density(np.nan_to_num(self.left, nan=DIVERGED) / scale) - np.log(scale)).sum(1)
 
     def explains_more(self, other: Explained, enough: float = BETTER) -> bool:
         """Whether much less is left than another explanation leaves, of one velocity at least and in total.
@@ -70,7 +72,7 @@ class Explained:
             other: the other explanation, of the same windows.
             enough: share of what is left of one velocity that this may leave; 1 if any share is enough.
         """
-        least = LESS if enough < 1.0 else LESS_AT_LEAST
+        least = LESS if enough < 1.0 else LEAST
         helps = (self.shares < enough * other.shares) & (other.shares - self.shares > least)
         return bool(helps.any()) and self.share < other.share and self.evidence(other) > EVIDENCE
 
@@ -78,9 +80,6 @@ class Explained:
 def explain(
     response: Response,
     *,
-    actions: np.ndarray | None = None,
-    known: np.ndarray | None = None,
-    order: np.ndarray | None = None,
     gains: tuple[float, float] = USUAL_GAINS,
     zeros: float = SMALL_ZERO,
 ) -> Explained:
@@ -91,27 +90,18 @@ def explain(
 
     Args:
         response: simulated windows.
-        actions: mean actions of the windows, (W, nu); those of their rows by default.
-        known: windows that are used, (W,); all by default.
-        order: for each actuator the column of its action, (nu,); its own by default.
         gains: bounds of the gains.
         zeros: largest error of the zero of an angle, in rad.
     """
-    given = response.limited[response.rows].mean(1) if actions is None else actions
-    given = given if order is None else given[:, order]
-    parts = [response.by_action * given[:, None], response.by_zero, friction_responses(response)]
-    columns = np.concatenate(parts, -1)
-    count, pairs = given.shape[1], response.log.pairs
+    columns = np.concatenate([response.by_gain, response.by_zero, friction_responses(response)], -1)
+    count, pairs = response.by_gain.shape[-1], response.log.pairs
     bounds = np.tile([[-np.inf], [np.inf]], columns.shape[-1])
     bounds[:, :count] = np.array(gains)[:, None]
     for index, pair in enumerate(pairs):
         bounds[:, count + index] = (-zeros, zeros) if pair.angle else (-np.inf, np.inf)
     usable = np.isfinite(response.target) & np.isfinite(columns).all(-1)
-    if known is not None:
-        usable &= known[:, None]
-    scale = response.scale * response.held
-    target = np.where(usable, response.target, 0.0) / scale
-    columns = np.where(usable[..., None], columns, 0.0) / scale[:, None]
+    target = np.where(usable, response.target, 0.0) / response.scale
+    columns = np.where(usable[..., None], columns, 0.0) / response.scale[:, None]
     left, values = np.full(target.shape, np.nan), []
     second = np.arange(len(target)) // FOLD % 2 == 1
     for fold in (second, ~second):
@@ -145,12 +135,7 @@ def _fitted(target: np.ndarray, columns: np.ndarray, usable: np.ndarray, bounds:
         values = solve_triangular(root, wanted)
         if ((values < bounds[0] * size) | (values > bounds[1] * size)).any():
             values = lsq_linear(root, wanted, bounds * size, method="bvls").x
-        left = np.where(usable, np.abs((y - x @ values).reshape(target.shape)), np.nan)
-        limit = ROBUST * np.maximum(1.4826 * np.nan_to_num(np.nanmedian(left, axis=0)), 1e-9)
+        left = np.where(usable, np.abs((y - x @ values).reshape(target.shape)), DIVERGED)
+        limit = ROBUST * np.maximum(np.median(left, axis=0) / MEDIAN, 1e-9)
         weights = np.where(usable, np.minimum(1.0, limit / np.maximum(left, 1e-12)), 0.0)
     return values / size
-
-
-def percent(share: float) -> str:
-    """A share in words."""
-    return "all" if share >= 0.995 else f"{share:.0%}"

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from torchrl_h2o.data.audit.log import AuditedSimulation, Log
 
-WINDOWS = 300  # windows that are simulated at most
+WINDOWS = 500  # windows that are simulated at most
 MIN_WINDOWS = 60  # windows below which the model is not consulted
-PHYSICS_STEPS = 3_000  # physics steps of one pass over the windows at most
+PHYSICS_STEPS = 4_000  # physics steps of one pass over the windows at most
 LONGEST_STEPS = 200  # physics steps of a window up to which MIN_WINDOWS are simulated in any case
 HYPOTHESIS_WINDOWS = 200  # windows on which a hypothesis such as exchanged joints is simulated at most
 HYPOTHESIS_STEPS = 1_000  # physics steps of one hypothesis at most
 LONGEST_WINDOW = 0.1  # s
-SIGNAL_TO_NOISE = 4.0  # change of the velocities within a window, in standard deviations of their noise, as a rule
+# change of the velocities within a window, in standard deviations of their noise: long windows show small causes, and
+# short ones what acts at once, such as actions and dry friction
+LONG, SHORT = 10.0, 4.0
 DROWNED = 0.6  # noise of a change, in usual changes, above which a bad fit is no evidence against the data
 SETTLING_STEPS = 12  # control steps from which unobserved coordinates are simulated
 NUDGE = 0.02  # step of derivatives, in ranges or spreads of an action
@@ -39,7 +41,6 @@ class Response:
         moving: columns of the observed velocities, (m,).
         noise: standard deviation of the noise of each observation, (n,); None if it is not known.
         like: similar windows, whose derivatives are taken for those of these windows; None to compute them.
-        held: usual effect of the actions on each velocity, in its usual changes, (m,), at least 1.
         is_known: whether the simulator is that of the user, without rotors of a size that was tried.
     """
 
@@ -53,12 +54,11 @@ class Response:
     moving: np.ndarray
     noise: np.ndarray | None = None
     like: Response | None = None
-    held: np.ndarray = field(default_factory=lambda: np.ones(1))
     is_known: bool = True
 
     @classmethod
     def of(
-        cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None, signal: float = SIGNAL_TO_NOISE
+        cls, log: Log, simulation: AuditedSimulation, noise: np.ndarray | None, signal: float = LONG
     ) -> Response | None:
         """Chooses windows in which the velocities change by more than their noise; None without enough of them.
 
@@ -104,10 +104,16 @@ class Response:
         """Some of the windows: indices or a mask."""
         return replace(self, starts=self.starts[windows], states=self.states[windows])
 
+    @cached_property
+    def short(self) -> Response:
+        """Short windows, which show what acts at once."""
+        short = Response.of(self.log, self.simulation, self.noise, SHORT) or self
+        return replace(short, is_known=self.is_known)
+
     def for_hypotheses(self) -> Response:
-        """As many of the windows as a hypothesis may simulate."""
-        most = HYPOTHESIS_STEPS // (self.simulation.frame_skip * self.horizon)
-        return self.thinned(int(np.clip(most, MIN_WINDOWS, HYPOTHESIS_WINDOWS)))
+        """As many of the short windows as a hypothesis may simulate."""
+        most = HYPOTHESIS_STEPS // (self.simulation.frame_skip * self.short.horizon)
+        return self.short.thinned(int(np.clip(most, MIN_WINDOWS, HYPOTHESIS_WINDOWS)))
 
     def changed(self, change: Callable[[np.ndarray], np.ndarray]) -> Response:
         """The same windows with changed observations (..., n), and with the derivatives of these windows."""
@@ -208,11 +214,7 @@ class Response:
     @cached_property
     def simulated(self) -> np.ndarray:
         """Simulated change of the velocities under the actions of :attr:`anchor`, (W, m)."""
-        return self.simulated_with(self.anchor)
-
-    def simulated_with(self, actions: np.ndarray) -> np.ndarray:
-        """Simulated change of the velocities under actions (W, H, nu), (W, m)."""
-        return self.reached(self.states, actions)[:, self.moving] - self.before
+        return self.reached(self.states, self.anchor)[:, self.moving] - self.before
 
     @cached_property
     def target(self) -> np.ndarray:

@@ -7,12 +7,12 @@ from typing import cast
 
 import numpy as np
 
+from torchrl_h2o.likelihood import TAIL
 from torchrl_h2o.residuals.measured.residual import executed_actions, residuals, start_states
 from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-TAILS = 4.0  # degrees of freedom of the residuals' t-distribution; contacts and outliers make its tails heavy
 SCATTER_ITERATIONS = 15  # iterations of the scatter estimate
 SHRINKAGE = 0.01  # shrinkage of the scatter towards its diagonal, so that it can be inverted without noise
 FORCE_NUDGE = 0.1  # step of the finite differences by the force, as a share of the typical force
@@ -147,5 +147,5 @@ def _precision(residual: np.ndarray, finite: np.ndarray) -> tuple[np.ndarray, np
         floor = np.maximum(np.diag(scatter), 1e-12 * scatter.trace() + 1e-30)
         precision = np.linalg.inv((1.0 - SHRINKAGE) * scatter + SHRINKAGE * np.diag(floor))
         distance = np.einsum("wn,nm,wm->w", residual, precision, residual)
-        rows = finite * (TAILS + size) / (TAILS + distance)
+        rows = finite * (TAIL + size) / (TAIL + distance)
     return precision, rows

@@ -1,0 +1,60 @@
+"""Log densities of errors, and by how much one explanation predicts better than another."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
+ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
+MOST_NATS = 20.0  # difference of a block beyond which it says no more
+FEWEST = 4  # blocks that must differ
+
+
+def log_density(z: np.ndarray) -> np.ndarray:
+    """Log density of Student's t with ``TAIL`` degrees of freedom and variance 1."""
+    constant = math.lgamma((TAIL + 1.0) / 2.0) - math.lgamma(TAIL / 2.0) - 0.5 * math.log((TAIL - 2.0) * math.pi)
+    return constant - (TAIL + 1.0) / 2.0 * np.log1p(z**2 / (TAIL - 2.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """By how much one explanation predicts better than another, paired over blocks.
+
+    Args:
+        by_block: (B), in nats.
+    """
+
+    by_block: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        """Mean over the blocks, in nats a block."""
+        return float(self.by_block.mean())
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean."""
+        return float(self.by_block.std(ddof=1) / np.sqrt(max(1, len(self.by_block))))
+
+    @property
+    def acting(self) -> int:
+        """Number of blocks that differ."""
+        return int((np.abs(self.by_block) > ACTS).sum())
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the likelihood ratio of a positive mean and none, in nats; negative for a negative mean.
+
+        The differences are taken as normal, with the scatter that they have. An effect that acts rarely, such as the
+        end of a joint's range, leaves most blocks as they are, so only those count that differ.
+        """
+        alike = np.abs(self.by_block) <= ACTS  # False for NaN, which must not pass for no evidence
+        acting = np.clip(self.by_block[~alike], -MOST_NATS, MOST_NATS)
+        if len(acting) < FEWEST:
+            return 0.0
+        n = len(acting)
+        square = acting.mean() ** 2 / max(acting.var(ddof=1) / n, 1e-24)
+        return float(np.sign(acting.mean()) * 0.5 * n * np.log1p(square / (n - 1)))
