@@ -39,7 +39,7 @@ def check_model(response: Response, lateness: float = 0.0) -> list[Finding]:
         plain = explain(response)
         better = [rival for rival in _rivals(response, plain, lateness) if rival.is_better]
         if not better:
-            return [*found, *(late_changes(response, lateness) or _belongs(response, plain))]
+            return [*found, *(late_changes(response.short, lateness) or _belongs(response, plain))]
         least = min(rival.leaves for rival in better)
         best = next(rival for rival in better if rival.leaves < least + EQUAL)
         found += best.findings

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from torchrl_h2o.data.audit.finding import Finding
-from torchrl_h2o.data.audit.physics import BETTER, ROBUST, USUAL_GAINS, Explained, explain
+from torchrl_h2o.data.audit.physics import BETTER, EVIDENCE, ROBUST, USUAL_GAINS, Explained, explain
 from torchrl_h2o.data.audit.response import MIN_WINDOWS, Response
 from torchrl_h2o.data.audit.rival import Rival, leaves
 
@@ -121,7 +121,8 @@ def late_changes(response: Response, lateness: float) -> tuple[Finding, ...]:
     """A lag at which sudden changes of the actions and of the accelerations coincide, if it is clear.
 
     If actions are smooth, errors of the friction and the masses hide the lag. Second differences of the velocities
-    contain little of these errors. The lag must be significant, and the same for differences over one and two rows.
+    contain little of these errors. The lag must be significant, and the same for differences over one and two rows, and
+    the whole motion must not speak against it.
     """
     found = {_lag_of_changes(response, rows) for rows in (1, 2)}
     lag = found.pop()
@@ -129,7 +130,8 @@ def late_changes(response: Response, lateness: float) -> tuple[Finding, ...]:
         return ()
     known = response.at(response.mean_action(lag)[1])
     late = known.driven_by(_late_by(lag, known.actions, known.log.runs))
-    return _late(response, lag, lateness) if explain(late).share < explain(known).share else ()
+    speaks_against = explain(known).evidence(explain(late)) > EVIDENCE
+    return () if speaks_against else _late(response, lag, lateness)
 
 
 def _lag_of_changes(response: Response, rows: int) -> int:
