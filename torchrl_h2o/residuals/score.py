@@ -57,20 +57,19 @@ class Predictions:
         )
 
     def effective_counts(self, errors: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-        """Share of a window by which it counts beside its neighbours, (h) for each kind of windows.
+        """Share of a window by which it counts beside the others of its block, (h) for each kind of windows.
 
-        With the correlation r of the errors of neighbouring windows, that is (1 - r) / (1 + r).
+        That is the variance that the mean error of a block would have if the errors were independent, over the variance
+        that it has (batch means).
         """
         found = []
         for windows, error in zip(self.blocks.windows, errors, strict=True):
             size = np.median(np.abs(error), axis=0) + ROUNDING
             z = np.clip(error / size, -4.0, 4.0)
-            pairs = np.flatnonzero(windows.block[1:] == windows.block[:-1])
-            if not len(pairs):
-                found.append(np.ones(len(windows.horizons)))
-                continue
-            r = ((z[pairs] * z[pairs + 1]).mean((0, 2)) / ((z**2).mean((0, 2)) + 1e-12)).clip(0.0, 1.0)
-            found.append((1.0 - r) / (1.0 + r))
+            number = self.blocks.steps // windows.steps
+            means = z.reshape(len(self.blocks), number, *z.shape[1:]).mean(1)
+            independent = (z**2).mean((0, 2)) / number
+            found.append(np.minimum(independent / ((means**2).mean((0, 2)) + 1e-12), 1.0))
         return tuple(found)
 
     def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Predictions:
