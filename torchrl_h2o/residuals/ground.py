@@ -253,17 +253,16 @@ class Ground:
 
         Noise of the logged commands moves the simulator and not the machine, and noise of the motion the machine alone.
         Over many steps an effect then predicts better that makes the simulator deaf to it, such as damping. Where there
-        is such noise, an effect must therefore predict the next step significantly better, too, with the expected
-        commands and the logged ones.
+        is such noise, the next step must therefore show the evidence needed, too, with the expected commands and the
+        logged ones.
         """
         needed = self.needed(more, less)
         difference = more.scores - less.scores
         in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
         if in_selection <= 0.0 or in_all <= needed + math.log(among):
             return False
-        least = min(needed, -math.log(self.level))
         return not less.is_noise or all(
-            Difference(one - other).evidence > least for one, other in zip(more.one_step, less.one_step, strict=True)
+            Difference(one - other).evidence > needed for one, other in zip(more.one_step, less.one_step, strict=True)
         )
 
 

@@ -26,7 +26,7 @@ from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates
 FIT_ROWS, SELECTION_ROWS = 1536, 1024  # rows that are predicted for fits, and for comparisons
 FIT_BLOCKS, SELECTION_BLOCKS = 32, 24  # blocks of a long log for which more rows are predicted
 DIVERGED = 1e3  # error in spreads where a simulation diverges
-WHITE = 0.5  # effective share of a window from which neighbouring errors count as independent noise
+WHITE = 1.0 / 3.0  # correlation of successive errors up to which they count as independent noise
 SCALED = 200  # windows from which these variances are fitted
 SCALES = np.append(0.0, np.logspace(-3.0, 3.0, 25))  # tried variances, in squared median errors
 
@@ -71,6 +71,13 @@ class Predictions:
             independent = (z**2).mean((0, 2)) / number
             found.append(np.minimum(independent / ((means**2).mean((0, 2)) + 1e-12), 1.0))
         return tuple(found)
+
+    def likeness_of_neighbours(self, errors: Sequence[np.ndarray]) -> float:
+        """Correlation of the errors one step ahead in successive windows, mean over the readings."""
+        error, block = errors[0][:, 0], self.blocks.windows[0].block
+        z = np.clip(error / (np.median(np.abs(error), axis=0) + ROUNDING), -4.0, 4.0)
+        pairs = np.flatnonzero(block[1:] == block[:-1])
+        return float((z[pairs] * z[pairs + 1]).mean() / ((z**2).mean() + 1e-12)) if len(pairs) else 0.0
 
     def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Predictions:
         """The same windows from the same start states, predicted by another simulation, or with other commands."""
@@ -276,6 +283,6 @@ class Model:
             density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
             one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
             is_larger = np.median(scales[0][0] / np.median(known, axis=0)) > 1.0
-            is_white = self.fit.effective_counts(errors)[0][0] > WHITE
+            is_white = self.fit.likeness_of_neighbours(errors) < WHITE
             self._found[effects] = by_block, one_step, bool(is_larger and is_white)
         return self._found[effects]
