@@ -171,3 +171,15 @@ def test_rare_differences_count_as_evidence_but_common_noise_does_not():
     rare[:6] = (2.0, 3.0, 2.5, 2.0, 3.0, 2.0)
     assert Difference(rare).evidence > 4.6
     assert abs(Difference(noise).evidence) < 4.6
+
+
+def test_errors_that_last_for_a_block_count_little_although_neighbours_resemble_each_other_little():
+    """A constant of each block with a variance of a third of white noise: neighbours have a correlation of 0.25."""
+    fit = Model.of(pendulum(), recorded(pendulum(), 2000, 0.0)).fit
+    rng, errors = np.random.default_rng(0), []
+    for windows in fit.blocks.windows:
+        lasting = rng.standard_normal((len(fit.blocks), 1, 2))[windows.block]
+        errors.append(np.sqrt(3.0) * rng.standard_normal((len(windows.rows), len(windows.horizons), 2)) + lasting)
+    number = fit.blocks.steps / fit.blocks.windows[0].steps
+    assert fit.effective_counts(errors)[0] == pytest.approx(4.0 / (3.0 + number), rel=0.5)
+    assert fit.likeness_of_neighbours(errors) == pytest.approx(0.25, abs=0.1)
