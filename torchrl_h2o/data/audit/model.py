@@ -72,12 +72,12 @@ def _rivals(response: Response, plain: Explained, lateness: float) -> list[Rival
         return [*free, *simulated]
     tried = list(turns(few))
     zeros = [*shifted_zeros(response, plain, left, tried), *slipped_zeros(response, plain, few, left, tried)]
-    rotors = _rotors(response, plain) if response.is_known else ()
+    rotors = _rotors(response, few, left) if response.is_known else ()
     return [*free, *simulated, *other_columns(few, left), *zeros, *rotors]
 
 
-def _rotors(response: Response, plain: Explained) -> Iterator[Rival]:
-    """Heavier rotors.
+def _rotors(response: Response, few: Response, plain: Explained) -> Iterator[Rival]:
+    """Heavier rotors, compared in a few windows.
 
     Behind a gear, a rotor often weighs more than the link, and many models leave it out (``armature``). Every force
     then moves the joints several times too much in the simulator, which can look like late actions, or like another
@@ -87,8 +87,9 @@ def _rotors(response: Response, plain: Explained) -> Iterator[Rival]:
     note = Finding("model", "note", words + "compared with these", None, "a search will tell their size")
     for share in ROTORS:
         if rotors := _rotor_effects(response, share):
-            heavier = replace(response, simulation=response.simulation.with_effects(*rotors), is_known=False)
-            yield Rival(explain(heavier), plain, (note,), heavier)
+            heavier = response.simulation.with_effects(*rotors)
+            explained = explain(replace(few, simulation=heavier))
+            yield Rival(explained, plain, (note,), replace(response, simulation=heavier, is_known=False))
 
 
 def _rotor_effects(response: Response, share: float) -> list:
