@@ -37,8 +37,8 @@ class Predictions:
 
     Args:
         starts: start states of the simulation without the added effects.
-        counts: effective share of a window for each kind of windows and horizon, (h): neighbouring windows with
-            similar errors count less; see :meth:`effective_counts`.
+        counts: effective share of a window for each kind of windows and horizon, (h): windows of a block whose errors
+            last count less; see :meth:`effective_counts`.
         floor: variance of errors that are too small to matter, (H, n) for the horizons 1, 2, 4, ...; none by default.
     """
 

@@ -54,9 +54,8 @@ def _belongs(response: Response, plain: Explained) -> tuple[Finding, ...]:
     if plain.share <= FOREIGN or plain.evidence(stay) > EVIDENCE or is_opposed(response):
         return ()
     words = f"the simulator leaves {percent(plain.share)} of the accelerations unexplained, with any usual gains, "
-    words += (
-        "friction and zeros: another robot's log, a model that lacks much (a load), or noise as large as the motion"
-    )
+    words += "friction and zeros: another robot's log, a model that lacks much (a load), or noise as large as the "
+    words += "motion"
     return (Finding("model", "warning", words, None, "check that model and log belong together"),)
 
 

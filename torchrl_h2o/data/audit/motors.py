@@ -40,7 +40,7 @@ def gains(response: Response, plain: Explained) -> Iterator[Rival]:
         foreign = Finding("actions", "severe", words, None, "pair the log with its own actions")
         yield Rival(none, plain, (foreign,), enough=1.0)
     if response.is_known and (found := _findings(response, plain, free)):  # another rotor looks like another gain
-        is_reversed = any("other sign" in finding.words for finding in found)
+        is_reversed = any(finding.remedy == _SIGN for finding in found)
         yield Rival(free, plain, found, enough=1.0 if is_reversed else BETTER)
 
 
@@ -89,10 +89,8 @@ def other_actions(few: Response, plain: Explained) -> Iterator[Rival]:
     for one, other in combinations(range(count), 2):
         order = np.arange(count)
         order[[one, other]] = other, one
-        words = (
-            f"{log.moved_by(one)} follows the action of {log.actuators[other]} instead of {log.actuators[one]}: the "
-        )
-        fault = Finding("actions", "severe", words + "columns are exchanged", None, _ORDER)
+        words = f"{log.moved_by(one)} follows the action of {log.actuators[other]} instead of {log.actuators[one]}"
+        fault = Finding("actions", "severe", f"{words}: the columns are exchanged", None, _ORDER)
         yield Rival(explain(few.driven_by(few.actions[:, order])), plain, (fault,))
 
 

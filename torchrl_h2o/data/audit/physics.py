@@ -41,10 +41,15 @@ class Explained:
     gains: np.ndarray
     zeros: np.ndarray
 
+    @property
+    def sizes(self) -> np.ndarray:
+        """Sizes of the errors, at most ``DIVERGED``, (W, m)."""
+        return np.minimum(np.nan_to_num(np.abs(self.left), nan=DIVERGED), DIVERGED)
+
     @cached_property
     def shares(self) -> np.ndarray:
         """Usual share of the change of each velocity that is left, (m,)."""
-        return np.median(np.minimum(np.nan_to_num(np.abs(self.left), nan=DIVERGED), DIVERGED), axis=0)
+        return np.median(self.sizes, axis=0)
 
     @property
     def share(self) -> float:

@@ -88,7 +88,7 @@ def slipped_zeros(
     """
     best = 0.0, slice(0), np.zeros(0)
     for shifts, shifted in tried:
-        gained = _by_window(left) - _by_window(shifted) - MARGIN
+        gained = (left.sizes - shifted.sizes).mean(1) - MARGIN
         best = max(best, (*_highest_sum(gained, few.log.run[few.starts]), shifts), key=lambda found: found[0])
     total, part, shifts = best
     if not total or not SHORTEST_PART <= part.stop - part.start < ENTIRE * len(few.starts):
@@ -105,17 +105,10 @@ def slipped_zeros(
     if not explained.explains_more(without):
         return
     words = f"{leaves(without, explained)}the zero of {response.log.pairs[index].name} is shifted by "
-    words += (
-        f"{-shifts[index]:.2f} rad in about rows {first} to {last}: its sensor slipped, lost counts, or was set to "
-    )
-    remedy = "leave these rows out, or correct the column"
-    finding = Finding("model", "severe", words + "zero elsewhere", Rows.of(rows), remedy)
+    words += f"{-shifts[index]:.2f} rad in about rows {first} to {last}: its sensor slipped, lost counts, or was set "
+    words += "to zero elsewhere"
+    finding = Finding("model", "severe", words, Rows.of(rows), "leave these rows out, or correct the column")
     yield Rival(explain(response.shifted(shifts, inside)), plain, (finding,))
-
-
-def _by_window(explained: Explained) -> np.ndarray:
-    """What is left of the changes of the velocities in each window, mean over the velocities, (W,)."""
-    return np.minimum(np.nan_to_num(np.abs(explained.left), nan=3.0), 3.0).mean(1)
 
 
 def _highest_sum(values: np.ndarray, groups: np.ndarray) -> tuple[float, slice]:
