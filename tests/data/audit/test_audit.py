@@ -24,6 +24,7 @@ from tests.data.audit.recorded import (
     warned,
     with_action,
 )
+from tests.residuals.pendulum import double_pendulum, recorded
 from torchrl_h2o.data import Audit, DataError, Finding, audit
 from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.data.audit.response import Response
@@ -341,6 +342,14 @@ def test_a_motor_that_moves_nothing_observed_has_no_unit(good):
     found = audit(with_action(good, action), simulation)
     assert [finding.words for finding in found.severe if "m1 has the other sign" in finding.words]
     assert not [finding.words for finding in found.findings if "action of m3" in finding.words]
+
+
+def test_an_angle_that_does_not_tell_where_its_joint_is_is_named_and_no_other_fault():
+    """The elbow turns over and over: 3 % of its motion are 3.9 rad, which was taken for an angle in the world."""
+    simulation = double_pendulum()
+    found = audit(recorded(simulation, 1200, noise=0.03, seed=2), simulation)
+    assert not found.severe
+    assert any("elbow (4 rad)" in finding.words for finding in found.warnings)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -32,6 +32,10 @@ def check_model(response: Response, lateness: float = 0.0) -> list[Finding]:
         response: simulated windows.
         lateness: rows by which the velocities are late against their positions, which is no lag of the actions.
     """
+    if lost := response.lost:
+        names = ", ".join(f"{pair.name} ({response.noise_of(pair):.2g} rad)" for pair in lost)
+        words = f"the noise of angles is so large that the simulator knows no start state: {names}"
+        return [Finding("model", "warning", words, None, "use a better sensor, or see whether a column is that angle")]
     if response.drowned:
         return []
     found: list[Finding] = []

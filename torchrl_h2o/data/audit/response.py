@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from torchrl_h2o.data.audit.log import AuditedSimulation, Log
+from torchrl_h2o.data.audit.log import AuditedSimulation, Log, Pair
 
 WINDOWS = 500  # windows that are simulated at most
 MIN_WINDOWS = 60  # windows below which the model is not consulted
@@ -20,6 +20,7 @@ LONGEST_WINDOW = 0.1  # s
 # change of the velocities within a window, in standard deviations of their noise: long windows show small causes, and
 # short ones what acts at once, such as actions and dry friction
 LONG, SHORT = 10.0, 4.0
+LOST = 1.0  # rad; noise of an angle above which it does not tell where a joint is
 DROWNED = 0.6  # noise of a change, in usual changes, above which a bad fit is no evidence against the data
 SETTLING_STEPS = 12  # control steps from which unobserved coordinates are simulated
 NUDGE = 0.02  # step of derivatives, in ranges or spreads of an action
@@ -153,6 +154,15 @@ class Response:
         """Usual change of each velocity, (m,)."""
         usual = np.median(np.abs(self.change), axis=0)
         return np.where(usual > 0.0, usual, np.maximum(np.abs(self.change).mean(0), 1e-12))
+
+    @property
+    def lost(self) -> list[Pair]:
+        """Angles whose noise is so large that they do not tell where the joint is."""
+        return [pair for pair in self.log.pairs if pair.angle and self.noise_of(pair) > LOST]
+
+    def noise_of(self, pair: Pair) -> float:
+        """Standard deviation of the noise of a position; 0 if it is not known."""
+        return 0.0 if self.noise is None else float(self.noise[pair.position])
 
     @property
     def drowned(self) -> bool:
