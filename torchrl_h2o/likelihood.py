@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+ENOUGH = math.log(100.0)  # evidence from which an explanation is better than another: a likelihood ratio of 100
 TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
 FEWEST = 4  # blocks that must differ
+BLOCKS = 30  # blocks of neighbouring windows, which count as independent
 
 
 def log_density(z: np.ndarray) -> np.ndarray:
@@ -28,6 +30,17 @@ class Difference:
     """
 
     by_block: np.ndarray
+
+    @classmethod
+    def of_losses(cls, worse: np.ndarray, better: np.ndarray) -> Difference:
+        """By how much losses of neighbouring windows, (W) in order of time, are lower than others.
+
+        The losses of a block are taken as those of exponential distributions, whose likeliest scales are their means.
+        """
+        parts = np.array_split(np.arange(len(worse)), min(BLOCKS, len(worse)))
+        least = 1e-6 * worse.mean() + 1e-300
+        ratios = [len(part) * np.log((worse[part].mean() + least) / (better[part].mean() + least)) for part in parts]
+        return cls(np.array(ratios))
 
     @property
     def mean(self) -> float:

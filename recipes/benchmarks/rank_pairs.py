@@ -18,11 +18,10 @@ from pairs import Pair, read_pairs
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.effects import Effect
-from torchrl_h2o.likelihood import Difference
+from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals import Measured
 from torchrl_h2o.residuals.ground import NATS_OF_SURPRISE, Ground, surprise_of
 from torchrl_h2o.residuals.score import Model
-from torchrl_h2o.residuals.settings import DEFAULTS
 
 
 def main() -> None:
@@ -82,7 +81,7 @@ def rank(pair: Pair) -> dict:
 
 def _prior(effects: tuple[Effect, ...]) -> float:
     """Logarithm of the prior probability of effects, in nats: the level for each kind, and less for unusual ones."""
-    return len({type(effect) for effect in effects}) * np.log(DEFAULTS.level) - NATS_OF_SURPRISE * surprise_of(effects)
+    return -ENOUGH * len({type(effect) for effect in effects}) - NATS_OF_SURPRISE * surprise_of(effects)
 
 
 if __name__ == "__main__":

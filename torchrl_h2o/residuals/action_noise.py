@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchrl_h2o.effects import ActionNoise
-from torchrl_h2o.likelihood import Difference
+from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.explanation import Explanation, Part
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import CONFIDENCE
 from torchrl_h2o.residuals.score import Model
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import OF_NORMAL, USUAL_FACTORS, Noise, Steps
 
@@ -47,16 +46,13 @@ class NoiseEstimate:
     left: float
 
 
-def add_action_noise(
-    simulation: Simulation, measured: Measured, explanation: Explanation, level: float = DEFAULTS.level
-) -> Explanation:
+def add_action_noise(simulation: Simulation, measured: Measured, explanation: Explanation) -> Explanation:
     """Adds the action noise that the simulator lacks, or removes the noise that it has in excess.
 
     Args:
         simulation: the simulator without the effects found.
         measured: the data.
         explanation: effects found so far.
-        level: significance level.
 
     Returns:
         The explanation with an :class:`~torchrl_h2o.effects.ActionNoise`, whose standard deviation is negative where
@@ -71,7 +67,7 @@ def add_action_noise(
     is_credible = noise.left < MOST_LEFT and noise.std < MOST * asked
     if not is_credible and noise.std**2 > CLEARLY_LESS * own_variance:
         return explanation  # the data do not tell
-    is_found = is_credible and noise.evidence > -math.log(level) and noise.confirmed > 0.0
+    is_found = is_credible and noise.evidence > ENOUGH and noise.confirmed > 0.0
     missing = (noise.std**2 if is_found else 0.0) - own_variance
     if abs(missing) <= max(MIN_CHANGE * own_variance, (LEAST * asked) ** 2):
         return explanation

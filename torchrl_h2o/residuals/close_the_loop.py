@@ -26,7 +26,6 @@ from torchrl_h2o.residuals.offered import late_velocities, offered_entries
 from torchrl_h2o.residuals.progress import NOISE, REPORT, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.search import search
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 FAILURES = (ValueError, np.linalg.LinAlgError)  # a model that rejects an effect, or singular equations
@@ -45,7 +44,6 @@ def close_the_loop(
     audit: Audit | None = None,
     known: Sequence[Effect] = (),
     so_far: Callable[[Report], object] = lambda report: None,
-    settings: LoopSettings = DEFAULTS,
 ) -> Report:
     """Finds what a simulator lacks from measured data, and judges it on data that neither a fit nor a choice has used.
 
@@ -64,7 +62,6 @@ def close_the_loop(
         audit: findings of :func:`torchrl_h2o.data.audit`, for the report.
         known: effects from which the search begins, such as ``Report.load(folder).effects`` of an unfinished run.
         so_far: called with an unfinished report whenever an effect has been found and after each stage.
-        settings: thresholds and budgets of all stages.
 
     Returns:
         The report; ``DynamicsGap(*report.effects)`` mends the simulator.
@@ -90,7 +87,7 @@ def close_the_loop(
     with LoopBar(disable=not progress, minutes=minutes) as bar:
         simulation = simulator if isinstance(simulator, Simulation) else Simulation.from_env(simulator)
         simulation = replace(simulation, check=bar.check)
-        measured = read_measured(data, simulation, source, held_out, settings)
+        measured = read_measured(data, simulation, source, held_out)
         begin = time.perf_counter()
         try:
             if (reason := why_no_conclusion(simulation, measured)) is not None:
@@ -104,7 +101,6 @@ def close_the_loop(
                 progress=bar,
                 known=known,
                 so_far=lambda found, stage: so_far(unfinished_report(evidence, found, stage)),
-                settings=settings,
                 late=catalogue is None,
             )
         except OutOfTimeError as end:
@@ -112,11 +108,11 @@ def close_the_loop(
             return inconclusive_report(simulation, measured, reason, audit)
         so_far(unfinished_report(evidence, explanation, "the errors before and after were computed"))
         bar.stage(REPORT)
-        judgement = judge(evidence, explanation, entries, seed=seed, progress=bar, settings=settings)
+        judgement = judge(evidence, explanation, entries, seed=seed, progress=bar)
         bar.finish()
         wall_s = time.perf_counter() - start
         made_by = provenance(cpu_start)
-        return compose_report(evidence, explanation, judgement, wall_s=wall_s, made_by=made_by, settings=settings)
+        return compose_report(evidence, explanation, judgement, wall_s=wall_s, made_by=made_by)
 
 
 def _require_arguments(
@@ -144,12 +140,11 @@ def read_measured(
     simulation: Simulation,
     source: str,
     held_out: float | Collection[int],
-    settings: LoopSettings,
 ) -> Measured:
-    """Measured transitions, checked against the simulation, with the sampling of the settings."""
+    """Measured transitions, checked against the simulation."""
     if isinstance(data, Measured):
-        return replace(data, max_windows=settings.max_windows)
-    return Measured.from_ted(data, simulation, source=source, held_out=held_out, max_windows=settings.max_windows)
+        return data
+    return Measured.from_ted(data, simulation, source=source, held_out=held_out)
 
 
 def explain(
@@ -159,7 +154,6 @@ def explain(
     progress: LoopBar,
     known: Sequence[Effect] = (),
     so_far: Callable[[Explanation, str], object] = lambda explanation, stage: None,
-    settings: LoopSettings = DEFAULTS,
     late: bool = False,
 ) -> Explanation:
     """Explains the residual: effects of the catalogue and forces outside it, then action noise.
@@ -170,7 +164,6 @@ def explain(
         progress: bar that shows how far the search is, and its stage.
         known: effects from which the search begins.
         so_far: called with a preliminary explanation, as it grows, and the current stage.
-        settings: significance level.
         late: whether to read off the data how late velocities are against their positions.
 
     Returns:
@@ -185,9 +178,7 @@ def explain(
         so_far(explanation if delay is None else explanation.beside(delay), "effects were tried")
 
     try:
-        found = search(
-            simulation, measured, catalogue, progress=progress, known=known, so_far=better, level=settings.level
-        )
+        found = search(simulation, measured, catalogue, progress=progress, known=known, so_far=better)
     except FAILURES as error:
         if not explanations:  # the data cannot be searched at all
             raise
@@ -199,7 +190,7 @@ def explain(
     progress.stage(NOISE)
     so_far(found, "action noise was looked for")
     try:
-        return add_action_noise(simulation, measured, found, settings.level)
+        return add_action_noise(simulation, measured, found)
     except OutOfTimeError:
         return replace(found, ended_in=NOISE)
     except FAILURES as error:

@@ -25,8 +25,7 @@ from torchrl_h2o.residuals.report.contents import (
 )
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.words import UNDECLARED, effect_name, effect_units, effect_words
-from torchrl_h2o.residuals.search import stop_test
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
+from torchrl_h2o.residuals.search import STOP_TEST
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 
@@ -37,7 +36,6 @@ def compose_report(
     *,
     wall_s: float | None = None,
     made_by: Mapping[str, Any] | None = None,
-    settings: LoopSettings = DEFAULTS,
 ) -> Report:
     """Composes the report.
 
@@ -47,7 +45,6 @@ def compose_report(
         judgement: held-out errors and tests of these effects.
         wall_s: duration of the whole run, in s.
         made_by: see :func:`~torchrl_h2o.provenance.provenance`.
-        settings: significance level, for the description of the stop test.
     """
     simulation, measured = evidence.simulation, judgement.measured
     words, units = partial(effect_words, names=simulation.names), partial(effect_units, names=simulation.names)
@@ -71,7 +68,7 @@ def compose_report(
         predictions=judgement.predictions,
         unexplained_intervals=_intervals(judgement),
         steps=explanation.steps,
-        stop_test=stop_test(settings.level),
+        stop_test=STOP_TEST,
         wall_s=wall_s,
         made_by=made_by or {},
         windows=judgement.windows,

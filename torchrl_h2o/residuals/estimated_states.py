@@ -11,7 +11,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.score import FIT_ROWS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.start_states import OF_NORMAL, Noise, StartStates
+from torchrl_h2o.residuals.start_states import OF_NORMAL, Noise, StartStates, filtered_rows
 
 # sensor noise, in spreads, up to which a reading counts as free of noise
 NOISELESS = 1e-4
@@ -46,8 +46,9 @@ def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray
     first = [row for run in measured.runs for row in _firsts(run, steps) if needed[row : row + steps].any()]
     if not first:
         return start_states(simulation, measured, rows)
-    record = Record(simulation, measured)
-    starts = StartStates.of(record, Blocks(np.array(first), steps), _noise(simulation, measured))
+    blocks = Blocks(np.array(first), steps)
+    record = Record(simulation, measured, filtered_rows(blocks, measured))
+    starts = StartStates.of(record, blocks, _noise(simulation, measured))
     _, filtered = starts.of_rows
     simulated = np.array(simulation.state_map.hidden, int)[record.settled[len(simulation.state_map.names) :]]
     if len(simulated):
@@ -77,6 +78,7 @@ def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | Non
 def _noise(simulation: Simulation, measured: Measured) -> Noise:
     def compute() -> Noise:
         steps = block_steps(measured, simulation.control_step)
-        return StartStates.of(Record(simulation, measured), Blocks.of(measured, Split.FIT, steps, FIT_ROWS)).noise
+        blocks = Blocks.of(measured, Split.FIT, steps, FIT_ROWS)
+        return StartStates.of(Record(simulation, measured, filtered_rows(blocks, measured)), blocks).noise
 
     return measured.remembered("noise", simulation, compute)

@@ -10,12 +10,11 @@ import numpy as np
 
 from torchrl_h2o.effects import ActionBias, CatalogueEntry, Effect, JointForce, ObservationBias, ResidualForce
 from torchrl_h2o.effects.catalogue.plausibility import surprise
-from torchrl_h2o.likelihood import Difference
+from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.command_noise import expected_commands
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.refit import fit_set
 from torchrl_h2o.residuals.score import Model, Predictions
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import ROUNDING
 
@@ -99,33 +98,28 @@ class Ground:
     Args:
         simulation: the simulator without effects.
         base: predictions of a set near those to compare, whose derivatives the filters of all sets use.
-        level: significance level at which an effect is added.
         logged: the data with the logged commands, if these have noise.
     """
 
     simulation: Simulation
     base: Model
-    level: float = DEFAULTS.level
     logged: Measured | None = None
     _models: dict[tuple[Effect, ...], Model] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(
-        cls, simulation: Simulation, measured: Measured, effects: Sequence[Effect] = (), level: float = DEFAULTS.level
-    ) -> Ground:
+    def of(cls, simulation: Simulation, measured: Measured, effects: Sequence[Effect] = ()) -> Ground:
         """The ground near a set of effects, with the logged commands.
 
         Args:
             simulation: the simulator without effects.
             measured: the data.
             effects: the set.
-            level: significance level at which an effect is added.
         """
         model = Model.of(simulation.with_effects(*effects), measured)
         errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
         floor = np.concatenate([(MATTERS * np.median(np.abs(error), axis=0)) ** 2 for error in errors])
         base = _weighted(model, floor)
-        return cls(simulation, base, level, None, {tuple(effects): base})
+        return cls(simulation, base, None, {tuple(effects): base})
 
     def near(self, found: Found, measured: Measured) -> tuple[Ground, Found]:
         """The ground near a set that was found, and the set fitted to the commands that make its readings likeliest.
@@ -146,7 +140,7 @@ class Ground:
             if (own := other.refit(found)).scores.mean() <= highest.scores.mean():
                 break
             best, highest = other, own
-        is_better = Difference(highest.scores - first.scores).evidence > -math.log(self.level)
+        is_better = Difference(highest.scores - first.scores).evidence > ENOUGH
         return (best, highest) if is_better else (logged, first)
 
     @property
@@ -243,7 +237,7 @@ class Ground:
         ]
         if all(kinds.count(kind_of(effect)) >= MANY for effect in added):
             return ONE_MORE
-        return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) - math.log(self.level)
+        return NATS_OF_SURPRISE * max(0, more.surprise - less.surprise) + ENOUGH
 
     def adds(self, more: Found, less: Found, among: int = 1) -> bool:
         """Whether a set predicts better than a smaller one, by more than its surprise.

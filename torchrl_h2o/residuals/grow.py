@@ -10,7 +10,7 @@ import numpy as np
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce, is_negligible
 from torchrl_h2o.effects.catalogue.plausibility import is_outside
-from torchrl_h2o.likelihood import Difference
+from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
@@ -174,7 +174,7 @@ def with_one_more(
         pairs: whether to try two candidates together.
     """
     rough, found, joints = candidates.rough, candidates.found, candidates.joints
-    least = -0.5 * math.log(ground.level) * len(rough.blocks) / len(ground.base.fit.blocks)
+    least = 0.5 * ENOUGH * len(rough.blocks) / len(ground.base.fit.blocks)
     leads = [
         lead
         for lead in candidates.leads
@@ -191,7 +191,7 @@ def with_one_more(
     if rival is None and not pairs and joints and is_new and joints.evidence > least:
         leads = [joints, *(lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names)]
     best = _best_simulated(rough, [candidates.sizes(lead) for lead in leads[:TRIED]])
-    return [one for one in _sketched(ground, candidates, best) if _is_usable(ground, one, found)]
+    return [one for one in _sketched(ground, candidates, best) if is_usable(ground, one, found)]
 
 
 def _kinds(lead: Lead) -> set[type]:
@@ -263,11 +263,12 @@ def best_of_each(leads: Sequence[Lead]) -> list[Lead]:
     return list(best.values())
 
 
-def _is_usable(ground: Ground, found: Found, before: Found) -> bool:
-    return not any(
+def is_usable(ground: Ground, found: Found, before: Found) -> bool:
+    """Whether one or two effects that a set has more than another are not negligible, and possible in the model."""
+    added = found.without(before.names)
+    return len(added[0]) > FEW or not any(
         is_negligible(effect, entry.trials) or is_outside(effect, ground.simulation.model)
-        for entry, effect in zip(found.entries, found.effects, strict=True)
-        if entry.name not in before.names and len(found.names - before.names) == 1
+        for entry, effect in zip(*added, strict=True)
     )
 
 

@@ -8,7 +8,15 @@ from dataclasses import replace
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
-from torchrl_h2o.residuals.grow import ALIKE, Candidates, gains_beside, is_preferred, most_usual, with_one_more
+from torchrl_h2o.residuals.grow import (
+    ALIKE,
+    Candidates,
+    gains_beside,
+    is_preferred,
+    is_usable,
+    most_usual,
+    with_one_more,
+)
 from torchrl_h2o.residuals.refit import variables_of, with_values
 from torchrl_h2o.residuals.sweep import Direction
 
@@ -82,19 +90,34 @@ def replaced(
             continue
         fewer = ground.found(*found.without({entry.name}))
         candidates = Candidates.of(ground, fewer, directions)
-        sketched = with_one_more(ground, candidates, rival=entry.name)
-        sketched += with_one_more(ground, candidates, [frozenset({entry.name})], pairs=True)
-        half = 0.5 * (found.scores - fewer.scores).mean()
-        fitted = [
-            ground.fitted(one.entries, one.effects) for one in sketched if (one.scores - fewer.scores).mean() > half
-        ]
-        others = [one for one in fitted if Difference(found.scores - one.scores).evidence < ALIKE]
+        others = _alike(ground, found, fewer, with_one_more(ground, candidates, rival=entry.name))
+        if not others:  # two effects say no more than one that explains the data as well
+            pairs = with_one_more(ground, candidates, [frozenset({entry.name})], pairs=True)
+            others = _alike(ground, found, fewer, pairs)
         better = [one for one in others if is_preferred(one, found) and _is_worth_it(ground, one, found, directions)]
         if better and swaps < SWAPS:
             found, alike, swaps = most_usual(better), [], swaps + 1
         else:
             alike.append(sorted(others, key=lambda one: -one.scores.mean()))
     return found, alike
+
+
+def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]) -> list[Found]:
+    """Of sets that explain at least half of what an effect explains, those that explain as much once they are fitted.
+
+    Args:
+        ground: where sets are compared.
+        found: the set with the effect.
+        fewer: the set without it.
+        sketched: the others.
+    """
+    half = 0.5 * (found.scores - fewer.scores).mean()
+    fitted = [ground.fitted(one.entries, one.effects) for one in sketched if (one.scores - fewer.scores).mean() > half]
+    return [
+        one
+        for one in fitted
+        if is_usable(ground, one, fewer) and Difference(found.scores - one.scores).evidence < ALIKE
+    ]
 
 
 def _is_worth_it(ground: Ground, other: Found, found: Found, directions: Sequence[Direction]) -> bool:

@@ -32,10 +32,12 @@ class Record:
     Args:
         simulation: the simulator with its effects.
         measured: the log.
+        rows: rows in which coordinates are needed that a simulation along the data reaches, (W); all by default.
     """
 
     simulation: Simulation
     measured: Measured
+    rows: np.ndarray | None = None
 
     @property
     def num_readings(self) -> int:
@@ -122,7 +124,8 @@ class Record:
         simulation, measured, derived = self.simulation, self.measured, self.positions_of_velocities
         before, after = (states.copy() for states in self.read_states)
         if others := [index for index in simulation.state_map.hidden if index not in derived]:
-            reached = settle(simulation, measured, before.copy(), self.executed, np.arange(len(measured)))
+            rows = np.arange(len(measured)) if self.rows is None else self.rows
+            reached = settle(simulation, measured, before.copy(), self.executed, rows)
             before[:, others] = after[:, others] = reached[:, others]
             goes_on = measured.run[1:] == measured.run[:-1]
             after[:-1][np.ix_(goes_on, others)] = before[1:][np.ix_(goes_on, others)]
@@ -132,6 +135,8 @@ class Record:
     def spread(self) -> np.ndarray:
         """Standard deviation of each coordinate, (m), in its unit: of a reading in the log, else in rows for fits."""
         fitted = self.measured.split == Split.FIT
+        if self.rows is not None:
+            fitted &= np.isin(np.arange(len(fitted)), self.rows)
         spread = np.nanstd(self.states[0][fitted] @ self.from_state.T, axis=0)
         spread[: self.num_readings] = self.measured.observation[:, self.seen].std(0)
         return np.where(spread > STILL, spread, 1.0)

@@ -21,7 +21,7 @@ from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates
+from torchrl_h2o.residuals.start_states import ROUNDING, Noise, StartStates, filtered_rows
 
 FIT_ROWS, SELECTION_ROWS = 1536, 1024  # rows that are predicted for fits, and for comparisons
 FIT_BLOCKS, SELECTION_BLOCKS = 32, 24  # blocks of a long log for which more rows are predicted
@@ -81,7 +81,10 @@ class Predictions:
 
     def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Predictions:
         """The same windows from the same start states, predicted by another simulation, or with other commands."""
-        own, record = self.record, Record(simulation, measured or self.record.measured)
+        own, record = (
+            self.record,
+            replace(self.record, simulation=simulation, measured=measured or self.record.measured),
+        )
         # unobserved coordinates stay those that the present simulation has reached
         record.__dict__["states"] = tuple(
             states + np.nan_to_num(new - old)
@@ -235,10 +238,17 @@ class Model:
             measured: the data.
             noise: the noise; estimated from the rows for fits by default.
         """
-        record, steps = Record(simulation, measured), block_steps(measured, simulation.control_step)
-        rows = max(FIT_ROWS, FIT_BLOCKS * steps), max(SELECTION_ROWS, SELECTION_BLOCKS * steps)
-        fit = StartStates.of(record, Blocks.of(measured, Split.FIT, steps, rows[0]), noise)
-        selection = StartStates.of(record, Blocks.of(measured, Split.SELECTION, steps, rows[1]), fit.noise)
+        steps = block_steps(measured, simulation.control_step)
+        blocks = [
+            Blocks.of(measured, split, steps, max(rows, fewest * steps))
+            for split, rows, fewest in (
+                (Split.FIT, FIT_ROWS, FIT_BLOCKS),
+                (Split.SELECTION, SELECTION_ROWS, SELECTION_BLOCKS),
+            )
+        ]
+        record = Record(simulation, measured, np.concatenate([filtered_rows(one, measured) for one in blocks]))
+        fit = StartStates.of(record, blocks[0], noise)
+        selection = StartStates.of(record, blocks[1], fit.noise)
         return cls(Predictions(fit), Predictions(selection))
 
     def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Model:
@@ -248,7 +258,8 @@ class Model:
             simulation: the simulator with its effects.
             measured: the same log with similar commands; that of this model by default.
         """
-        record = Record(simulation, measured or self.fit.record.measured)
+        record = self.fit.record
+        record = replace(record, simulation=simulation, measured=measured or record.measured)
         fit = StartStates.of(record, self.fit.blocks, similar=self.fit.starts)
         selection = StartStates.of(record, self.selection.blocks, fit.noise, self.selection.starts)
         return Model(replace(self.fit, starts=fit), replace(self.selection, starts=selection))

@@ -13,7 +13,7 @@ from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.effects.model.joint import LOCKED, JointRange
-from torchrl_h2o.likelihood import Difference
+from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.elements import elements
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
 from torchrl_h2o.residuals.forces.candidates import force_entry
@@ -27,7 +27,6 @@ from torchrl_h2o.residuals.refit import fit_set, interval
 from torchrl_h2o.residuals.report.contents import SearchStep
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.score import Predictions
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, alone_on, sweep
 
@@ -37,12 +36,11 @@ MOST_LEFT_OUT = 3  # fits after which effects are left out whose intervals hold 
 SWEEPS = 6  # largest number of sweeps
 
 
-def stop_test(level: float) -> str:
-    """Description of the test by which the search for effects stops."""
-    return (
-        "log density of the rows, predicted 1, 2, 4, ... rows ahead: paired over blocks of rows, a further effect must "
-        f"raise it by a likelihood ratio of {1.0 / level:.0f}, more if it is unusual, also in rows not used for its fit"
-    )
+#: the test by which the search for effects stops
+STOP_TEST = (
+    "log density of the rows, predicted 1, 2, 4, ... rows ahead: paired over blocks of rows, a further effect must "
+    f"raise it by a likelihood ratio of {math.exp(ENOUGH):.0f}, more if it is unusual, also in rows that chose no value"
+)
 
 
 def search(
@@ -53,7 +51,6 @@ def search(
     progress: LoopBar,
     known: Sequence[Effect] = (),
     so_far: Callable[[Explanation], object] = lambda found: None,
-    level: float = DEFAULTS.level,
 ) -> Explanation:
     """Searches the effects with which a simulator predicts the data best.
 
@@ -65,7 +62,6 @@ def search(
         progress: bar that shows how far the search is.
         known: effects of the catalogue from which the search begins.
         so_far: called with each better explanation.
-        level: significance level at which an effect is added.
 
     Returns:
         The explanation, with the values fitted to the rows for fits and for selection; the one so far if the time of
@@ -90,7 +86,7 @@ def search(
 
     ended_in, unseen, alike = None, (), []
     progress.stage(EFFECTS)
-    grounds = [Ground.of(simulation, measured, latest[0].effects, level)]
+    grounds = [Ground.of(simulation, measured, latest[0].effects)]
     try:
         alike, unseen = _searched(grounds, measured, latest[0], catalogue, progress, better, tried)
     except OutOfTimeError as end:
@@ -202,7 +198,7 @@ def _unseen(
         if evidence > seen[direction.entry.name]:
             seen[direction.entry.name] = evidence
             largest[direction.entry.name] = direction.entry.effect.with_parameters(direction.trial)
-    needed = {name: NATS_OF_SURPRISE * surprise(effect) - math.log(ground.level) for name, effect in largest.items()}
+    needed = {name: NATS_OF_SURPRISE * surprise(effect) + ENOUGH for name, effect in largest.items()}
     missed = sorted((name for name in seen if seen[name] < needed[name]), key=lambda name: -seen[name])
     effects = [largest[name] for name in missed]
     first = {type(effect): effect for effect in reversed(effects)}

@@ -16,6 +16,7 @@ from scipy.stats import norm
 
 from torchrl_h2o.likelihood import log_density
 from torchrl_h2o.residuals.blocks import LENGTHS, Blocks, Windows
+from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.record import Record
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
@@ -359,6 +360,12 @@ def _bounded(doubt: np.ndarray, most: np.ndarray | float) -> np.ndarray:
     """Covariances (..., m, m) with variances of at most ``most`` and the same correlations."""
     shrink = np.sqrt(np.minimum(1.0, most / np.maximum(np.einsum("...ii->...i", doubt), 1e-300)))
     return doubt * shrink[..., :, None] * shrink[..., None, :]
+
+
+def filtered_rows(blocks: Blocks, measured: Measured) -> np.ndarray:
+    """Rows of a log that are filtered for the start states in some blocks, and the row after each block."""
+    rows = blocks.first[:, None] + np.arange(-_rows_before(blocks), blocks.steps + 1)
+    return np.unique(rows.clip(0, len(measured) - 1))
 
 
 def _rows_before(blocks: Blocks) -> int:

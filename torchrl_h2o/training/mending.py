@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +19,7 @@ from torchrl_h2o.data.readers.sources import Source, words_of
 from torchrl_h2o.data.readers.whole_folder import whole_folder
 from torchrl_h2o.effects import Effect, effect_to_dict
 from torchrl_h2o.options.run import POSTERIOR_WORLDS
-from torchrl_h2o.residuals import LoopSettings, Report, close_the_loop
+from torchrl_h2o.residuals import Report, close_the_loop
 from torchrl_h2o.residuals.close_the_loop import FAILURES
 from torchrl_h2o.residuals.report.contents import DataSummary
 from torchrl_h2o.training.cache import SEARCHES, cache_folder, cached, key_of
@@ -125,7 +124,7 @@ def searched_rows(real: TensorDictBase) -> TensorDictBase:
 
 
 def search_key(task: Task, simulator: EnvBase, rows: TensorDictBase) -> str:
-    """Identifies a search by the simulator and its effects, the data's values, the settings and the code.
+    """Identifies a search by the simulator and its effects, the data's values and the code.
 
     The effects count beside the simulator's model, which does not show those on actions, observations and forces.
     """
@@ -135,7 +134,7 @@ def search_key(task: Task, simulator: EnvBase, rows: TensorDictBase) -> str:
         for key in READ
         if (values := rows.get(key, None)) is not None
     ]
-    return key_of([dict(task.config["make"]), effects, asdict(LoopSettings()), SEARCH], simulator, SEARCHES, data)
+    return key_of([dict(task.config["make"]), effects, SEARCH], simulator, SEARCHES, data)
 
 
 def _draws(report: Report, task: Task, num_worlds: int, seed: int) -> list[tuple[Effect, ...]]:

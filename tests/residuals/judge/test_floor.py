@@ -5,7 +5,7 @@ import torch
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.residuals import Split, residuals
-from torchrl_h2o.residuals.judge.floor import explainable_floor
+from torchrl_h2o.residuals.judge.held_out_error import explainable_floor
 
 
 def held_out_error(simulation, measured) -> np.ndarray:

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchrl_h2o.residuals.judge.floor import explainable_floor
 from torchrl_h2o.residuals.judge.headline import headline_error, headline_horizon
+from torchrl_h2o.residuals.judge.network import learned
 from torchrl_h2o.residuals.judge.whiteness import autocorrelation
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured, Split
 from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary, HorizonError
-from torchrl_h2o.residuals.settings import LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
+HORIZONS = (1, 2, 5, 10, 20, 50)  # control steps ahead at which errors are reported
 METRIC = "held-out one-step RMSE, each dimension divided by the standard deviation of its one-step change"
 
 
@@ -43,19 +43,25 @@ def error_summary(simulation: Simulation, mended: Simulation, measured: Measured
     )
 
 
-def with_horizons(
-    error: ErrorSummary, simulation: Simulation, mended: Simulation, measured: Measured, settings: LoopSettings
-) -> ErrorSummary:
+def with_horizons(error: ErrorSummary, simulation: Simulation, mended: Simulation, measured: Measured) -> ErrorSummary:
     """The summary with the errors several steps ahead."""
-    return replace(error, horizons=_horizons(simulation, mended, measured, settings))
+    return replace(error, horizons=_horizons(simulation, mended, measured))
 
 
 def with_floor(error: ErrorSummary, mended: Simulation, measured: Measured) -> ErrorSummary:
-    """The summary with the estimated error of the best possible model."""
+    """The summary with the error one step ahead that the best possible model would leave: what no network learns."""
     floor = explainable_floor(mended, measured)
     per_dimension = (replace(one, floor=value) for one, value in zip(error.per_dimension, floor.tolist(), strict=True))
     overall = float(np.sqrt(np.mean((floor / spread(measured)) ** 2)))
     return replace(error, floor=overall, per_dimension=tuple(per_dimension))
+
+
+def explainable_floor(simulation: Simulation, measured: Measured) -> np.ndarray:
+    """Held-out one-step RMSE that a network leaves which learns from the simulator's residuals, (n), in their units."""
+    fitted, judged = measured.fitted(), measured.reported_on()
+    errors, left = (residuals(simulation, measured, rows)[:, 0] for rows in (fitted, judged))
+    rest = left - learned(simulation, measured, fitted, judged, errors)
+    return np.sqrt(np.minimum(np.nanmean(rest**2, axis=0), np.nanmean(left**2, axis=0)))
 
 
 def overall_error(simulation: Simulation, measured: Measured) -> float:
@@ -69,12 +75,10 @@ def spread(measured: Measured) -> np.ndarray:
     return np.maximum(change.std(0), 1e-12)
 
 
-def _horizons(
-    simulation: Simulation, mended: Simulation, measured: Measured, settings: LoopSettings
-) -> tuple[HorizonError, ...]:
+def _horizons(simulation: Simulation, mended: Simulation, measured: Measured) -> tuple[HorizonError, ...]:
     """Errors at each horizon with at least two held-out windows."""
     names, found = simulation.state_map.names, []
-    for steps in settings.horizons:
+    for steps in HORIZONS:
         if len(measured.reported_on(steps)) < 2:
             break
         ahead = [

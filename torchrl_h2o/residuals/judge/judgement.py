@@ -29,7 +29,6 @@ from torchrl_h2o.residuals.report.errors import ErrorSummary, PredictionTable
 from torchrl_h2o.residuals.report.residual_trace import ResidualTrace
 from torchrl_h2o.residuals.report.windows import RunError, ShownWindow
 from torchrl_h2o.residuals.report.words import effect_words
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 MAX_REJECTED = 30  # largest number of rejected effects in the report
@@ -96,7 +95,6 @@ def judge(
     *,
     progress: LoopBar,
     seed: int = 0,
-    settings: LoopSettings = DEFAULTS,
 ) -> Judgement:
     """Judges an explanation on data that no fit has used.
 
@@ -107,7 +105,6 @@ def judge(
             the data could not have shown.
         progress: the time for the report; what it does not allow is left out and named in ``left_out``.
         seed: seed of the network that learns from what the effects leave.
-        settings: horizons and significance level.
 
     Returns:
         The held-out figures and the verdict.
@@ -120,12 +117,12 @@ def judge(
     steps = _shown_steps(error, simulation)
     predictions = optional(
         "the table of predictions",
-        lambda: None if steps is None else predicted(simulation, mended, measured, steps, seed=seed, settings=settings),
+        lambda: None if error is None else predicted(simulation, mended, measured, steps or 1, seed=seed),
         None,
     )
     verdict = optional(
         "the verdict",
-        lambda: _verdict(simulation, mended, measured, explanation, error, predictions, settings),
+        lambda: _verdict(simulation, mended, measured, explanation, error, predictions),
         Verdict(UNDECIDED, ("the time was up before a verdict was reached",), recommended=False),
     )
     if verdict.kind == NOTHING_MISSING and (explanation.ended_in is not None or progress.left_out):
@@ -133,7 +130,7 @@ def judge(
     if verdict.kind == NOTHING_MISSING and not explanation.failures:
         unseen = tuple(effect_words(effect, simulation.names) for effect in explanation.unseen)
         verdict = replace(verdict, undetectable=unseen)
-    details = _details(simulation, mended, measured, explanation, error, progress, settings)
+    details = _details(simulation, mended, measured, explanation, error, progress)
     if verdict.kind == NOT_EXPLAINED and not effects and explanation.ended_in is None and error is not None:
         verdict = replace(verdict, too_few=too_few_rows(simulation, measured, details["rejected"], error))
     return Judgement(
@@ -153,7 +150,6 @@ def _details(
     explanation: Explanation,
     error: ErrorSummary | None,
     progress: LoopBar,
-    settings: LoopSettings,
 ) -> dict[str, Any]:
     """The fields of a judgement that the verdict does not need, the most useful ones first, as far as there is time."""
     effects, optional = explanation.effects, progress.within_time
@@ -162,7 +158,7 @@ def _details(
     alternatives = optional("errors of alternatives", lambda: _all_alternatives(simulation, measured, explanation), ())
     others = optional("other sets", lambda: _others(simulation, mended, measured, explanation), ())
     if error is not None:
-        error = optional("errors ahead", partial(with_horizons, error, simulation, mended, measured, settings), error)
+        error = optional("errors ahead", partial(with_horizons, error, simulation, mended, measured), error)
         error = optional("the floor", partial(with_floor, error, mended, measured), error)
     steps = _shown_steps(error, simulation)
     windows = optional("windows", lambda: shown_windows(simulation, mended, measured, steps), ())
@@ -191,13 +187,12 @@ def _verdict(
     explanation: Explanation,
     error: ErrorSummary | None,
     predictions: Predicted | None,
-    settings: LoopSettings,
 ) -> Verdict:
     if error is None:
         raise OutOfTimeError(REPORT)  # the verdict is read from the errors
     undetermined = undetermined_values(explanation.parts, simulation.names)
     effects = explanation.effects
-    return reach_verdict(simulation, mended, measured, effects, error, predictions, settings, undetermined)
+    return reach_verdict(simulation, mended, measured, effects, error, predictions, undetermined)
 
 
 def _errors_after(simulation: Simulation, effects: tuple[Effect, ...], measured: Measured) -> tuple[float, ...]:

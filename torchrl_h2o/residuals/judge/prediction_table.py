@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import mujoco
 import numpy as np
-import torch
 from scipy.stats import t as student
-from torch import nn
 
 from torchrl_h2o.effects import Effect, selection
+from torchrl_h2o.likelihood import BLOCKS, ENOUGH, Difference
 from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
 from torchrl_h2o.residuals.judge.headline import HEADLINE_WINDOWS
+from torchrl_h2o.residuals.judge.network import learned
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals, start_states, undelayed_following
-from torchrl_h2o.residuals.measured.significance import p_value_of_losses
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.report.errors import PredictedRow, Prediction, PredictionTable
-from torchrl_h2o.residuals.report.sentence import effects_in_words
+from torchrl_h2o.residuals.report.errors import HeadlineError, PredictedRow, Prediction, PredictionTable
+from torchrl_h2o.residuals.report.sentence import effects_in_words, headline_words
 from torchrl_h2o.residuals.report.words import duration, number
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
-CELLS, UPDATES, BATCH = 64, 500, 256  # of the network: units of its two hidden layers, updates and windows in each
-FEWEST_LEARNT = 60  # windows for fits below which no network is trained
-CHECKED = 0.2  # share of these, at their end, that tells how much of the network's answer to trust
-TRUST = np.linspace(0.0, 1.0, 5)  # shares of its answer that are tried
-FAR = 5.0  # standard deviations at which the network's inputs and targets are cut
 LEARNT = 0.8  # share of the error that a network may leave at most for something learnable to be missing
 FARTHEST = 10.0  # largest error of a reading that counts, in its spreads
 BETTER_THAN_GUESS = 0.8  # share of the guess's error up to which effects explain the motion
 NEGLIGIBLE = 0.002  # errors below this, in spreads of the readings, are not reported as a missing effect
+WORSE = 1.1  # factor on the error of a reading above which the effects make it worse
 LITTLE = 0.02  # neither are errors below this share of the error without effects
 TOTAL = "total"
 _COMPARED = ("mended", "velocities_stay")
@@ -47,20 +42,24 @@ class Predicted:
         names: ``"total"`` and the joints, (R).
         seconds: time ahead, in s.
         losses: for each predictor, mean absolute error in spreads of the readings, (R, W).
-        settings: blocks and significance level.
+        readings: name, unit and spread of each reading.
+        by_reading: for the simulator as it is and mended, absolute errors in these spreads, (n, W).
+        one_step: for both, mean absolute error of all readings one step ahead, (V).
     """
 
     names: tuple[str, ...]
     seconds: float
     losses: dict[str, np.ndarray]
-    settings: LoopSettings
+    readings: tuple[tuple[str, str, float], ...] = ()
+    by_reading: tuple[np.ndarray, ...] = ()
+    one_step: tuple[np.ndarray, ...] = ()
 
     @cached_property
     def table(self) -> PredictionTable:
         """The mean errors with their 95 % intervals, from the scatter between blocks of neighbouring windows."""
         rows = []
         for index, name in enumerate(self.names):
-            cells = {which: _with_interval(loss[index], self.settings.blocks) for which, loss in self.losses.items()}
+            cells = {which: _with_interval(loss[index]) for which, loss in self.losses.items()}
             rows.append(PredictedRow(name, **cells))
         return PredictionTable(self.seconds, tuple(rows))
 
@@ -70,11 +69,11 @@ class Predicted:
         mended, learned = self.losses["mended"], self.losses["mended_and_network"]
         shares = learned.mean(1) / np.maximum(mended.mean(1), 1e-12)
         least = np.maximum(NEGLIGIBLE, LITTLE * self.losses["as_it_is"].mean(1))
-        level = self.settings.level / len(self.names)
+        needed = ENOUGH + math.log(len(self.names))
         telling = [
             row
             for row in np.flatnonzero((shares < LEARNT) & (mended.mean(1) > least))
-            if p_value_of_losses(mended[row], learned[row], self.settings) < level
+            if Difference.of_losses(mended[row], learned[row]).evidence > needed
         ]
         if not telling:
             return ()
@@ -82,6 +81,34 @@ class Predicted:
         where = "the motion" if self.names[best] == TOTAL else f"the motion of {self.names[best]}"
         ahead = f"{duration(self.seconds)} ahead"
         return (f"a small network removes {1.0 - shares[best]:.0%} of the error that is left in {where} {ahead}",)
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the mended simulator predicts better than the simulator as it is, one step or some steps ahead.
+
+        Noise of measured torques moves the simulator and not the machine, and can hide an effect some steps ahead.
+        """
+        ahead = self.losses["as_it_is"][0], self.losses["mended"][0]
+        return any(Difference.of_losses(*pair).evidence > ENOUGH for pair in (ahead, self.one_step) if pair)
+
+    @cached_property
+    def made_worse(self) -> tuple[str, ...]:
+        """Names the reading whose error the effects raise most, as evidence that one of them is wrong.
+
+        A fit lowers the sum over all readings. A wrong effect can lower it, if what one reading gains exceeds what
+        another one loses; a right one lowers all errors, or leaves them as they are.
+        """
+        if not self.readings:
+            return ()
+        means = [np.maximum(error.mean(1), NEGLIGIBLE) for error in self.by_reading]
+        index = int((means[1] / means[0]).argmax())
+        before, after = (float(mean[index]) for mean in means)
+        rise = Difference.of_losses(*(error[index] for error in reversed(self.by_reading))).evidence
+        if after <= WORSE * before or rise <= ENOUGH + math.log(len(self.readings)):
+            return ()
+        name, unit, spread = self.readings[index]
+        rose = HeadlineError(name, unit, self.seconds, spread * before, spread * after)
+        return (f"at least one of these effects is wrong: they raise the error of {headline_words(rose)}",)
 
     def hardly_better(self, simulation: Simulation, effects: Sequence[Effect]) -> tuple[str, ...]:
         """Says so if effects predict motion hardly better than the guess that every velocity stays as it is.
@@ -123,7 +150,6 @@ def predicted(
     steps: int,
     *,
     seed: int,
-    settings: LoopSettings = DEFAULTS,
 ) -> Predicted | None:
     """Predicts the held-out motion by the simulator as it is and mended, by constant velocities, and with a network.
 
@@ -136,7 +162,6 @@ def predicted(
         measured: the data.
         steps: control steps ahead.
         seed: seed of the network.
-        settings: blocks and significance level.
 
     Returns:
         The errors; None if the data hold too few held-out windows.
@@ -149,26 +174,30 @@ def predicted(
     spread = np.maximum(measured.observation.std(0), 1e-12)
     noisy = sensor_noise(mended, measured) is not None
 
-    def errors(which: Simulation, starts: np.ndarray) -> np.ndarray:
+    def errors(which: Simulation, starts: np.ndarray, steps: int = steps) -> np.ndarray:
         states = estimate_states(which, measured, starts) if noisy else None
         return residuals(which, measured, starts, steps, states=states)[:, -1] / spread
 
     states = (estimate_states if noisy else start_states)(mended, measured, judged)[judged]
     stays = undelayed_following(mended, measured)[judged + steps - 1] - at_constant_velocity(mended, states, steps)
-    left, learned = errors(mended, judged), np.zeros((len(judged), len(spread)))
-    if len(fitted) >= FEWEST_LEARNT:
-        inputs = _inputs(measured, fitted, steps), _inputs(measured, judged, steps)
-        learned = _learned(*inputs, errors(mended, fitted), seed, mended.check)
+    left = errors(mended, judged)
+    answer = learned(mended, measured, fitted, judged, errors(mended, fitted), steps, seed=seed)
     names, readings = _rows(mended)
     by_predictor = {
         "as_it_is": errors(simulation, judged),
         "mended": left,
         "velocities_stay": stays / spread,
-        "mended_and_network": left - learned,
+        "mended_and_network": left - answer,
     }
     known = np.isfinite(stays)  # late sensors leave the readings at the ends of runs unknown
     losses = {name: mean_errors(error, known, readings) for name, error in by_predictor.items()}
-    return Predicted(names, steps * simulation.control_step, losses, settings)
+    single = [[index] for index in range(len(spread))]
+    by_reading = tuple(mean_errors(by_predictor[name], known, single) for name in ("as_it_is", "mended"))
+    rows = measured.reported_on()
+    next_known = np.isfinite(undelayed_following(mended, measured)[rows])
+    one_step = tuple(mean_errors(errors(which, rows, 1), next_known, readings[:1])[0] for which in (simulation, mended))
+    described = tuple(zip(simulation.state_map.names, simulation.state_map.units, spread.tolist(), strict=True))
+    return Predicted(names, steps * simulation.control_step, losses, described, by_reading, one_step)
 
 
 def at_constant_velocity(simulation: Simulation, states: np.ndarray, steps: int) -> np.ndarray:
@@ -219,42 +248,8 @@ def mean_errors(error: np.ndarray, known: np.ndarray, readings: list[list[int]])
     return np.stack([size[:, own].sum(1) / np.maximum(known[:, own].sum(1), 1) for own in readings])
 
 
-def _inputs(measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:
-    """Readings at the start of windows and the mean of their actions, (W, n + nu)."""
-    actions = measured.action[starts[:, None] + np.arange(steps)].mean(1)
-    return np.concatenate([measured.observation[starts], actions], 1)
-
-
-def _learned(
-    fitted: np.ndarray, judged: np.ndarray, errors: np.ndarray, seed: int, check: Callable[[], object]
-) -> np.ndarray:
-    """What a network predicts of the errors of the judged windows, (W, n), from those of the fitted ones, (F, n)."""
-    mean, std = fitted.mean(0), np.maximum(fitted.std(0), 1e-9)
-    errors = np.nan_to_num(errors)
-    scale = np.maximum(np.median(np.abs(errors), axis=0) / 0.6745, 1e-9)
-    x, ask = (torch.from_numpy(np.clip((each - mean) / std, -FAR, FAR)).float() for each in (fitted, judged))
-    y = torch.from_numpy(np.clip(errors / scale, -FAR, FAR)).float()
-    known = round((1.0 - CHECKED) * len(x))
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        layers = (nn.Linear(x.shape[1], CELLS), nn.SiLU(), nn.Linear(CELLS, CELLS), nn.SiLU())
-        network = nn.Sequential(*layers, nn.Linear(CELLS, y.shape[1]))
-        optimiser = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=0.1)
-        for _ in range(UPDATES):
-            check()
-            batch = torch.randint(known, (BATCH,))
-            loss = nn.functional.smooth_l1_loss(network(x[batch]), y[batch])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-    with torch.no_grad():
-        answer, seen = network(ask).numpy() * scale, network(x[known:]).numpy() * scale
-    left = np.abs(errors[known:, None] - TRUST[:, None] * seen[:, None]).mean(0)
-    return TRUST[left.argmin(0)] * answer
-
-
-def _with_interval(loss: np.ndarray, blocks: int) -> Prediction:
+def _with_interval(loss: np.ndarray) -> Prediction:
     """Mean of the losses (W) and its 95 % interval."""
-    means = np.array([part.mean() for part in np.array_split(loss, min(blocks, len(loss)))])
+    means = np.array([part.mean() for part in np.array_split(loss, min(BLOCKS, len(loss)))])
     half = student.ppf(0.975, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
     return Prediction(float(loss.mean()), float(max(0.0, loss.mean() - half)), float(loss.mean() + half))

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import mannwhitneyu
 
 from torchrl_h2o.effects import Effect, JointRange
-from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
+from torchrl_h2o.likelihood import ENOUGH, Difference
+from torchrl_h2o.residuals.estimated_states import sensor_noise
 from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios
-from torchrl_h2o.residuals.judge.made_worse import FAR_WINDOWS, NEGLIGIBLE_ERROR, made_worse
-from torchrl_h2o.residuals.judge.prediction_table import Predicted
+from torchrl_h2o.residuals.judge.headline import HEADLINE_WINDOWS
+from torchrl_h2o.residuals.judge.prediction_table import NEGLIGIBLE, Predicted
 from torchrl_h2o.residuals.judge.separation import DESCRIBED_SHARE, UNUSUAL_FACTOR, where_it_is_large
 from torchrl_h2o.residuals.measured.error_over_noise import errors_and_noise
 from torchrl_h2o.residuals.measured.in_motion import in_motion
 from torchrl_h2o.residuals.measured.residual import residuals
-from torchrl_h2o.residuals.measured.significance import WORST, p_value_of_losses
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED,
@@ -28,10 +28,10 @@ from torchrl_h2o.residuals.report.contents import (
 from torchrl_h2o.residuals.report.errors import ErrorSummary, HeadlineError
 from torchrl_h2o.residuals.report.sentence import headline_words
 from torchrl_h2o.residuals.report.words import duration, effect_words, number, quantity
-from torchrl_h2o.residuals.settings import DEFAULTS, LoopSettings
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 AUTOCORRELATION = 0.2  # rank correlation of successive residuals above which they are not noise
+FAR_SECONDS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # times ahead, in s, of which the longest that the data allow counts
 # median error far ahead, in multiples of the median error by sensor noise, above which something is missing
 FAR_RATIO = 2.0
 FAR_NEGLIGIBLE = 0.01  # median error far ahead, in spreads, that is negligible without sensor noise
@@ -48,7 +48,6 @@ def reach_verdict(
     effects: Sequence[Effect],
     error: ErrorSummary,
     predictions: Predicted | None,
-    settings: LoopSettings = DEFAULTS,
     undetermined: Sequence[str] = (),
 ) -> Verdict:
     """Reaches a verdict from the part of the data that neither a fit nor a choice has used.
@@ -64,22 +63,20 @@ def reach_verdict(
         effects: the effects.
         error: errors before and after.
         predictions: how well the held-out motion is predicted; None if the data hold too few windows.
-        settings: thresholds.
         undetermined: reasons against effects whose value the data leave open.
     """
     with_noise = simulation.with_effects(*effects)
-    signs = signs_of_something_missing(with_noise, measured, error, predictions, settings)
+    signs = signs_of_something_missing(with_noise, measured, error, predictions)
     if not effects:
         if not signs:
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured))
-    against = reasons_against(simulation, mended, measured, effects, error, predictions, settings)
+    against = reasons_against(simulation, effects, predictions)
     hardly = () if predictions is None else predictions.hardly_better(mended, _acting(effects))
     against = (*against, *undetermined, *hardly)
     raised = False
     if (head := error.headline) is not None:
-        steps = max(1, round(head.seconds / simulation.control_step))
-        worse = made_worse(simulation, mended, measured, steps, settings)
+        worse = () if predictions is None else predictions.made_worse
         if raised := _raises(head, measured, simulation, effects):
             against = (*against, *(worse or (f"the effects found raise the error of {headline_words(head)}",)))
         else:
@@ -103,7 +100,7 @@ def _raises(
 ) -> bool:
     """Whether effects other than noise raise the error of the sentence, beyond what is negligible."""
     spread = float(measured.observation[:, simulation.state_map.names.index(head.name)].std())
-    return bool(_acting(effects)) and head.after > max(RAISED * head.before, NEGLIGIBLE_ERROR * spread)
+    return bool(_acting(effects)) and head.after > max(RAISED * head.before, NEGLIGIBLE * spread)
 
 
 def _leaves_little(error: ErrorSummary, predictions: Predicted | None) -> bool:
@@ -128,7 +125,6 @@ def signs_of_something_missing(
     measured: Measured,
     error: ErrorSummary,
     predictions: Predicted | None,
-    settings: LoopSettings = DEFAULTS,
 ) -> tuple[str, ...]:
     """The tests by which a simulation with all effects still differs from the data, each in words with its figure."""
     signs = [] if predictions is None else [*predictions.learnt]
@@ -137,15 +133,15 @@ def signs_of_something_missing(
     if high:
         name = max(high, key=lambda name: high[name])
         signs.append(f"successive residuals of {name} are alike (rank correlation {number(high[name], 2)})")
-    far = _far_ahead(simulation, measured, settings)
+    far = _far_ahead(simulation, measured)
     return (*signs, *far)
 
 
-def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSettings) -> tuple[str, ...]:
+def _far_ahead(simulation: Simulation, measured: Measured) -> tuple[str, ...]:
     """Whether the error far ahead exceeds what the sensors' noise causes."""
     names, units = simulation.state_map.names, simulation.state_map.units
-    times = [max(1, round(seconds / simulation.control_step)) for seconds in settings.window_seconds]
-    possible = [steps for steps in times if len(measured.reported_on(steps)) >= FAR_WINDOWS]
+    times = [max(1, round(seconds / simulation.control_step)) for seconds in FAR_SECONDS]
+    possible = [steps for steps in times if len(measured.reported_on(steps)) >= HEADLINE_WINDOWS]
     if not possible:
         return ()
     steps = max(possible)
@@ -153,16 +149,16 @@ def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSetting
     sensor_std = sensor_noise(simulation, measured)
     if sensor_std is None:
         sensor_std = np.zeros(len(names))
-    starts = in_motion(measured, measured.reported_on(steps), steps, FAR_WINDOWS)
+    starts = in_motion(measured, measured.reported_on(steps), steps, HEADLINE_WINDOWS)
     rng = np.random.default_rng(0)
     error, by_noise = errors_and_noise(simulation, measured, starts, steps, sensor_std, rng)
-    if len(error) < FAR_WINDOWS:
+    if len(error) < HEADLINE_WINDOWS:
         return ()
     usual = np.maximum(np.median(by_noise, axis=0), FAR_NEGLIGIBLE * spread)
     ratio = np.median(error, axis=0) / usual
     worst = int(ratio.argmax())
-    p = mannwhitneyu(error[:, worst], np.maximum(by_noise[:, worst], usual[worst]), alternative="greater").pvalue
-    if ratio[worst] <= FAR_RATIO or p >= settings.level / len(names):
+    beyond = Difference.of_losses(error[:, worst], np.maximum(by_noise[:, worst], usual[worst]))
+    if ratio[worst] <= FAR_RATIO or beyond.evidence <= ENOUGH + math.log(len(names)):
         return ()
     missed, noise = (quantity(v, units[worst], 2) for v in (np.median(error[:, worst]), usual[worst]))
     ahead = duration(steps * simulation.control_step)
@@ -170,18 +166,12 @@ def _far_ahead(simulation: Simulation, measured: Measured, settings: LoopSetting
 
 
 def reasons_against(
-    simulation: Simulation,
-    mended: Simulation,
-    measured: Measured,
-    effects: Sequence[Effect],
-    error: ErrorSummary,
-    predictions: Predicted | None,
-    settings: LoopSettings = DEFAULTS,
+    simulation: Simulation, effects: Sequence[Effect], predictions: Predicted | None
 ) -> tuple[str, ...]:
     """Reasons against putting effects into a simulator for training; empty if there are none."""
     reasons = []
     acting = _acting(effects)
-    if acting and not _lowers_the_error(simulation, mended, measured, error, settings):
+    if acting and (predictions is None or not predictions.is_better):
         reasons.append("the effects found do not lower the error on data that chose nothing")
     if not acting and predictions is not None and (learnt := predictions.learnt):
         reasons.append(f"the noise found stands for something that can be predicted: {learnt[0]}")
@@ -193,29 +183,6 @@ def reasons_against(
 def _acting(effects: Sequence[Effect]) -> list[Effect]:
     """The effects that change the motion; noise does not."""
     return [effect for effect in effects if not effect.random]
-
-
-def _lowers_the_error(
-    simulation: Simulation, mended: Simulation, measured: Measured, error: ErrorSummary, settings: LoopSettings
-) -> bool:
-    """Whether the error on the report's data falls significantly, one step ahead or as far as the sentence says.
-
-    With noisy sensors, windows start from states that are filtered with the past rows.
-    """
-    noisy = sensor_noise(mended, measured) is not None
-    ahead = {1} if error.headline is None else {1, max(1, round(error.headline.seconds / simulation.control_step))}
-    spread = np.maximum(measured.observation.std(0), 1e-12)
-    for steps in ahead:
-        starts = measured.reported_on(steps)
-        sizes = []
-        for which in (simulation, mended):
-            states = estimate_states(which, measured, starts) if noisy else None
-            missed = residuals(which, measured, starts, steps, states=states)[:, -1] / spread
-            sizes.append(np.nan_to_num(np.abs(missed), nan=WORST).mean(1))
-        level = settings.level / len(ahead)
-        if len(starts) >= 2 and p_value_of_losses(sizes[0], sizes[1], settings) < level:
-            return True
-    return False
 
 
 def _why_implausible(effect: Effect) -> str:

@@ -15,7 +15,6 @@ from tensordict import TensorDictBase
 from torchrl_h2o.data import DataError
 from torchrl_h2o.data.readers.ted import require_ted
 from torchrl_h2o.residuals.measured.moving_rows import moving_rows
-from torchrl_h2o.residuals.settings import DEFAULTS
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 # usable transitions below which no conclusion is drawn: no test could distinguish an effect from chance
@@ -33,6 +32,7 @@ WINDOWS_IN_BLOCK = 25
 Result = TypeVar("Result")
 
 HELD_OUT = 0.25  # share of the transitions on which errors are reported
+MAX_WINDOWS = 3500  # largest number of windows in a judgement; more are slower and hardly more precise
 REMEMBERED = 32  # results that are kept with the data
 
 
@@ -65,7 +65,6 @@ class Measured:
         split: (T), the :class:`Split` of each transition.
         left_out: number of excluded rows by reason.
         source: name of the data in reports and errors.
-        max_windows: largest number of windows in a fit or a judgement.
         estimated_std: (n), standard deviation of the errors of columns that were estimated from others, such as
             velocities from positions, and 0 for measured ones; None if all were measured.
         block: neighbouring windows that are kept or left out together.
@@ -80,7 +79,6 @@ class Measured:
     split: np.ndarray
     left_out: dict[str, int]
     source: str
-    max_windows: int = DEFAULTS.max_windows
     estimated_std: np.ndarray | None = None
     block: int = 1
     _results: OrderedDict[tuple[Hashable, Simulation | None], Any] = field(
@@ -95,7 +93,6 @@ class Measured:
         *,
         source: str = "transitions",
         held_out: float | Collection[int] = HELD_OUT,
-        max_windows: int = DEFAULTS.max_windows,
     ) -> Measured:
         """Converts a TED TensorDict, checks its widths against the simulation, and divides it into three parts.
 
@@ -111,7 +108,6 @@ class Measured:
             source: name of the data in reports and errors.
             held_out: share of the transitions, taken from the end, on which errors are reported; or the indices of
                 the logs on which they are. Of the rest, ``SELECTION_SHARE`` is for the selection of effects.
-            max_windows: largest number of windows in a fit or a judgement.
 
         Raises:
             DataError: if observations or actions do not have the simulation's width, or no log is left for fits.
@@ -137,7 +133,6 @@ class Measured:
             divided(run, logs, held_out, observation, action, source=str(source)),
             {"a value at the end of its sensor's range": int(clipped.sum())} if clipped.any() else {},
             str(source),
-            max_windows,
             _rms(_float64(data["observation_std"])) if "observation_std" in data.keys() else None,
             WINDOWS_IN_BLOCK if simulation.state_map.hidden else 1,
         )
@@ -192,7 +187,7 @@ class Measured:
         return starts[whole & (self.run[starts] == self.run[starts + horizon - 1])]
 
     def fitted(self, horizon: int = 1) -> np.ndarray:
-        """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``max_windows``."""
+        """First rows, (W), of the windows for fits: not overlapping, evenly thinned to ``MAX_WINDOWS``."""
         return self.spread_windows(Split.FIT, horizon)
 
     def reported_on(self, horizon: int = 1) -> np.ndarray:
@@ -200,8 +195,8 @@ class Measured:
         return self.spread_windows(Split.REPORT, horizon)
 
     def spread_windows(self, split: Split, horizon: int) -> np.ndarray:
-        """First rows, (W), of a part's windows: not overlapping, evenly thinned to ``max_windows``."""
-        return thinned(self.windows(horizon, horizon, split=split), self.max_windows, self.block)
+        """First rows, (W), of a part's windows: not overlapping, evenly thinned to ``MAX_WINDOWS``."""
+        return thinned(self.windows(horizon, horizon, split=split), MAX_WINDOWS, self.block)
 
     def part(self, rows: slice) -> Measured:
         """A contiguous piece of the transitions."""
