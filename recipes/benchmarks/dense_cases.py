@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import (
     ActionDelay,
+    ActionLag,
     Armature,
     JointDamping,
     JointFrictionLoss,
@@ -110,11 +111,16 @@ def _on_joints(found: Iterable[FoundEffect], name: str, model: mujoco.MjModel) -
 
 
 def _delay_errors(report: Report, case: Case, count: int) -> np.ndarray:
-    """Errors of each actuator's delay in s; late sensors and late motors are the same in such a log."""
+    """Errors of each actuator's delay in s.
+
+    Late sensors and late motors are the same in such a log, and so are a delay and a filter of a fraction of a step.
+    """
     found = np.zeros(count)
     for effect in report.effects:
         if isinstance(effect, ActionDelay):
             found[slice(None) if effect.actuators is None else list(effect.actuators)] += effect.delay
+        elif isinstance(effect, ActionLag):
+            found[slice(None) if effect.actuators is None else list(effect.actuators)] += effect.time_constant
         elif isinstance(effect, ObservationDelay) and effect.entries is None:
             found += effect.delay
     (true,) = (effect.delay for effect in case.truth if isinstance(effect, ActionDelay))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.data.audit.recorded import arm, changed, recording
-from torchrl_h2o.effects import ActionNoise, ObservationDelay
+from torchrl_h2o.effects import ActionDelay, ActionNoise, ObservationDelay
 from torchrl_h2o.residuals.offered import late_velocities, offered_entries
 from torchrl_h2o.residuals.record import Record
 
@@ -16,9 +16,10 @@ def filtered(rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def test_some_sensors_alone_are_not_late_in_a_search():
-    delays = [entry.effect for entry in offered_entries(arm()) if isinstance(entry.effect, ObservationDelay)]
-    assert [delay.entries for delay in delays] == [None]
+def test_sensors_are_not_late_in_a_search_because_motors_are():
+    effects = [entry.effect for entry in offered_entries(arm())]
+    assert not any(isinstance(effect, ObservationDelay) for effect in effects)
+    assert any(isinstance(effect, ActionDelay) and effect.actuators is None for effect in effects)
 
 
 @pytest.mark.parametrize("data", [recording(noise=0.0), recording(noise=0.01), recording(ActionNoise(0.2), noise=0.0)])

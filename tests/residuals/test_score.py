@@ -71,6 +71,11 @@ def test_a_fit_that_is_given_derivatives_reaches_the_same_values_by_fewer_simula
     assert fewer < len(simulated)
 
 
+def test_a_smooth_sensor_has_little_noise_however_wrong_the_simulator_is():
+    measured = recorded(pendulum().with_effects(ObservationGain(1.4, (0,))), 2000)
+    assert Model.of(pendulum(), measured).fit.starts.noise.sensor[0] < 0.05
+
+
 def test_sets_are_compared_with_the_same_noise_so_that_an_effect_of_no_size_gains_nothing():
     ground = Ground.of(double_pendulum(), recorded(double_pendulum(), 1200, 0.01))
     gain = Difference(ground.model((Gravity(1.0 + 1e-9),)).scores() - ground.base.scores())

@@ -235,6 +235,14 @@ def test_one_effect_on_each_joint_stands_for_a_shared_one_and_a_further_one():
     assert disjoint(sets, [], SIMULATION.catalogue(), SIMULATION)[1] == ()  # where the time was up
 
 
+def test_bodies_that_share_an_effect_beside_a_further_one_have_one_each():
+    effects = BodyMass(2.0, "*"), BodyMass(0.5, "lower")
+    entries = [entry_of(one, SIMULATION.catalogue()) for one in effects]
+    assert None not in entries
+    apart, _ = disjoint(Found(tuple(entries), effects, np.zeros(0)), [], SIMULATION.catalogue(), SIMULATION)
+    assert {effect.bodies: effect.scale for effect in apart.effects} == {"upper": 2.0, "lower": 1.0}
+
+
 def test_two_candidates_are_tried_together_that_explain_little_one_by_one():
     size, rng = 400, np.random.default_rng(0)
     common, apart, other = rng.standard_normal((3, size))

@@ -74,6 +74,12 @@ def body_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:
     return [1 + i for i in matching(paths, patterns, "body")]
 
 
+def geom_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:
+    """Returns the ids of the matching geoms of a compiled model."""
+    views = [model.geom(i) for i in range(model.ngeom)]
+    return matching([(model.body(view.bodyid[0]).name, view.name) for view in views], patterns, "geom")
+
+
 def _paths(elements: Sequence) -> list[tuple[str, str]]:
     return [(element.parent.name, element.name) for element in elements]
 

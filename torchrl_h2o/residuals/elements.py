@@ -1,4 +1,4 @@
-"""The joints or motors that an effect acts on."""
+"""The parts of a machine that an effect acts on."""
 
 from __future__ import annotations
 
@@ -15,3 +15,12 @@ def elements(effect: Effect, simulation: Simulation) -> tuple[int, ...]:
         chosen = getattr(effect, "actuators", None)
         return tuple(range(simulation.model.nu)) if chosen is None else chosen
     return ()
+
+
+def all_elements(effect: Effect, simulation: Simulation) -> tuple[int, ...]:
+    """As :func:`elements`, and the bodies or the geoms that an effect acts on."""
+    if (bodies := getattr(effect, "bodies", None)) is not None:
+        return tuple(selection.body_ids(simulation.model, bodies))
+    if (geoms := getattr(effect, "geoms", None)) is not None:
+        return tuple(selection.geom_ids(simulation.model, geoms))
+    return elements(effect, simulation)

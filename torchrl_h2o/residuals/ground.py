@@ -25,7 +25,7 @@ SKETCH = 3  # steps of such a fit
 GROWN = 5  # steps of the fit of a set after an effect was added
 REFITTED = 3  # fits of a set, each from the start states that the fit before gives
 NATS_OF_SURPRISE = 2.0  # evidence that an effect needs for each degree of surprise
-MATTERS = 0.03  # share of the errors of the simulator without effects, below which what is left is not explained
+MATTERS = 0.03  # share of the errors without effects, or of the motion if less, below which errors are not explained
 NEARLY_NONE = 10.0  # roundings of a reading up to which an error is none
 MANY = 2  # joints or motors with an effect beside which a further one needs hardly any evidence
 ONE_MORE = 1.0  # that evidence
@@ -117,7 +117,8 @@ class Ground:
         """
         model = Model.of(simulation.with_effects(*effects), measured)
         errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
-        floor = np.concatenate([(MATTERS * np.median(np.abs(error), axis=0)) ** 2 for error in errors])
+        sizes = (np.minimum(*map(_usual, pair)) for pair in zip(errors, model.fit.changes, strict=True))
+        floor = np.concatenate([(MATTERS * size) ** 2 for size in sizes])
         base = _weighted(model, floor)
         return cls(simulation, base, None, {tuple(effects): base})
 
@@ -185,7 +186,7 @@ class Ground:
         if floor is None or not found.entries:
             return False
         errors = self.model(found.effects).fit.errors()
-        usual = np.concatenate([np.median(np.abs(error), axis=0) for error in errors])
+        usual = np.concatenate(list(map(_usual, errors)))
         return bool((usual**2 <= floor + (NEARLY_NONE * ROUNDING) ** 2).all())
 
     def fitted(self, entries: Sequence[CatalogueEntry], effects: Sequence[Effect]) -> Found:
@@ -258,6 +259,11 @@ class Ground:
         return not less.is_noise or all(
             Difference(one - other).evidence > needed for one, other in zip(more.one_step, less.one_step, strict=True)
         )
+
+
+def _usual(errors: np.ndarray) -> np.ndarray:
+    """Median size of errors (W, h, n) by horizon and reading, (h, n)."""
+    return np.median(np.abs(errors), axis=0)
 
 
 def _weighted(model: Model, floor: np.ndarray | None) -> Model:

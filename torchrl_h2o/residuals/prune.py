@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.likelihood import Difference
+from torchrl_h2o.residuals.elements import all_elements
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import (
     ALIKE,
@@ -18,6 +19,7 @@ from torchrl_h2o.residuals.grow import (
     with_one_more,
 )
 from torchrl_h2o.residuals.refit import variables_of, with_values
+from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction
 
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
@@ -45,7 +47,7 @@ def _smaller(ground: Ground, found: Found, kept: set[frozenset[str]]) -> Found |
     variables = variables_of(part, found.entries, found.effects)
     gains = gains_beside(part, found, found.slopes)
     tried = []
-    for names in _of_each_kind(found):
+    for names in _of_each_kind(found, ground.simulation):
         if names not in kept:
             dropped = [index for index, entry in enumerate(found.entries) if entry.name in names]
             tried.append((names, *gains.readjusted(dropped, variables)))
@@ -65,11 +67,19 @@ def _smaller(ground: Ground, found: Found, kept: set[frozenset[str]]) -> Found |
     return None
 
 
-def _of_each_kind(found: Found) -> list[frozenset[str]]:
-    """Names of the entries of each kind of effects."""
+def _of_each_kind(found: Found, simulation: Simulation) -> list[frozenset[str]]:
+    """Names of the entries of each kind of effects; those that overlap, such as one on both feet and one on a foot,
+    each by itself."""
     kinds: dict[Hashable, set[str]] = {}
-    for entry, effect in zip(found.entries, found.effects, strict=True):
-        kinds.setdefault(kind_of(effect), set()).add(entry.name)
+    own = [set(all_elements(effect, simulation)) for effect in found.effects]
+    for index, (entry, effect) in enumerate(zip(found.entries, found.effects, strict=True)):
+        overlaps = any(
+            kind_of(other) == kind_of(effect) and elements & own[index]
+            for other, elements in zip(
+                found.effects[:index] + found.effects[index + 1 :], own[:index] + own[index + 1 :], strict=True
+            )
+        )
+        kinds.setdefault(entry.name if overlaps else kind_of(effect), set()).add(entry.name)
     return [frozenset(names) for names in kinds.values()]
 
 
@@ -112,7 +122,14 @@ def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]
         sketched: the others.
     """
     half = 0.5 * (found.scores - fewer.scores).mean()
-    fitted = [ground.fitted(one.entries, one.effects) for one in sketched if (one.scores - fewer.scores).mean() > half]
+    present = dict(zip((entry.name for entry in found.entries), found.effects, strict=True))
+    fitted = []
+    for one in sketched:
+        if (one.scores - fewer.scores).mean() > half:
+            # what explains the data as well leaves the other effects as they are
+            kept = [present.get(entry.name, effect) for entry, effect in zip(one.entries, one.effects, strict=True)]
+            best = max(one, ground.found(one.entries, kept), key=lambda each: each.scores.mean())
+            fitted.append(ground.fitted(best.entries, best.effects))
     return [
         one
         for one in fitted

@@ -139,6 +139,14 @@ class Predictions:
             for windows, one in zip(self.blocks.windows, predicted, strict=True)
         ]
 
+    @property
+    def changes(self) -> list[np.ndarray]:
+        """Changes of the readings in spreads, (W, h, n) for each kind of windows."""
+        record = self.record
+        before, after = (each[:, record.seen] / record.spread[: record.num_readings] for each in record.readings)
+        windows = self.blocks.windows
+        return [after[one.rows[:, None] + one.horizons - 1] - before[one.rows][:, None] for one in windows]
+
     @cached_property
     def variances(self) -> list[np.ndarray]:
         """Variance of the errors by sensor noise and uncertain start states, (W, h, n) for each kind of windows."""

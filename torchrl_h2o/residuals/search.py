@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce
+from torchrl_h2o.effects import CatalogueEntry, Effect, ResidualForce, is_negligible
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.effects.model.joint import LOCKED, JointRange
 from torchrl_h2o.likelihood import ENOUGH, Difference
-from torchrl_h2o.residuals.elements import elements
+from torchrl_h2o.residuals.elements import all_elements
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
 from torchrl_h2o.residuals.forces.candidates import force_entry
 from torchrl_h2o.residuals.gains import summed
-from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground
+from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, grow, is_preferred, with_force
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
@@ -208,14 +208,14 @@ def _unseen(
 def disjoint(
     found: Found, alike: Sequence[Sequence[Found]], catalogue: Sequence[CatalogueEntry], simulation: Simulation
 ) -> tuple[Found, Sequence[Sequence[Found]]]:
-    """A set and its alternatives, in which one effect on each joint stands for a shared one beside further ones.
+    """A set and its alternatives, in which one effect on each element stands for a shared one beside further ones.
 
     *Stiffness of both feet + 60, stiffness of the back foot + 60* becomes 120 for the back foot and 60 for the front
     foot. A set that would grow by this stays as it is.
     """
-    alone = alone_on(catalogue, simulation)
+    alone = alone_on(catalogue, simulation, all_elements)
     for entry, effect in zip(found.entries, found.effects, strict=True):
-        own = [alone.get((type(effect), index)) for index in elements(effect, simulation)]
+        own = [alone.get((type(effect), index)) for index in all_elements(effect, simulation)]
         further = {one.name for one in own if one is not None} & found.names - {entry.name}
         if len(effect.parameters) == 1 and further and None not in own and len(own) <= 1 + len(further):
             present = dict(zip((one.name for one in found.entries), found.effects, strict=True))
@@ -242,7 +242,8 @@ def with_intervals(
 
     Every horizon counts alike in this fit: values hold for simulations of any length, and small errors in the many
     short windows do not outweigh large ones far ahead. Effects whose interval holds their neutral value are left out,
-    the least certain ones first, while there is time.
+    the least certain ones first, while there is time. What several joints or motors have, such as friction, is left out
+    on all of them or on none, because they resemble each other, but for values that are rounding.
     """
     effects = found.effects
     for is_last in (False, True) if effects else (True,):
@@ -252,9 +253,16 @@ def with_intervals(
         fit = fit_set(parts, found.entries, effects, most_steps=GROWN, intervals=is_last)
         effects = fit.effects
     for _ in range(MOST_LEFT_OUT):
-        sizes = [_certainty(effect, half) for effect, half in zip(fit.effects, fit.half_widths, strict=True)]
+        certain: dict[Hashable, float] = {}
+        for effect, half in zip(fit.effects, fit.half_widths, strict=True):
+            certain[kind_of(effect)] = max(_certainty(effect, half), certain.get(kind_of(effect), 0.0))
+        sizes = [certain[kind_of(effect)] for effect in fit.effects]
         least = max(NEUTRAL, min(sizes, default=math.inf))
-        idle = {one.name for one, size in zip(found.entries, sizes, strict=True) if size <= least and size < 1.0}
+        idle = {
+            entry.name
+            for entry, effect, size in zip(found.entries, fit.effects, sizes, strict=True)
+            if (size <= least and size < 1.0) or is_negligible(effect, entry.trials)
+        }
         if not idle:
             break
         fewer = Found(*replace(found, effects=fit.effects).without(idle), found.scores)

@@ -29,6 +29,7 @@ SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trust
 LINEARISED = 2  # times that the steps of the simulation are linearised, about better states each time
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
 USUAL_FACTORS = np.array([0.0, -0.7])
+MOST_NOISE = 3.0  # largest noise of a sensor, in that which third differences show: noise of some rows shows less
 SPACINGS = (2.0, 1.0, 0.5, 0.2, 0.07)  # of the logarithms that are tried, one grid after another
 LASTS = 0.95  # correlation of lasting errors of the actions in successive rows
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
@@ -186,11 +187,14 @@ class Steps:
         rows = np.maximum(rows, begins[blocks.first][:, None])
         about = np.zeros((*rows.shape, m)) if about is None else np.where(live[..., None], about, 0.0)
         base = _reached(record, record.simulation, rows, about)
-        if slope is None:
-            slope, quick = np.empty((*rows.shape, m, m)), record.simulation.quick
+        # how readings depend on coordinates that a simulation reaches, such as the depth of contacts, is the set's own
+        columns = np.arange(m) if slope is None else np.flatnonzero(record.settled)
+        if len(columns):
+            slope = np.empty((*rows.shape, m, m)) if slope is None else slope.copy()
+            quick = record.simulation.quick
             before = base if quick is record.simulation else _reached(record, quick, rows, about)
-            for index, nudge in enumerate(NUDGE * np.eye(m)):
-                slope[..., index] = (_reached(record, quick, rows, about + nudge) - before) / NUDGE
+            for index in columns:
+                slope[..., index] = (_reached(record, quick, rows, about + NUDGE * np.eye(m)[index]) - before) / NUDGE
         after = record.states[1][rows] @ record.from_state.T / record.spread
         miss = base - after - (slope @ about[..., None])[..., 0]
         known = np.asarray(np.isfinite(slope).all((2, 3)) & np.isfinite(miss).all(2))
@@ -209,9 +213,11 @@ class Steps:
     def noise(self, factors: np.ndarray) -> Noise:
         """The noise with given logarithms of its two or three factors on :meth:`_typical_noise`.
 
-        The third is that of the noise of the actions, or of their errors that last.
+        The third is that of the noise of the actions, or of their errors that last. No sensor's noise is larger than
+        the third differences of its readings allow, however wrong the simulator is.
         """
         noise = self._typical_noise.scaled(*np.exp(factors))
+        noise = replace(noise, sensor=np.clip(noise.sensor, ROUNDING, MOST_NOISE * self.jerk + ROUNDING))
         if not self.lasting:
             return noise
         lasting = np.full(self.lasting, math.exp(factors[2]) * math.sqrt(1.0 - LASTS**2))

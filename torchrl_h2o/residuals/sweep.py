@@ -122,11 +122,15 @@ def sweep(
     return [direction for directions in found.values() for direction in reversed(directions)]
 
 
-def alone_on(entries: Sequence[CatalogueEntry], simulation: Simulation) -> dict[tuple[type, int], CatalogueEntry]:
-    """The entries that act on a single joint or motor, by kind and index."""
+def alone_on(
+    entries: Sequence[CatalogueEntry],
+    simulation: Simulation,
+    of: Callable[[Effect, Simulation], Sequence[int]] = elements,
+) -> dict[tuple[type, int], CatalogueEntry]:
+    """The entries that act on a single joint or motor, or on one of other elements, by kind and index."""
     found = {}
     for entry in entries:
-        own = elements(entry.effect, simulation)
+        own = of(entry.effect, simulation)
         if len(own) == 1:
             found[type(entry.effect), own[0]] = entry
     return found

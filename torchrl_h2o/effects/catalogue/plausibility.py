@@ -47,20 +47,17 @@ def surprise(effect: Effect) -> int:
     Friction, damping, rotor inertia, delays and offsets are usual; a wrong mass, length or motor constant is less so,
     and a different gravity or time step is an error of the model. A property that differs by a large factor, and
     friction, damping or rotor inertia below those of the model, count one more, and so does a drive or a sensor that is
-    so late that it does next to nothing. All sensors late by the same time move as late motors do, and are less usual.
+    so late that it does next to nothing.
 
     Args:
         effect: the effect at its fitted value.
 
     Examples:
-        >>> from torchrl_h2o.effects import ActionDelay, ActionGain, Armature, Gravity, ObservationDelay
+        >>> from torchrl_h2o.effects import ActionGain, Armature, Gravity
         >>> surprise(Armature(0.003)), surprise(ActionGain(0.8)), surprise(ActionGain(0.3)), surprise(Gravity(0.8))
         (0, 1, 2, 2)
-        >>> surprise(ActionDelay(0.01)), surprise(ObservationDelay(0.01)), surprise(ObservationDelay(0.01, (0,)))
-        (0, 1, 0)
     """
     rank = 0 if isinstance(effect, USUAL) else 2 if isinstance(effect, KNOWN) else 1
-    rank += isinstance(effect, ObservationDelay) and effect.entries is None
     for parameter in effect.parameters.values():
         if parameter.neutral == 1.0 and parameter.value > 0.0:
             far = abs(math.log(parameter.value)) > math.log(_LARGE_FACTOR)
