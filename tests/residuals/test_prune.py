@@ -17,8 +17,9 @@ FRICTION = JointFrictionLoss(0.001, "shoulder"), JointFrictionLoss(0.02, "elbow"
         (FRICTION[1:], FRICTION, 2),  # friction of the elbow alone tells that joints have friction
         ((), FRICTION, 0),
         (FRICTION, (*FRICTION, Gravity(1.0001)), 2),
+        ((JointFrictionLoss(0.02),), (JointFrictionLoss(0.02), JointFrictionLoss(0.0003, "elbow")), 1),
     ],
-    ids=["one of two joints", "none", "another effect"],
+    ids=["one of two joints", "none", "another effect", "one on both joints, and one on the elbow"],
 )
 def test_an_effect_on_several_joints_stays_on_all_or_on_none(true, found, left):
     simulation = double_pendulum()
