@@ -36,6 +36,7 @@ class Difference:
         """By how much losses of neighbouring windows, (W) in order of time, are lower than others.
 
         The losses of a block are taken as those of exponential distributions, whose likeliest scales are their means.
+        What acts in fewer than ``FEWEST`` blocks shows no evidence.
         """
         parts = np.array_split(np.arange(len(worse)), min(BLOCKS, len(worse)))
         least = 1e-6 * worse.mean() + 1e-300

@@ -80,7 +80,7 @@ def rank(pair: Pair) -> dict:
 
 
 def _prior(effects: tuple[Effect, ...]) -> float:
-    """Logarithm of the prior probability of effects, in nats: the level for each kind, and less for unusual ones."""
+    """Logarithm of the prior probability of effects, in nats: 100 times less for each kind, less for unusual ones."""
     return -ENOUGH * len({type(effect) for effect in effects}) - NATS_OF_SURPRISE * surprise_of(effects)
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.residuals.pendulum import pendulum
+from tests.residuals.pendulum import double_pendulum, pendulum
 from tests.residuals.pendulum import recorded as recorded_pendulum
 from torchrl_h2o.effects import ActionDelay, Gravity, JointFrictionLoss, ObservationGain
 from torchrl_h2o.envs import WheelLeggedEnv, noisy_balance_controller, record
-from torchrl_h2o.residuals import Measured, Simulation
+from torchrl_h2o.residuals import Measured, Simulation, StateMap
 from torchrl_h2o.residuals.estimated_states import estimate_states, sensor_noise
 from torchrl_h2o.residuals.measured.residual import start_states
 
@@ -107,3 +107,15 @@ def test_later_rows_and_other_runs_do_not_change_an_estimate(simulation, recorde
     first, second = (estimate_states(simulation, data) for data in (noisy, other))
     np.testing.assert_allclose(first[:701], second[:701], atol=1e-9)
     assert (np.abs(first[701:] - second[701:]).max(0) > 0.1).any()
+
+
+def test_velocities_that_no_sensor_reads_are_estimated_in_any_rows():
+    full = double_pendulum()
+    noisy, clean = (recorded_pendulum(full, 1500, noise) for noise in (0.01, 0.0))
+    names = StateMap.of_coordinates(("shoulder", "elbow"), ("rad", "rad"), (0, 1), num_states=4)
+    simulation = Simulation(full.spec, full.frame_skip, replace(names, hidden=(2, 3)))
+    positions = replace(noisy, observation=noisy.observation[:, :2], following=noisy.following[:, :2])
+    rows = positions.reported_on(5)
+    missed = estimate_states(simulation, positions, rows)[rows] - clean.observation[rows]
+    spread = clean.observation[:, 2:].std(0)
+    assert (np.sqrt((missed[:, 2:] ** 2).mean(0)) < 0.25 * spread).all()

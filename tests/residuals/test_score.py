@@ -15,6 +15,7 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointFrictionLoss,
     ObservationBias,
+    ObservationDelay,
     ObservationGain,
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
@@ -79,6 +80,14 @@ def test_a_smooth_sensor_has_little_noise_however_wrong_the_simulator_is():
     env.set_seed(0)
     data, simulation = env.rollout(500, break_when_any_done=False), Simulation.from_env(GymEnv("Hopper-v5"))
     assert Model.of(simulation, Measured.from_ted(data, simulation)).fit.starts.noise.sensor[4] < 0.04
+
+
+def test_sensors_that_are_late_at_the_end_of_runs_leave_the_score_finite():
+    simulation = double_pendulum().with_effects(ObservationDelay(0.02, (2, 3)))
+    runs = replace(recorded(simulation, 1200), run=np.arange(1200) // 96)
+    ground = Ground.of(simulation, runs)
+    assert np.isfinite(ground.base.scores()).all()
+    assert np.isfinite(ground.base.fit.floor).all()
 
 
 def test_sets_are_compared_with_the_same_noise_so_that_an_effect_of_no_size_gains_nothing():

@@ -47,7 +47,8 @@ def estimate_states(simulation: Simulation, measured: Measured, rows: np.ndarray
     if not first:
         return start_states(simulation, measured, rows)
     blocks = Blocks(np.array(first), steps)
-    record = Record(simulation, measured, filtered_rows(blocks, measured))
+    both = [filtered_rows(one, measured) for one in (blocks, _blocks_for_fits(simulation, measured))]
+    record = Record(simulation, measured, np.concatenate(both))
     starts = StartStates.of(record, blocks, _noise(simulation, measured))
     _, filtered = starts.of_rows
     simulated = np.array(simulation.state_map.hidden, int)[record.settled[len(simulation.state_map.names) :]]
@@ -75,10 +76,13 @@ def sensor_noise(simulation: Simulation, measured: Measured) -> np.ndarray | Non
     return std if (std > NOISELESS * spread).any() else None
 
 
+def _blocks_for_fits(simulation: Simulation, measured: Measured) -> Blocks:
+    return Blocks.of(measured, Split.FIT, block_steps(measured, simulation.control_step), FIT_ROWS)
+
+
 def _noise(simulation: Simulation, measured: Measured) -> Noise:
     def compute() -> Noise:
-        steps = block_steps(measured, simulation.control_step)
-        blocks = Blocks.of(measured, Split.FIT, steps, FIT_ROWS)
+        blocks = _blocks_for_fits(simulation, measured)
         return StartStates.of(Record(simulation, measured, filtered_rows(blocks, measured)), blocks).noise
 
     return measured.remembered("noise", simulation, compute)

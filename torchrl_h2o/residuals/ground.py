@@ -97,7 +97,7 @@ class Ground:
 
     Args:
         simulation: the simulator without effects.
-        base: predictions of a set near those to compare, whose derivatives the filters of all sets use.
+        base: predictions of a set near those to compare; the filters of all sets use most of its derivatives.
         logged: the data with the logged commands, if these have noise.
     """
 
@@ -117,7 +117,8 @@ class Ground:
         """
         model = Model.of(simulation.with_effects(*effects), measured)
         errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
-        sizes = (np.minimum(*map(_usual, pair)) for pair in zip(errors, model.fit.changes, strict=True))
+        motion = (np.sqrt(np.nanmean(change**2, axis=0)) for change in model.fit.changes)  # late sensors have gaps
+        sizes = (np.fmin(_usual(error), moved) for error, moved in zip(errors, motion, strict=True))
         floor = np.concatenate([(MATTERS * size) ** 2 for size in sizes])
         base = _weighted(model, floor)
         return cls(simulation, base, None, {tuple(effects): base})

@@ -264,7 +264,7 @@ def best_of_each(leads: Sequence[Lead]) -> list[Lead]:
 
 
 def is_usable(ground: Ground, found: Found, before: Found) -> bool:
-    """Whether one or two effects that a set has more than another are not negligible, and possible in the model."""
+    """Whether the one or two effects that a set has beyond another are possible and not negligible; True for more."""
     added = found.without(before.names)
     return len(added[0]) > FEW or not any(
         is_negligible(effect, entry.trials) or is_outside(effect, ground.simulation.model)

@@ -22,8 +22,8 @@ LAG_ERROR = 0.5  # rows by which this lag is uncertain at least
 def offered_entries(simulation: Simulation) -> tuple[CatalogueEntry, ...]:
     """The catalogue of a simulator without delays of sensors.
 
-    All sensors late by one time give the same log as all motors late by it. Of some sensors, see
-    :func:`late_velocities`.
+    All sensors late by one time give the same log as all motors late by it. For delays of some
+    sensors, see :func:`late_velocities`.
     """
     return tuple(entry for entry in simulation.catalogue() if not isinstance(entry.effect, ObservationDelay))
 

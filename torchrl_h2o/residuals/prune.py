@@ -128,7 +128,10 @@ def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]
         if (one.scores - fewer.scores).mean() > half:
             # what explains the data as well leaves the other effects as they are
             kept = [present.get(entry.name, effect) for entry, effect in zip(one.entries, one.effects, strict=True)]
-            best = max(one, ground.found(one.entries, kept), key=lambda each: each.scores.mean())
+            try:
+                best = max(one, ground.found(one.entries, kept), key=lambda each: each.scores.mean())
+            except ValueError:  # the model rejects these values together
+                best = one
             fitted.append(ground.fitted(best.entries, best.effects))
     return [
         one

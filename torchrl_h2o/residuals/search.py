@@ -14,7 +14,7 @@ from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 from torchrl_h2o.effects.model.joint import LOCKED, JointRange
 from torchrl_h2o.likelihood import ENOUGH, Difference
-from torchrl_h2o.residuals.elements import all_elements
+from torchrl_h2o.residuals.elements import all_elements, elements
 from torchrl_h2o.residuals.explanation import Alternative, Explanation, Part, Tried
 from torchrl_h2o.residuals.forces.candidates import force_entry
 from torchrl_h2o.residuals.gains import summed
@@ -39,7 +39,8 @@ SWEEPS = 6  # largest number of sweeps
 #: the test by which the search for effects stops
 STOP_TEST = (
     "log density of the rows, predicted 1, 2, 4, ... rows ahead: paired over blocks of rows, a further effect must "
-    f"raise it by a likelihood ratio of {math.exp(ENOUGH):.0f}, more if it is unusual, also in rows that chose no value"
+    f"raise it by a likelihood ratio of {math.exp(ENOUGH):.0f} in all rows, more if it is unusual or the best of many, "
+    "less if several joints have it, and must raise it in the rows that chose no value, too"
 )
 
 
@@ -243,7 +244,8 @@ def with_intervals(
     Every horizon counts alike in this fit: values hold for simulations of any length, and small errors in the many
     short windows do not outweigh large ones far ahead. Effects whose interval holds their neutral value are left out,
     the least certain ones first, while there is time. What several joints or motors have, such as friction, is left out
-    on all of them or on none, because they resemble each other, but for values that are rounding.
+    on all of them or on none, because they resemble each other. Values within rounding of neutral are left out by
+    themselves.
     """
     effects = found.effects
     for is_last in (False, True) if effects else (True,):
@@ -253,10 +255,11 @@ def with_intervals(
         fit = fit_set(parts, found.entries, effects, most_steps=GROWN, intervals=is_last)
         effects = fit.effects
     for _ in range(MOST_LEFT_OUT):
+        kinds = [kind_of(effect) if elements(effect, ground.simulation) else effect for effect in fit.effects]
         certain: dict[Hashable, float] = {}
-        for effect, half in zip(fit.effects, fit.half_widths, strict=True):
-            certain[kind_of(effect)] = max(_certainty(effect, half), certain.get(kind_of(effect), 0.0))
-        sizes = [certain[kind_of(effect)] for effect in fit.effects]
+        for kind, effect, half in zip(kinds, fit.effects, fit.half_widths, strict=True):
+            certain[kind] = max(_certainty(effect, half), certain.get(kind, 0.0))
+        sizes = [certain[kind] for kind in kinds]
         least = max(NEUTRAL, min(sizes, default=math.inf))
         idle = {
             entry.name

@@ -29,7 +29,7 @@ SURPRISE = 4.0  # mean squared whitened innovation beyond which the filter trust
 LINEARISED = 2  # times that the steps of the simulation are linearised, about better states each time
 NOISE_BLOCKS = 8  # blocks from which the noise is estimated
 USUAL_FACTORS = np.array([0.0, -0.7])
-MOST_NOISE = 3.0  # largest noise of a sensor, in that which third differences show: noise of some rows shows less
+MOST_NOISE = 3.0  # most noise of a sensor, in what third differences show; noise that lasts for some rows shows less
 SPACINGS = (2.0, 1.0, 0.5, 0.2, 0.07)  # of the logarithms that are tried, one grid after another
 LASTS = 0.95  # correlation of lasting errors of the actions in successive rows
 MOST_DOUBT = 100.0  # largest variance of a coordinate, in squared spreads
@@ -91,9 +91,10 @@ class StartStates:
             record: the log and the simulation.
             blocks: the blocks.
             noise: the noise; estimated from these blocks by default.
-            similar: start states of a similar simulation in these blocks, with the same derivatives and the same two
-                factors of the noise. Explanations are compared with the same factors, because a change of the noise
-                changes the scores of all blocks alike, as a better explanation does.
+            similar: start states of a similar simulation in these blocks, with the same two factors of the noise, and
+                with the same derivatives but for those by coordinates that a simulation reaches. Explanations are
+                compared with the same factors, because a change of the noise changes the scores of all blocks alike, as
+                a better explanation does.
         """
 
         def filtered(steps: Steps) -> tuple[Noise, np.ndarray, np.ndarray, np.ndarray]:
@@ -187,7 +188,7 @@ class Steps:
         rows = np.maximum(rows, begins[blocks.first][:, None])
         about = np.zeros((*rows.shape, m)) if about is None else np.where(live[..., None], about, 0.0)
         base = _reached(record, record.simulation, rows, about)
-        # how readings depend on coordinates that a simulation reaches, such as the depth of contacts, is the set's own
+        # derivatives by coordinates that a simulation reaches, such as the depth of contacts, are computed for each set
         columns = np.arange(m) if slope is None else np.flatnonzero(record.settled)
         if len(columns):
             slope = np.empty((*rows.shape, m, m)) if slope is None else slope.copy()
@@ -202,7 +203,7 @@ class Steps:
         third = np.abs(
             np.diff(record.readings[0][:, record.seen][rows], 3, axis=1) / record.spread[: record.num_readings]
         )
-        jerk = np.median(third[live[:, :-3]], axis=0) / 0.6745 / math.sqrt(20.0)
+        jerk = np.nan_to_num(np.nanmedian(third[live[:, :-3]], axis=0)) / 0.6745 / math.sqrt(20.0)
         return cls(record, blocks, rows, about, slope, miss, live, known, jerk)
 
     @property
@@ -217,7 +218,8 @@ class Steps:
         the third differences of its readings allow, however wrong the simulator is.
         """
         noise = self._typical_noise.scaled(*np.exp(factors))
-        noise = replace(noise, sensor=np.clip(noise.sensor, ROUNDING, MOST_NOISE * self.jerk + ROUNDING))
+        most = np.where(self.jerk > 0.0, MOST_NOISE * self.jerk + ROUNDING, math.inf)  # a sensor may rest or be slow
+        noise = replace(noise, sensor=np.minimum(noise.sensor, most))
         if not self.lasting:
             return noise
         lasting = np.full(self.lasting, math.exp(factors[2]) * math.sqrt(1.0 - LASTS**2))

@@ -127,7 +127,7 @@ def alone_on(
     simulation: Simulation,
     of: Callable[[Effect, Simulation], Sequence[int]] = elements,
 ) -> dict[tuple[type, int], CatalogueEntry]:
-    """The entries that act on a single joint or motor, or on one of other elements, by kind and index."""
+    """The entries that act on a single joint or motor, or on a single element by ``of``, by kind and index."""
     found = {}
     for entry in entries:
         own = of(entry.effect, simulation)

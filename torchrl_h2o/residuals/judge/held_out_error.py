@@ -49,7 +49,7 @@ def with_horizons(error: ErrorSummary, simulation: Simulation, mended: Simulatio
 
 
 def with_floor(error: ErrorSummary, mended: Simulation, measured: Measured) -> ErrorSummary:
-    """The summary with the error one step ahead that the best possible model would leave: what no network learns."""
+    """The summary with the error one step ahead that the best possible model would leave, which no network learns."""
     floor = explainable_floor(mended, measured)
     per_dimension = (replace(one, floor=value) for one, value in zip(error.per_dimension, floor.tolist(), strict=True))
     overall = float(np.sqrt(np.mean((floor / spread(measured)) ** 2)))

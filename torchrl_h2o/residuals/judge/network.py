@@ -14,6 +14,7 @@ CELLS, UPDATES, BATCH = 64, 500, 256  # units of its two hidden layers, updates 
 FEWEST = 60  # windows for fits below which no network is trained
 CHECKED = 0.2  # share of these, at their end, that tells how much of the network's answer to trust
 TRUST = np.linspace(0.0, 1.0, 5)  # shares of its answer that are tried
+RARE = 2.0  # roots of the mean square to the least scale of the errors: rare errors may be the largest ones
 FAR = 5.0  # standard deviations at which its inputs and targets are cut
 
 
@@ -47,7 +48,8 @@ def learned(
     inputs, asked = (_inputs(simulation, measured, rows, steps) for rows in (fitted, judged))
     mean, std = inputs.mean(0), np.maximum(inputs.std(0), 1e-9)
     errors = np.nan_to_num(errors)
-    scale = np.maximum(np.median(np.abs(errors), axis=0) / 0.6745, 1e-9 * np.abs(errors).max(0) + 1e-300)
+    usual = np.maximum(np.median(np.abs(errors), axis=0) / 0.6745, np.sqrt((errors**2).mean(0)) / RARE)
+    scale = np.maximum(usual, 1e-300)
     x, ask = (torch.from_numpy(np.clip((each - mean) / std, -FAR, FAR)).float() for each in (inputs, asked))
     y = torch.from_numpy(np.clip(errors / scale, -FAR, FAR)).float()
     known = round((1.0 - CHECKED) * len(x))

@@ -27,9 +27,9 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 LEARNT = 0.8  # share of the error that a network may leave at most for something learnable to be missing
 FARTHEST = 10.0  # largest error of a reading that counts, in its spreads
 BETTER_THAN_GUESS = 0.8  # share of the guess's error up to which effects explain the motion
-NEGLIGIBLE = 0.002  # errors below this, in spreads of the readings, are not reported as a missing effect
+NEGLIGIBLE = 0.002  # errors below this, in spreads of the readings, do not count
+LITTLE = 0.02  # neither does what a network learns of an error below this share of the error without effects
 WORSE = 1.1  # factor on the error of a reading above which the effects make it worse
-LITTLE = 0.02  # neither are errors below this share of the error without effects
 TOTAL = "total"
 _COMPARED = ("mended", "velocities_stay")
 
@@ -100,14 +100,19 @@ class Predicted:
         """
         if not self.readings:
             return ()
-        means = [np.maximum(error.mean(1), NEGLIGIBLE) for error in self.by_reading]
-        index = int((means[1] / means[0]).argmax())
-        before, after = (float(mean[index]) for mean in means)
-        rise = Difference.of_losses(*(error[index] for error in reversed(self.by_reading))).evidence
-        if after <= WORSE * before or rise <= ENOUGH + math.log(len(self.readings)):
+        before, after = (np.median(error, axis=1) for error in self.by_reading)
+        rise = after / np.maximum(before, NEGLIGIBLE)
+        needed = ENOUGH + math.log(len(self.readings))
+        telling = [
+            index
+            for index, (better, worse) in enumerate(zip(*self.by_reading, strict=True))
+            if rise[index] > WORSE and Difference.of_losses(worse, better).evidence > needed
+        ]
+        if not telling:
             return ()
-        name, unit, spread = self.readings[index]
-        rose = HeadlineError(name, unit, self.seconds, spread * before, spread * after)
+        worst = max(telling, key=lambda index: rise[index])
+        name, unit, spread = self.readings[worst]
+        rose = HeadlineError(name, unit, self.seconds, float(spread * before[worst]), float(spread * after[worst]))
         return (f"at least one of these effects is wrong: they raise the error of {headline_words(rose)}",)
 
     def hardly_better(self, simulation: Simulation, effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -153,8 +158,7 @@ def predicted(
 ) -> Predicted | None:
     """Predicts the held-out motion by the simulator as it is and mended, by constant velocities, and with a network.
 
-    The network predicts what the mended simulator leaves, from the readings at the start of a window and the mean of
-    its actions. It is trained on the rows for fits, and as much of its answer is used as helps at their end.
+    The network predicts what the mended simulator leaves; see :func:`~torchrl_h2o.residuals.judge.network.learned`.
 
     Args:
         simulation: the simulator before effects are put in.

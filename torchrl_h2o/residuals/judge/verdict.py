@@ -72,7 +72,9 @@ def reach_verdict(
             return Verdict(NOTHING_MISSING)
         return Verdict(NOT_EXPLAINED, signs, recommended=False, where=where_most(mended, measured))
     against = reasons_against(simulation, effects, predictions)
-    hardly = () if predictions is None else predictions.hardly_better(mended, _acting(effects))
+    hardly = (
+        () if predictions is None or error.headline is None else predictions.hardly_better(mended, _acting(effects))
+    )
     against = (*against, *undetermined, *hardly)
     raised = False
     if (head := error.headline) is not None:
@@ -171,7 +173,9 @@ def reasons_against(
     """Reasons against putting effects into a simulator for training; empty if there are none."""
     reasons = []
     acting = _acting(effects)
-    if acting and (predictions is None or not predictions.is_better):
+    if acting and predictions is None:
+        reasons.append("the rows that chose nothing are too few to tell whether the effects found lower the error")
+    elif acting and not predictions.is_better:
         reasons.append("the effects found do not lower the error on data that chose nothing")
     if not acting and predictions is not None and (learnt := predictions.learnt):
         reasons.append(f"the noise found stands for something that can be predicted: {learnt[0]}")
