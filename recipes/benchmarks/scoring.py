@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
-from torchrl_h2o.effects import Effect, ResidualForce, selection
+from torchrl_h2o.effects import ActionDelay, Effect, ObservationDelay, ResidualForce, selection
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import NOTHING_MISSING
 
@@ -16,7 +16,7 @@ def elements(effect: Effect, simulation: Simulation) -> frozenset:
 
     Two effects that select the same elements by other patterns are the same.
     """
-    spec = simulation.spec()
+    effect, spec = _of_motors(effect), simulation.spec()
     by_name = {"bodies": selection.bodies, "joints": selection.joints, "geoms": selection.geoms}
     sizes = {"actuators": simulation.model.nu, "entries": len(simulation.state_map.names)}
     for field in dataclasses.fields(effect):
@@ -28,9 +28,16 @@ def elements(effect: Effect, simulation: Simulation) -> frozenset:
     return frozenset()
 
 
+def _of_motors(effect: Effect) -> Effect:
+    """All sensors late by one time give the same log as all motors late by it."""
+    late = isinstance(effect, ObservationDelay) and effect.entries is None
+    return ActionDelay(effect.delay) if late else effect
+
+
 def part_of(effect: Effect, truth: Effect, simulation: Simulation) -> bool:
     """Whether an effect equals a true one on all or some of its elements."""
-    return type(effect) is type(truth) and elements(effect, simulation) <= elements(truth, simulation)
+    same = type(_of_motors(effect)) is type(_of_motors(truth))
+    return same and elements(effect, simulation) <= elements(truth, simulation)
 
 
 def is_named_first(report: Report, truth: Sequence[Effect], simulation: Simulation) -> bool:
