@@ -79,10 +79,12 @@ class Found:
 
     @property
     def unusual(self) -> tuple[int, int, int]:
-        """Surprise, number of entries, and of those that not all joints or motors have: joints resemble each other."""
-        single = [
-            one for one in self.effects if getattr(one, "joints", getattr(one, "actuators", None)) not in ("*", None)
+        """Surprise, number of entries, and of those on a single joint, motor or geom: these resemble each other."""
+        chosen = [
+            next((getattr(one, name) for name in ("joints", "actuators", "geoms") if hasattr(one, name)), None)
+            for one in self.effects
         ]
+        single = [which for which in chosen if which is not None and "*" not in str(which)]
         return self.surprise, len(self.entries), len(single)
 
     def without(self, names: Collection[str]) -> tuple[tuple[CatalogueEntry, ...], tuple[Effect, ...]]:
@@ -117,8 +119,9 @@ class Ground:
         """
         model = Model.of(simulation.with_effects(*effects), measured)
         errors = model.of_simulation(simulation).fit.errors() if effects else model.fit.errors()
-        motion = (np.sqrt(np.nanmean(change**2, axis=0)) for change in model.fit.changes)  # late sensors have gaps
-        sizes = (np.fmin(_usual(error), moved) for error, moved in zip(errors, motion, strict=True))
+        motion = (_usual(change) for change in model.fit.changes)
+        # a reading may rest in most windows
+        sizes = (np.minimum(_usual(e), np.where(m > 0.0, m, math.inf)) for e, m in zip(errors, motion, strict=True))
         floor = np.concatenate([(MATTERS * size) ** 2 for size in sizes])
         base = _weighted(model, floor)
         return cls(simulation, base, None, {tuple(effects): base})
@@ -263,8 +266,8 @@ class Ground:
 
 
 def _usual(errors: np.ndarray) -> np.ndarray:
-    """Median size of errors (W, h, n) by horizon and reading, (h, n)."""
-    return np.median(np.abs(errors), axis=0)
+    """Median size of errors (W, h, n) by horizon and reading, (h, n), of those that are known."""
+    return np.nanmedian(np.abs(errors), axis=0)
 
 
 def _weighted(model: Model, floor: np.ndarray | None) -> Model:
