@@ -117,10 +117,9 @@ def _delay_errors(report: Report, case: Case, count: int) -> np.ndarray:
     """
     found = np.zeros(count)
     for effect in report.effects:
-        if isinstance(effect, ActionDelay):
-            found[slice(None) if effect.actuators is None else list(effect.actuators)] += effect.delay
-        elif isinstance(effect, ActionLag):
-            found[slice(None) if effect.actuators is None else list(effect.actuators)] += effect.time_constant
+        if isinstance(effect, ActionDelay | ActionLag):
+            late = effect.delay if isinstance(effect, ActionDelay) else effect.time_constant
+            found[slice(None) if effect.actuators is None else list(effect.actuators)] += late
         elif isinstance(effect, ObservationDelay) and effect.entries is None:
             found += effect.delay
     (true,) = (effect.delay for effect in case.truth if isinstance(effect, ActionDelay))

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_h2o.data.audit import Audit
+from torchrl_h2o.data.audit.derivative import roughness_of
+from torchrl_h2o.data.audit.log import Log, Pair
+from torchrl_h2o.data.audit.response import LOST
 from torchrl_h2o.residuals.measured.outside import OutsideInterval, outside_intervals, without_intervals
 from torchrl_h2o.residuals.measured.residual import residuals
 from torchrl_h2o.residuals.measured.transitions import Measured
@@ -39,12 +42,23 @@ def why_no_conclusion(simulation: Simulation, measured: Measured) -> str | None:
     if (reason := measured.why_no_conclusion()) is not None:
         return reason
     diverged = ~np.isfinite(residuals(simulation, measured, measured.fitted())).all((1, 2))
-    if diverged.mean() <= MAX_DIVERGED:
-        return None
-    return (
-        f"the simulator diverges within one step of {diverged.mean():.0%} of the measured states; check its timestep, "
-        "the units, and the coordinate that each column stands for"
-    )
+    if diverged.mean() > MAX_DIVERGED:
+        return (
+            f"the simulator diverges within one step of {diverged.mean():.0%} of the measured states; check its "
+            "timestep, the units, and the coordinate that each column stands for"
+        )
+    lost = [pair.name for pair in Log.of(measured, simulation).pairs if pair.angle and _noise(measured, pair) > LOST]
+    if lost:
+        return (
+            f"the noise of {', '.join(lost)} exceeds {LOST:g} rad, so the sensor does not tell where the joint is, and "
+            "any friction could be found; use a better sensor, or see whether the column is that angle"
+        )
+    return None
+
+
+def _noise(measured: Measured, pair: Pair) -> float:
+    """Largest noise that a position may have, by its third differences, in its unit."""
+    return roughness_of(measured.observation[:, pair.position], measured.run)
 
 
 def gather_evidence(simulation: Simulation, measured: Measured, *, audit: Audit | None = None) -> Evidence:

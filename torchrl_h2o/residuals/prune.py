@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
+from itertools import chain
 
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.likelihood import Difference
@@ -68,17 +70,11 @@ def _smaller(ground: Ground, found: Found, kept: set[frozenset[str]]) -> Found |
 
 
 def _of_each_kind(found: Found, simulation: Simulation) -> list[frozenset[str]]:
-    """Names of the entries of each kind of effects; those that overlap, such as one on both feet and one on a foot,
-    each by itself."""
-    kinds: dict[Hashable, set[str]] = {}
-    own = [set(all_elements(effect, simulation)) for effect in found.effects]
-    for index, (entry, effect) in enumerate(zip(found.entries, found.effects, strict=True)):
-        overlaps = any(
-            kind_of(other) == kind_of(effect) and elements & own[index]
-            for other, elements in zip(
-                found.effects[:index] + found.effects[index + 1 :], own[:index] + own[index + 1 :], strict=True
-            )
-        )
+    """Names of the entries of each kind of effects; of those that overlap, such as on both feet and on a foot, each."""
+    acting = [{(kind_of(one), index) for index in all_elements(one, simulation)} for one in found.effects]
+    times, kinds = Counter(chain.from_iterable(acting)), dict[Hashable, set[str]]()
+    for entry, effect, own in zip(found.entries, found.effects, acting, strict=True):
+        overlaps = any(times[one] > 1 for one in own)
         kinds.setdefault(entry.name if overlaps else kind_of(effect), set()).add(entry.name)
     return [frozenset(names) for names in kinds.values()]
 

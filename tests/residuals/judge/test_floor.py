@@ -37,3 +37,11 @@ def test_floor_leaves_the_random_generator_of_torch_alone():
     first = explainable_floor(simulation, measured)
     assert torch.equal(torch.get_rng_state(), before)
     np.testing.assert_array_equal(first, explainable_floor(simulation, measured))
+
+
+def test_floor_is_below_rare_errors_that_a_network_learns():
+    """A force acts beyond an angle that the arm seldom reaches, and is the whole error."""
+    simulation = pendulum()
+    stop = UnknownForce(0.5, lambda q, v, t: -np.sign(q) * (np.abs(q) > 1.2))
+    measured = recorded(simulation.with_effects(stop), 4000)
+    assert explainable_floor(simulation, measured)[1] < 0.85 * held_out_error(simulation, measured)[1]

@@ -24,9 +24,8 @@ def learned(
     fitted: np.ndarray,
     judged: np.ndarray,
     errors: np.ndarray,
-    steps: int = 1,
-    *,
-    seed: int = 0,
+    steps: int,
+    seed: int,
 ) -> np.ndarray:
     """What a network predicts of the simulator's errors at the end of windows, (W, n), in the unit of the errors.
 
@@ -66,9 +65,9 @@ def learned(
             loss.backward()
             optimiser.step()
     with torch.no_grad():
-        answer, seen = network(ask).numpy() * scale, network(x[known:]).numpy() * scale
-    left = np.abs(errors[known:, None] - TRUST[:, None] * seen[:, None]).mean(0)
-    return TRUST[left.argmin(0)] * answer
+        answer, seen = network(ask).numpy() * scale, network(x[known:])
+        left = [nn.functional.smooth_l1_loss(share * seen, y[known:], reduction="none").mean(0) for share in TRUST]
+    return TRUST[torch.stack(left).argmin(0).numpy()] * answer
 
 
 def _inputs(simulation: Simulation, measured: Measured, starts: np.ndarray, steps: int) -> np.ndarray:

@@ -50,9 +50,9 @@ class Predicted:
     names: tuple[str, ...]
     seconds: float
     losses: dict[str, np.ndarray]
-    readings: tuple[tuple[str, str, float], ...] = ()
-    by_reading: tuple[np.ndarray, ...] = ()
-    one_step: tuple[np.ndarray, ...] = ()
+    readings: tuple[tuple[str, str, float], ...]
+    by_reading: tuple[np.ndarray, np.ndarray]
+    one_step: tuple[np.ndarray, np.ndarray]
 
     @cached_property
     def table(self) -> PredictionTable:
@@ -89,7 +89,7 @@ class Predicted:
         Noise of measured torques moves the simulator and not the machine, and can hide an effect some steps ahead.
         """
         ahead = self.losses["as_it_is"][0], self.losses["mended"][0]
-        return any(Difference.of_losses(*pair).evidence > ENOUGH for pair in (ahead, self.one_step) if pair)
+        return any(Difference.of_losses(*pair).evidence > ENOUGH for pair in (ahead, self.one_step))
 
     @cached_property
     def made_worse(self) -> tuple[str, ...]:
@@ -98,8 +98,6 @@ class Predicted:
         A fit lowers the sum over all readings. A wrong effect can lower it, if what one reading gains exceeds what
         another one loses; a right one lowers all errors, or leaves them as they are.
         """
-        if not self.readings:
-            return ()
         before, after = (np.median(error, axis=1) for error in self.by_reading)
         rise = after / np.maximum(before, NEGLIGIBLE)
         needed = ENOUGH + math.log(len(self.readings))
@@ -176,16 +174,19 @@ def predicted(
     if len(judged) < HEADLINE_WINDOWS:
         return None
     spread = np.maximum(measured.observation.std(0), 1e-12)
-    noisy = sensor_noise(mended, measured) is not None
+    rows, noisy = measured.reported_on(), sensor_noise(mended, measured) is not None
+    every = np.unique(np.concatenate([judged, fitted, rows]))
+    states = {
+        which: (estimate_states if noisy else start_states)(which, measured, every) for which in (simulation, mended)
+    }
 
     def errors(which: Simulation, starts: np.ndarray, steps: int = steps) -> np.ndarray:
-        states = estimate_states(which, measured, starts) if noisy else None
-        return residuals(which, measured, starts, steps, states=states)[:, -1] / spread
+        return residuals(which, measured, starts, steps, states=states[which])[:, -1] / spread
 
-    states = (estimate_states if noisy else start_states)(mended, measured, judged)[judged]
-    stays = undelayed_following(mended, measured)[judged + steps - 1] - at_constant_velocity(mended, states, steps)
+    stays = at_constant_velocity(mended, states[mended][judged], steps)
+    stays = undelayed_following(mended, measured)[judged + steps - 1] - stays
     left = errors(mended, judged)
-    answer = learned(mended, measured, fitted, judged, errors(mended, fitted), steps, seed=seed)
+    answer = learned(mended, measured, fitted, judged, errors(mended, fitted), steps, seed)
     names, readings = _rows(mended)
     by_predictor = {
         "as_it_is": errors(simulation, judged),
@@ -197,7 +198,6 @@ def predicted(
     losses = {name: mean_errors(error, known, readings) for name, error in by_predictor.items()}
     single = [[index] for index in range(len(spread))]
     by_reading = tuple(mean_errors(by_predictor[name], known, single) for name in ("as_it_is", "mended"))
-    rows = measured.reported_on()
     next_known = np.isfinite(undelayed_following(mended, measured)[rows])
     one_step = tuple(mean_errors(errors(which, rows, 1), next_known, readings[:1])[0] for which in (simulation, mended))
     described = tuple(zip(simulation.state_map.names, simulation.state_map.units, spread.tolist(), strict=True))
