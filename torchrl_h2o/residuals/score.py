@@ -81,10 +81,8 @@ class Predictions:
 
     def of_simulation(self, simulation: Simulation, measured: Measured | None = None) -> Predictions:
         """The same windows from the same start states, predicted by another simulation, or with other commands."""
-        own, record = (
-            self.record,
-            replace(self.record, simulation=simulation, measured=measured or self.record.measured),
-        )
+        own = self.record
+        record = replace(own, simulation=simulation, measured=measured or own.measured)
         # unobserved coordinates stay those that the present simulation has reached
         record.__dict__["states"] = tuple(
             states + np.nan_to_num(new - old)
