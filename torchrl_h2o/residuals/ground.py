@@ -74,8 +74,8 @@ class Found:
 
     @property
     def surprise(self) -> int:
-        """How unusual the effects are in all; see :func:`surprise_of`."""
-        return surprise_of(self.effects)
+        """How unusual the effects are in all; see :func:`surprise_of`. Each further value of an effect counts one."""
+        return surprise_of(self.effects) + sum(len(entry.fitted) - 1 for entry in self.entries)
 
     @property
     def unusual(self) -> tuple[int, int, int]:

@@ -190,8 +190,8 @@ class Steps:
         base = _reached(record, record.simulation, rows, about)
         # derivatives by coordinates that a simulation reaches, such as the depth of contacts, are computed for each set
         columns = np.arange(m) if slope is None else np.flatnonzero(record.settled)
+        slope = np.empty((*rows.shape, m, m)) if slope is None else slope.copy()
         if len(columns):
-            slope = np.empty((*rows.shape, m, m)) if slope is None else slope.copy()
             quick = record.simulation.quick
             before = base if quick is record.simulation else _reached(record, quick, rows, about)
             for index in columns:

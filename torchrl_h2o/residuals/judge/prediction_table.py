@@ -197,11 +197,12 @@ def predicted(
     known = np.isfinite(stays)  # late sensors leave the readings at the ends of runs unknown
     losses = {name: mean_errors(error, known, readings) for name, error in by_predictor.items()}
     single = [[index] for index in range(len(spread))]
-    by_reading = tuple(mean_errors(by_predictor[name], known, single) for name in ("as_it_is", "mended"))
+    before, after = (mean_errors(by_predictor[name], known, single) for name in ("as_it_is", "mended"))
     next_known = np.isfinite(undelayed_following(mended, measured)[rows])
-    one_step = tuple(mean_errors(errors(which, rows, 1), next_known, readings[:1])[0] for which in (simulation, mended))
+    nearest = [mean_errors(errors(which, rows, 1), next_known, readings[:1])[0] for which in (simulation, mended)]
+    one_step = nearest[0], nearest[1]
     described = tuple(zip(simulation.state_map.names, simulation.state_map.units, spread.tolist(), strict=True))
-    return Predicted(names, steps * simulation.control_step, losses, described, by_reading, one_step)
+    return Predicted(names, steps * simulation.control_step, losses, described, (before, after), one_step)
 
 
 def at_constant_velocity(simulation: Simulation, states: np.ndarray, steps: int) -> np.ndarray:

@@ -173,11 +173,13 @@ def reasons_against(
     """Reasons against putting effects into a simulator for training; empty if there are none."""
     reasons = []
     acting = _acting(effects)
-    if acting and predictions is None:
-        reasons.append("the rows that chose nothing are too few to tell whether the effects found lower the error")
-    elif acting and not predictions.is_better:
-        reasons.append("the effects found do not lower the error on data that chose nothing")
-    if not acting and predictions is not None and (learnt := predictions.learnt):
+    if predictions is None:
+        if acting:
+            reasons.append("the rows that chose nothing are too few to tell whether the effects found lower the error")
+    elif acting:
+        if not predictions.is_better:
+            reasons.append("the effects found do not lower the error on data that chose nothing")
+    elif learnt := predictions.learnt:
         reasons.append(f"the noise found stands for something that can be predicted: {learnt[0]}")
     names = simulation.names
     reasons += [f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect))]
