@@ -13,7 +13,7 @@ from torchrl_h2o.residuals.measured.transitions import Measured, Split
 
 SECONDS = 0.3  # time that a prediction looks ahead, rounded to a power of two of control steps
 LEAST_STEPS, MOST_STEPS = 16, 128  # control steps of a block, if the runs are long enough
-FEWEST_BLOCKS = 6  # blocks of the rows for selection below which shorter blocks are cut
+FEWEST_BLOCKS = 12  # blocks of the rows for selection below which shorter blocks are cut
 LENGTHS = (2, 8)  # control steps of the short windows; the longest are whole blocks
 SHORTEST = 4  # control steps of the shortest blocks, for runs of a few rows
 
