@@ -1,7 +1,6 @@
 """load(): all kinds of sources, and errors for invalid ones."""
 
 import io
-import json
 import pickle
 import zipfile
 
@@ -104,7 +103,7 @@ def test_pickle_under_any_name_is_refused(tmp_path, name, content):
         load(path, columns="simple_pendulum")
 
 
-@pytest.mark.parametrize("suffix", ["pkl", "pickle", "pt", "pth", "npy", "npz", "joblib"])
+@pytest.mark.parametrize("suffix", ["pkl", "pickle", "npy", "npz", "joblib"])
 def test_pickle_is_refused_by_its_name(tmp_path, suffix):
     path = tmp_path / f"data.{suffix}"
     path.write_bytes(pickle.dumps([1], 0))  # protocol 0 is plain text
@@ -158,21 +157,40 @@ def test_what_is_no_source_is_refused(source):
         load(source)
 
 
-def test_a_lerobot_dataset_is_named_with_what_to_give(tmp_path):
-    (tmp_path / "arm" / "meta").mkdir(parents=True)
-    names = {"names": ["pan.pos", "lift.pos"]}
-    info = {"codebase_version": "v3.0", "fps": 30, "total_episodes": 4}
-    info["features"] = {"action": names, "observation.state": names}
-    (tmp_path / "arm" / "meta" / "info.json").write_text(json.dumps(info))
-    said = r"it is a LeRobot dataset \(v3\.0, 4 episodes at 30 Hz; action: pan\.pos, lift\.pos.*arm/data/\*/\*\.parquet"
-    with pytest.raises(DataError, match=said):
-        load(tmp_path / "arm")
+def test_tensors_of_torch_are_read_by_name(tmp_path):
+    angle = torch.linspace(0.0, 1.0, 50)
+    tensors = {"t": 0.01 * torch.arange(50.0), "q": torch.stack([angle, 2 * angle], 1), "servo": {"goal": angle.half()}}
+    torch.save({**tensors, "gain": torch.tensor(3.0), "note": "hung up"}, tmp_path / "log.pt")
+    columns = {
+        "columns": [
+            {"name": "t", "role": "time", "unit": "s"},
+            {"name": "q[1]", "role": "observation"},
+            {"name": "servo.goal", "role": "action"},
+        ],
+        "header": True,
+        "other_columns": "ignore",
+    }
+    td = load(tmp_path / "log.pt", columns=columns)
+    assert td["observation"][:, 0].tolist() == (2 * angle)[:-1].tolist()
+    assert td["action"][:, 0].tolist() == angle.half()[:-1].tolist()
 
 
-def test_tensors_of_torch_are_refused_with_a_way_out(tmp_path):
-    torch.save({"dof_pos": torch.zeros(3)}, tmp_path / "log.pt")
-    with pytest.raises(DataError, match=r"torch\.load\(file, weights_only=True\); numpy\.savez"):
-        load(tmp_path / "log.pt", columns="simple_pendulum")
+@pytest.mark.parametrize("protocol", [0, 2])
+def test_code_in_a_file_of_tensors_is_not_run(tmp_path, protocol):
+    path, sign = tmp_path / "log.pt", tmp_path / "ran"
+
+    class Harm:
+        def __reduce__(self):
+            return type(sign).touch, (sign,)
+
+    for content in ({"q": torch.zeros(5), "x": Harm()}, [torch.zeros(5)], torch.zeros(5)):
+        torch.save(content, path, pickle_protocol=2)
+        with pytest.raises(DataError, match=r"log\.pt: it holds .*save the tensors by name: torch\.save"):
+            load(path, columns="simple_pendulum")
+    path.write_bytes(pickle.dumps(Harm(), protocol))
+    with pytest.raises(DataError, match="it holds more than tensors by name"):
+        load(path, columns="simple_pendulum")
+    assert not sign.exists()
 
 
 def columns_of_one_run(folder, begin=0.0):

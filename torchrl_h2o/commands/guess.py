@@ -8,7 +8,6 @@ from pathlib import Path
 
 import mujoco
 
-from torchrl_h2o.commands.column_names import as_key
 from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
@@ -45,18 +44,17 @@ def guess_columns(arguments: Sequence[str]) -> None:
     require_several_runs(logs)
     log = Path(logs[0])
     path = Path(given.get("columns", f"{log.stem}.yaml"))
-    guessed = guess_layout(log, _coordinates_of(given["simulator"]) if "simulator" in given else None)
+    text = guess_layout(log, _coordinates_of(given["simulator"]) if "simulator" in given else None)
     if path.exists():
         problem = "the file exists and is not overwritten"
         raise DataError(problem, "remove it, or choose another name with columns=", source=path)
     try:
-        write_text(path, guessed.text)
+        write_text(path, text)
     except OSError as error:
         problem = f"the file cannot be written: {error.strerror or error}"
         raise DataError(problem, "choose another name with columns=", source=path) from error
-    print(
-        f"{path} describes the columns of {log}; correct it, then run\n\n{_command(given, path, guessed.coordinates)}"
-    )
+    words = [f"simulator={given.get('simulator', 'robot.xml')}", f"data={given['data']}", f"columns={path}"]
+    print(f"{path} describes the columns of {log}; correct it, then run\n\n{shlex.join(['close-the-loop', *words])}")
     try:
         read_robot_log(log, path)
     except DataError as error:
@@ -69,11 +67,18 @@ def _coordinates_of(simulator: str) -> Coordinates:
     except ValueError as error:
         raise ValueError(f"simulator={simulator}: {error}") from None
     names, units = coordinate_names(model)
+    joints = [model.joint(i).name for i in range(model.njnt)]
     return Coordinates(
         dict(zip(names, units, strict=True)),
         [model.actuator(i).name or str(i) for i in range(model.nu)],
         servos=model.nu > 0 and all(map(is_servo, spec.actuators)),
         forces=model.nu > 0 and all(_pushes(model, actuator) for actuator in range(model.nu)),
+        driven={
+            model.actuator(i).name or str(i): joints[model.actuator_trnid[i, 0]]
+            for i in range(model.nu)
+            if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+        },
+        ranges={name: tuple(model.jnt_range[i]) for i, name in enumerate(joints) if model.jnt_limited[i]},
     )
 
 
@@ -83,11 +88,3 @@ def _pushes(model: mujoco.MjModel, actuator: int) -> bool:
     if kind in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT):
         return model.jnt_type[target] == mujoco.mjtJoint.mjJNT_SLIDE
     return kind == mujoco.mjtTrn.mjTRN_SITE and bool(model.actuator_gear[actuator, :3].any())
-
-
-def _command(given: dict[str, str], path: Path, coordinates) -> str:
-    words = [f"simulator={given.get('simulator', 'robot.xml')}", f"data={given['data']}", f"columns={path}"]
-    if coordinates:
-        pairs = ", ".join(f"{as_key(name)}: {other}" for name, other in coordinates.items())
-        words.append(f"simulator.coordinates={{{pairs}}}")
-    return shlex.join(["close-the-loop", *words])

@@ -15,7 +15,6 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDictBase
 
-from torchrl_h2o.commands.column_names import column_of
 from torchrl_h2o.data import LogColumns, load, sources_of
 from torchrl_h2o.data.audit.log import find_turning
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
@@ -84,8 +83,8 @@ class Recording:
         """Maps each observed column, in the data's order, to a coordinate of the model.
 
         Args:
-            chosen: ``simulator.coordinates``: a list of coordinates; a mapping from column to coordinate, for the
-                columns whose name differs from the coordinate's; or None.
+            chosen: ``simulator.coordinates``: a list of coordinates; a mapping from column to coordinate, for those
+                that the description of the columns does not tell; or None.
 
         Returns:
             The list itself, or a mapping from columns to coordinates.
@@ -100,11 +99,11 @@ class Recording:
                 f"{self.source} does not name its columns; list the model coordinate of each column, such as "
                 "simulator.coordinates=[hip,hip_velocity]"
             )
-        names, found = self.columns.observation, {name: name for name in self.columns.observation}
+        names, found = self.columns.observation, self.columns.coordinates
         for key, coordinate in (chosen or {}).items():
-            if (column := column_of(key, names)) is None:
+            if str(key) not in names:
                 raise ValueError(f"simulator.coordinates names {key!r}, but the log observes {', '.join(names)}")
-            found[column] = coordinate
+            found[str(key)] = coordinate
         return found
 
     def control_step(self) -> float:

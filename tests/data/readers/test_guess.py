@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from tests.data.readers.guessing import ANGLE, COMMAND, TIME, guessed
+from tests.data.readers.guessing import ANGLE, COMMAND, TIME, guessed, renamed
 from torchrl_h2o.data import LogColumns, load, read_robot_log
 from torchrl_h2o.data.readers.guess import guess_layout
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
@@ -14,7 +14,7 @@ from torchrl_h2o.data.readers.guess.roles import guess_columns
 
 def test_of_commanded_and_measured_actions_one_set_is_taken(shared_data, tmp_path):
     log = shared_data / "double_pendulum" / "trajectory_00.csv"
-    (tmp_path / "log.yaml").write_text(guess_layout(log).text)
+    (tmp_path / "log.yaml").write_text(guess_layout(log))
     layout = LogColumns.load(tmp_path / "log.yaml")
     assert layout.action == ("tau_con1", "tau_con2")
     assert layout.observation == ("pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2")
@@ -91,7 +91,7 @@ def test_names_of_the_model_say_what_a_column_is(tmp_path):
         header="time,cart,Pole_deg,cart_velocity,pole_velocity,drive",
         comments="",
     )
-    text = guess_layout(tmp_path / "log.csv", Coordinates(units, ["drive"])).text
+    text = guess_layout(tmp_path / "log.csv", Coordinates(units, ["drive"]))
     for line in (
         '"cart", role: observation, unit: "m"',
         '"Pole_deg", role: observation, unit: "deg"',
@@ -101,14 +101,14 @@ def test_names_of_the_model_say_what_a_column_is(tmp_path):
     ):
         assert line in text
     assert "role: ignore" not in text
-    assert "ignore" in guess_layout(tmp_path / "log.csv").text
+    assert "ignore" in guess_layout(tmp_path / "log.csv")
 
 
 def test_the_command_of_a_servo_has_the_unit_of_its_position(tmp_path):
     rows = np.cumsum(np.ones((50, 4)), axis=0) * [0.02, 2.0, 1.9, 0.1]
     np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time,command,angle,effort", comments="")
     model = Coordinates({"arm": "rad", "arm_velocity": "rad/s"}, ["servo"], servos=True)
-    text = guess_layout(tmp_path / "log.csv", model).text
+    text = guess_layout(tmp_path / "log.csv", model)
     assert '{name: "command", role: action, unit: "deg"}  # the model\'s actuators are servos' in text
     assert '{name: "effort", role: ignore}' in text
 
@@ -119,7 +119,7 @@ def test_irregular_stamps_are_resampled(tmp_path):
     time = np.cumsum(0.01 + 0.004 * np.random.default_rng(0).uniform(-1, 1, 300))
     rows = "".join(f"{t:.9f},{np.sin(t):.9f},{np.cos(t):.9f}\n" for t in time)
     path.write_text("t,hip,tau\n" + rows)
-    text = guess_layout(path).text
+    text = guess_layout(path)
     assert "resample: 0.0" in text
     (tmp_path / "log.yaml").write_text(text)
     td = read_robot_log(path, tmp_path / "log.yaml")
@@ -228,23 +228,23 @@ def test_of_the_many_columns_of_a_cart_pole_s_log_the_state_and_the_action_are_f
         "Q_squared": COMMAND**2,
     }
     found = of_cart_pole(tmp_path, ",".join(values), [*values.values()])
-    assert found.coordinates == {
+    assert renamed(found) == {
         "angle": "pole",
         "angleD": "pole_velocity",
         "position": "cart",
         "positionD": "cart_velocity",
     }
-    kept = [name for name in values if f'"{name}", role: ignore' not in found.text]
+    kept = [name for name in values if f'"{name}", role: ignore' not in found]
     assert kept == ["time", "angle", "angleD", "position", "positionD", "Q"]
-    assert '"position", role: observation, unit: "m"}' in found.text
-    assert "derivative_of" not in found.text
+    assert '"position", role: observation, unit: "m", coordinate: "cart"}' in found
+    assert "derivative_of" not in found
 
 
 def test_a_joint_that_does_not_move_in_this_log_is_kept(tmp_path):
     still = 0.0 * TIME
     found = of_cart_pole(tmp_path, "time,angle,position,Q,stickPos", [TIME, ANGLE, still, COMMAND, still])
-    assert (found.coordinates["angle"], found.coordinates["position"]) == ("pole", "cart")
-    assert '"stickPos", role: ignore}  # does not change' in found.text
+    assert (renamed(found)["angle"], renamed(found)["position"]) == ("pole", "cart")
+    assert '"stickPos", role: ignore}  # does not change' in found
 
 
 def test_a_gap_far_behind_the_beginning_is_seen(tmp_path):
@@ -268,12 +268,12 @@ def test_a_length_is_not_assigned_to_the_hinge_that_is_left(tmp_path):
     model = Coordinates({"hip": "rad", "knee": "rad", "hip_velocity": "rad/s", "knee_velocity": "rad/s"}, ["motor"])
     columns = np.stack([TIME, ANGLE, ANGLE, COMMAND], 1)
     np.savetxt(tmp_path / "log.csv", columns, delimiter=",", header="t,hip_pos,height,tau", comments="")
-    assert "height" not in guess_layout(tmp_path / "log.csv", model).coordinates
+    assert "height" not in renamed(guess_layout(tmp_path / "log.csv", model))
 
 
 def test_positions_whose_names_fit_no_joint_are_assigned_in_order(tmp_path):
     found = of_cart_pole(tmp_path, "time,x,y,Q", [TIME, ANGLE, np.cos(TIME), COMMAND])
-    assert (found.coordinates["x"], found.coordinates["y"]) == ("cart", "pole")
+    assert (renamed(found)["x"], renamed(found)["y"]) == ("cart", "pole")
 
 
 def test_a_position_beside_as_many_with_velocities_as_the_model_has_joints_is_the_action(tmp_path):
@@ -294,7 +294,7 @@ def test_positions_with_the_names_of_joints_are_kept_beside_others_with_velociti
     model = Coordinates({"arm": "rad", "pendulum": "rad", "arm_velocity": "rad/s", "pendulum_velocity": "rad/s"}, ["m"])
     columns = [TIME, ANGLE, 4.0 * np.cos(TIME), ANGLE, 4.0 * np.cos(TIME), ANGLE, ANGLE, COMMAND]
     np.savetxt(tmp_path / "log.csv", np.stack(columns, 1), delimiter=",", header=names, comments="")
-    found = guess_layout(tmp_path / "log.csv", model).coordinates
+    found = renamed(guess_layout(tmp_path / "log.csv", model))
     assert (found["arm_pos"], found["pendulum_pos"]) == ("arm", "pendulum")
 
 
@@ -381,7 +381,7 @@ def test_columns_that_are_no_slopes_stay_positions(tmp_path):
 def test_a_regular_clock_without_a_name_is_the_time(tmp_path):
     time = 0.002 * np.arange(500)
     np.savetxt(tmp_path / "log.dat", np.stack([time, np.sin(3 * time), 3 * np.cos(3 * time), np.cos(9 * time)], 1))
-    text = guess_layout(tmp_path / "log.dat").text
+    text = guess_layout(tmp_path / "log.dat")
     assert list(roles(text).values()) == ["time", "observation", "observation", "ignore"]
     assert "the median step is 0.002, which is 0.002 s" in text
 
@@ -394,9 +394,9 @@ def test_what_counts_rows_or_grows_unevenly_is_no_clock(tmp_path, values):
 def test_lists_in_cells_are_described_one_by_one(tmp_path):
     rows = "".join(f'{t:.2f},"[{np.sin(t):.6f}, {t:.2f}]","[{np.cos(t):.6f}, 1.0]"\n' for t in TIME[:200])
     (tmp_path / "log.csv").write_text("t,positions,velocities\n" + rows)
-    found = roles(guess_layout(tmp_path / "log.csv").text)
+    found = roles(guess_layout(tmp_path / "log.csv"))
     assert list(found) == ["t", "positions[0]", "positions[1]", "velocities[0]", "velocities[1]"]
-    (tmp_path / "log.yaml").write_text(guess_layout(tmp_path / "log.csv").text)
+    (tmp_path / "log.yaml").write_text(guess_layout(tmp_path / "log.csv"))
     assert load(tmp_path / "log.csv", columns=tmp_path / "log.yaml")["observation"].shape == (199, 4)
 
 

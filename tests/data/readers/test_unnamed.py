@@ -25,7 +25,7 @@ def roles(tmp_path, *columns, model=MOTORS) -> dict[int, tuple[str, str]]:
     """Name and role of each column that is not ignored, by its index."""
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack(columns), delimiter=",")
-    found = re.findall(r'name: "(\w+)", role: (\w+)', guess_layout(path, model).text)
+    found = re.findall(r'name: "(\w+)", role: (\w+)', guess_layout(path, model))
     return {index: entry for index, entry in enumerate(found) if entry[1] != "ignore"}
 
 
@@ -75,7 +75,7 @@ def test_the_time_has_the_unit_that_its_step_suggests(tmp_path, unit, factor):
     counter = np.arange(len(TIME))
     columns = [counter, np.round(factor * TIME), Q, V, TORQUE]
     assert roles(tmp_path, *columns) == expected(1, (2, 3), (4, 5), (6, 7))
-    assert f'role: time, unit: "{unit}"' in guess_layout(tmp_path / "log.csv", MOTORS).text
+    assert f'role: time, unit: "{unit}"' in guess_layout(tmp_path / "log.csv", MOTORS)
 
 
 def test_columns_that_drift_are_no_clocks_and_repeated_rows_are_no_fault_of_a_clock(tmp_path):
@@ -90,7 +90,7 @@ def test_a_joint_at_rest_is_recognised_by_its_place_and_the_note_says_so(tmp_pat
     rest = Q * [1.0, 0.0] + 1e-5 * RNG.standard_normal(Q.shape)
     found = roles(tmp_path, TIME, rest, V * [1.0, 0.0], TORQUE, OTHER)
     assert found == expected(0, (1, 2), (3, 4), (5, 6))
-    text = guess_layout(tmp_path / "log.csv", MOTORS).text
+    text = guess_layout(tmp_path / "log.csv", MOTORS)
     assert text.count("does not move, so only its place speaks for it") == 2
 
 
@@ -111,7 +111,7 @@ def test_another_set_that_may_be_meant_is_spoken_of(tmp_path):
     noisy = 1e-4 * RNG.standard_normal(Q.shape)
     path = tmp_path / "log.csv"
     np.savetxt(path, np.column_stack([TIME, Q, V, Q + noisy, V + noisy, TORQUE]), delimiter=",")
-    assert "other columns may be too, such as commanded and measured ones" in guess_layout(path, MOTORS).text
+    assert "other columns may be too, such as commanded and measured ones" in guess_layout(path, MOTORS)
 
 
 def test_the_command_of_a_servo_follows_its_position(tmp_path):
@@ -132,7 +132,7 @@ def test_a_motor_with_the_name_of_its_joint_has_another_one_in_the_log(tmp_path)
 @pytest.mark.parametrize(("unit", "factor"), [("deg", 180.0 / np.pi), ("rad", 1.0)])
 def test_degrees_are_recognised_as_well(tmp_path, unit, factor):
     assert roles(tmp_path, TIME, factor * Q, factor * V, TORQUE, OTHER) == expected(0, (1, 2), (3, 4), (5, 6))
-    text = guess_layout(tmp_path / "log.csv", MOTORS).text
+    text = guess_layout(tmp_path / "log.csv", MOTORS)
     assert text.count(f'unit: "{unit}"') == text.count(f'unit: "{unit}/s"') == 2
 
 

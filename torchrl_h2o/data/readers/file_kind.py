@@ -65,15 +65,12 @@ def require_file(path: str | Path) -> Path:
         raise DataError("this is not a regular file", "copy the data into a file and give that", source=path)
     with unreadable("the file cannot be opened", "check its permissions", source=path), path.open("rb") as file:
         start = file.read(len(_GZIP_START))
-    if is_pickle(path):
-        remedy = "if you trust the file, convert it to CSV, HDF5 or a memory-mapped TensorDict"
-        if path.suffix.lower() in _TORCH_SUFFIXES:
-            remedy = (
-                "if it holds tensors by name: d = torch.load(file, weights_only=True); "
-                "numpy.savez('log.npz', **{k: v.numpy() for k, v in d.items()}); then give log.npz"
-            )
-        problem = "this is a pickle, or a format that may contain one, and reading it could execute arbitrary code"
-        raise DataError(problem, remedy, source=path)
+    if is_pickle(path) and path.suffix.lower() not in _TORCH_SUFFIXES:  # of which torch reads the tensors alone
+        raise DataError(
+            "this is a pickle, or a format that may contain one, and reading it could execute arbitrary code",
+            "if you trust the file, convert it to CSV, HDF5 or a memory-mapped TensorDict",
+            source=path,
+        )
     if not start:
         raise DataError("the file is empty", "copy or record it again", source=path)
     if start == _GZIP_START:

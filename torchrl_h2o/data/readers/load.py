@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from torchrl_h2o.data.readers.d4rl import read_d4rl
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.file_kind import require_file
+from torchrl_h2o.data.readers.formats.lerobot import is_lerobot
 from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.log_columns import LogColumns
 from torchrl_h2o.data.readers.memory_map import read_ted
@@ -42,8 +43,8 @@ def load(
 
     Args:
         source: a Minari name (``"halfcheetah/medium-v0"``) or folder, an HDF5 file, a log (.csv, .txt, .parquet, .npz,
-            .mat, .mcap), or a folder written by :func:`write_ted`; or several of them: a list, a glob
-            (``"logs/*.csv"``), or a folder of logs. See :func:`sources_of` for their order.
+            .mat, .pt, .mcap), the folder of a LeRobot dataset, or one written by :func:`write_ted`; or several of them:
+            a list, a glob (``"logs/*.csv"``), or a folder of logs. See :func:`sources_of` for their order.
         env: an environment; the data's dimensions, kinds of numbers and action bounds are checked against it.
         columns: for a log, the layout of its columns; see :func:`read_robot_log`.
         reward: for a log, its reward function; see :func:`read_robot_log`.
@@ -81,6 +82,8 @@ def load(
 
 def _read(source: str | Path, columns: Columns | None, reward: Reward | None, task: str | None) -> TensorDict:
     path = Path(source).expanduser()
+    if is_lerobot(path):
+        return _read_log(path, columns, reward)
     if path.is_dir():
         _require_no_columns(columns, source)
         return _read_folder(path, task)
@@ -136,6 +139,10 @@ def _read_file(
         _require_no_columns(columns, path)
         warn_of_unknown_task(task, path)
         return read_d4rl(path)
+    return _read_log(path, columns, reward)
+
+
+def _read_log(path: Path, columns: Columns | None, reward: Reward | None) -> TensorDict:
     if columns is None:
         raise DataError(
             "a log does not describe its columns",

@@ -36,6 +36,7 @@ class Column:
         index: position in the file, counted from 0, for files without names; all columns have it, or none.
         derivative_of: the observed position whose velocity this column is, for a velocity that is not in the file. It
             is estimated, in SI; see :func:`~torchrl_h2o.data.readers.velocity.estimate_velocity`.
+        coordinate: the coordinate of the model that an observation measures, if it has another name than the column.
 
     Example:
         >>> import numpy as np
@@ -56,6 +57,7 @@ class Column:
     bounds: tuple[float, float] | None = None
     index: int | None = None
     derivative_of: str | None = None
+    coordinate: str | None = None
 
     def __post_init__(self):
         if not isinstance(self.name, str):
@@ -87,13 +89,12 @@ class Column:
             not isinstance(self.index, int) or isinstance(self.index, bool) or self.index < 0
         ):
             raise ValueError(f"index {self.index!r} must be a number of a column, counted from 0")
-        if self.derivative_of is not None:
-            if self.role != "observation":
-                raise ValueError("derivative_of is for observations only")
-            if self.index is not None or self.unwrap or (self.unit, self.scale, self.offset) != ("1", 1.0, 0.0):
-                raise ValueError(
-                    "a column with derivative_of is not in the file: omit index, unit, scale, offset, unwrap"
-                )
+        for name in ("derivative_of", "coordinate"):
+            if getattr(self, name) is not None and self.role != "observation":
+                raise ValueError(f"{name} is for observations only")
+        is_plain = (self.index, self.unwrap, self.unit, self.scale, self.offset) == (None, False, "1", 1.0, 0.0)
+        if self.derivative_of is not None and not is_plain:
+            raise ValueError("a column with derivative_of is not in the file: omit index, unit, scale, offset, unwrap")
 
     @property
     def factor(self) -> float:
@@ -253,6 +254,12 @@ class LogColumns:
     def derivatives(self) -> dict[str, str]:
         """The estimated velocities and the position of each."""
         return {column.name: column.derivative_of for column in self.columns if column.derivative_of is not None}
+
+    @property
+    def coordinates(self) -> dict[str, str]:
+        """The coordinate of the model that each observed column measures, in the order of the observation."""
+        of_column = {column.name: column.coordinate or column.name for column in self.columns}
+        return {name: of_column[name] for name in self.observation}
 
     def named(self, role: str) -> Column | None:
         """Return the column of a role that occurs at most once, or None."""

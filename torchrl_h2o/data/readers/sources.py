@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import glob
-import json
 import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchrl_h2o.data.readers.error import DataError, unreadable
+from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.formats import FORMATS
+from torchrl_h2o.data.readers.formats.lerobot import is_lerobot
 
 Source = str | Path | Sequence[str | Path]
 
 _HDF5_SUFFIXES = {".hdf5", ".h5", ".hdf"}
-_LEROBOT = "meta/info.json"
 _HDF5_START = b"\x89HDF\r\n\x1a\n"
 
 
@@ -84,7 +83,7 @@ def is_log(source: Source) -> bool:
     Raises:
         DataError: see :func:`sources_of`.
     """
-    return all(Path(one).is_file() and not is_hdf5(Path(one)) for one in sources_of(source))
+    return all(is_lerobot(one) or (Path(one).is_file() and not is_hdf5(Path(one))) for one in sources_of(source))
 
 
 def names_of(sources: Sequence[str | Path]) -> tuple[str, ...]:
@@ -111,10 +110,8 @@ def words_of(source: Source) -> str:
 
 
 def _in_folder(folder: Path) -> tuple[Path, ...]:
-    if is_data_set(folder):
+    if is_data_set(folder) or is_lerobot(folder):
         return (folder,)
-    if (folder / _LEROBOT).is_file():
-        raise _lerobot_error(folder)
     logs = sorted(path for path in folder.iterdir() if path.suffix.lower() in FORMATS)
     if not logs:
         raise DataError(
@@ -124,18 +121,3 @@ def _in_folder(folder: Path) -> tuple[Path, ...]:
             source=folder,
         )
     return tuple(logs)
-
-
-def _lerobot_error(folder: Path) -> DataError:
-    """What a LeRobot dataset holds, and how its tables are read."""
-    with unreadable("it looks like a LeRobot dataset, but its description cannot be read", source=folder / _LEROBOT):
-        info = json.loads((folder / _LEROBOT).read_text(encoding="utf-8"))
-        features = {name: info["features"][name]["names"] for name in ("action", "observation.state")}
-        version, rate, episodes = (info[name] for name in ("codebase_version", "fps", "total_episodes"))
-        names = "; ".join(f"{name}: {', '.join(map(str, of))}" for name, of in features.items())
-    return DataError(
-        f"it is a LeRobot dataset ({version}, {episodes} episodes at {rate} Hz; {names})",
-        f"give its tables, {folder.name}/data/*/*.parquet, with columns action[0], observation.state[0], ..., and "
-        "episode_index with role: run; positions may be normalised",
-        source=folder,
-    )

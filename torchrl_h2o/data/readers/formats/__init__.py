@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchrl_h2o.data.readers.file_kind import require_file
-from torchrl_h2o.data.readers.formats.arrays import read_mat, read_npz
+from torchrl_h2o.data.readers.formats.arrays import read_mat, read_npz, read_pt
+from torchrl_h2o.data.readers.formats.lerobot import is_lerobot, read_lerobot
 from torchrl_h2o.data.readers.formats.mcap_bag import read_mcap
 from torchrl_h2o.data.readers.formats.parquet import read_parquet
 from torchrl_h2o.data.readers.formats.raw_table import RawTable
@@ -16,7 +17,15 @@ if TYPE_CHECKING:
     from torchrl_h2o.data.readers.log_columns import LogColumns
 
 _TEXT = dict.fromkeys((".csv", ".txt", ".tsv", ".dat", ".log"), read_text)
-FORMATS = {**_TEXT, ".npz": read_npz, ".mat": read_mat, ".parquet": read_parquet, ".mcap": read_mcap}
+FORMATS = {
+    **_TEXT,
+    ".npz": read_npz,
+    ".mat": read_mat,
+    ".pt": read_pt,
+    ".pth": read_pt,
+    ".parquet": read_parquet,
+    ".mcap": read_mcap,
+}
 """Reader of a file by its suffix; a file with any other suffix is read as text."""
 
 
@@ -24,7 +33,7 @@ def read_raw(path: str | Path, layout: LogColumns | None = None) -> RawTable:
     """Read the columns of a log before they are selected and converted.
 
     Args:
-        path: the log.
+        path: the log, or the folder of a LeRobot dataset.
         layout: the columns, which must be those of the file, with separator, header, comment and decimal of a text
             file and the topic of a bag. A file that names its columns can be read without it.
 
@@ -42,5 +51,7 @@ def read_raw(path: str | Path, layout: LogColumns | None = None) -> RawTable:
         >>> read_raw(path).names
         ('q[0]', 'q[1]', 'u')
     """
+    if is_lerobot(path):
+        return read_lerobot(Path(path).expanduser(), layout)
     path = require_file(path)
     return FORMATS.get(path.suffix.lower(), read_text)(path, layout)

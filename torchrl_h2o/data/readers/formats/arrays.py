@@ -1,6 +1,7 @@
-"""Read the arrays of NumPy's .npz and MATLAB's .mat files as columns: ``q`` of shape (T, 2) is q[0] and q[1].
+"""Read the arrays of NumPy's .npz, MATLAB's .mat and torch's .pt files as columns.
 
-Arrays whose length is not that of the longest array, such as a scalar dt, are not columns.
+``q`` of shape (T, 2) is q[0] and q[1]. Arrays whose length is not that of the longest array,
+such as a scalar dt, are not columns.
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from torchrl_h2o.data.readers.error import DataError, unreadable
 from torchrl_h2o.data.readers.file_kind import require_plausible_size
@@ -73,6 +75,30 @@ def read_mat(path: Path, layout: LogColumns | None) -> RawTable:
         content = loadmat(path, chars_as_strings=False)
     arrays = {name: values for name, values in content.items() if not name.startswith("__")}
     return _columns(dict(_with_fields(arrays)), path, layout)
+
+
+def read_pt(path: Path, layout: LogColumns | None) -> RawTable:
+    """Read the tensors that ``torch.save`` wrote in a dictionary by name, and those in dictionaries in it as ``a.b``.
+
+    Raises:
+        DataError: for a damaged file, or one that holds anything else, whose reading could execute code.
+    """
+    remedy = "save the tensors by name: torch.save({'time': t, 'position': q, 'target': u}, 'log.pt')"
+    with unreadable("it holds more than tensors by name, or is damaged", remedy, source=path):
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(content, Mapping):
+        raise DataError(f"it holds a {type(content).__name__}, whose columns have no names", remedy, source=path)
+    arrays = {name: values.detach().resolve_conj().numpy() for name, values in _tensors(content)}
+    return _columns(arrays, path, layout)
+
+
+def _tensors(content: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, torch.Tensor]]:
+    """Yield tensors, and those in dictionaries, by their path."""
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            yield from _tensors(value, f"{prefix}{name}.")
+        elif isinstance(value, torch.Tensor):
+            yield f"{prefix}{name}", value.float() if value.dtype == torch.bfloat16 else value
 
 
 def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from torchrl_h2o.data.readers.error import DataError, unreadable
 from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats import FORMATS, read_raw
+from torchrl_h2o.data.readers.formats.lerobot import is_lerobot, read_calibration
 from torchrl_h2o.data.readers.formats.raw_table import RawTable
 from torchrl_h2o.data.readers.formats.text import number_of, read_text, split_rows, with_lists
 from torchrl_h2o.data.readers.guess.roles import guess_columns
@@ -30,11 +31,13 @@ class Contents:
         values: the numbers of each column by name; None for a column that is not numbers.
         options: entries of the layout that describe the file, such as ``separator``.
         named: whether the names are in the file.
+        calibration: for a LeRobot dataset, the range of each servo in turns, as far as it has its calibration.
     """
 
     values: dict[str, np.ndarray | None]
     options: dict[str, str] = field(default_factory=dict)
     named: bool = True
+    calibration: Mapping[str, float] | None = None
 
 
 def read_contents(path: str | Path) -> Contents:
@@ -54,12 +57,13 @@ def read_contents(path: str | Path) -> Contents:
         >>> read_contents(path).options
         {'separator': '";"', 'header': 'true', 'decimal': '","'}
     """
-    path = require_file(path)
-    if FORMATS.get(path.suffix.lower(), read_text) is not read_text:
+    path = Path(path).expanduser()
+    if is_lerobot(path) or FORMATS.get(require_file(path).suffix.lower(), read_text) is not read_text:
         raw = read_raw(path)
         values = {name: _numbers(raw, index, name) for index, name in enumerate(raw.names or ())}
         topic = {"topic": f'"{raw.topic}"'} if raw.topic else {}
-        return Contents(values, {"header": "true", **topic})
+        calibration = read_calibration(path) if is_lerobot(path) else None
+        return Contents(values, {"header": "true", **topic}, calibration=calibration)
     if is_hdf5(path):
         raise DataError("an HDF5 data set names its arrays", "use it without a description of columns", source=path)
     with unreadable("the file is not text", "give a log", source=path), path.open(encoding="utf-8-sig") as file:

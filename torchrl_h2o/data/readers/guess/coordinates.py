@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents
 from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE
-from torchrl_h2o.data.readers.guess.roles import Guess, kind_of_joint
+from torchrl_h2o.data.readers.guess.roles import Guess, kind_of_joint, words_of
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,16 @@ class Coordinates:
         actuators: the actuators' names.
         servos: whether all actuators are position servos, whose commands are desired positions.
         forces: whether all actuators push along an axis, as a propeller or a linear motor does.
+        driven: the joint that each actuator moves; without those that move none, or several.
+        ranges: lowest and highest position of the joints that have a range.
     """
 
     units: Mapping[str, str]
     actuators: Sequence[str]
     servos: bool = False
     forces: bool = False
+    driven: Mapping[str, str] = field(default_factory=dict)
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def quantities(self) -> dict[str, tuple[str, str | None]]:
@@ -49,6 +55,7 @@ def coordinates_of(
         like = [name for name in positions if joint.lower() in name.lower() and name not in found]
         if like:
             found[min(like, key=len)] = joint
+    found |= _between(positions, found, model) if not taken else {}
     found |= _by_kind(
         [name for name in positions if name not in found],
         [joint for joint in joints if joint not in found.values()],
@@ -65,6 +72,63 @@ def coordinates_of(
             estimated = estimated_velocity(position, [column.name for column in columns])
             found[velocity_of.get(position, estimated)] = f"{joint}_velocity"
     return found
+
+
+def _between(positions: Sequence[str], known: Mapping[str, str], model: Coordinates) -> dict[str, str]:
+    """Return the joints of columns between those whose joints are known, if there are as many of both in between."""
+    joints = [name for name in model.units if not name.endswith("_velocity")]
+    places = sorted((positions.index(name), joints.index(joint)) for name, joint in known.items())
+    if not places or places != sorted(places, key=itemgetter(1)):
+        return {}
+    ends = [(-1, -1), *places, (len(positions), len(joints))]
+    found: dict[str, str] = {}
+    for (column, joint), (next_column, next_joint) in pairwise(ends):
+        if next_column - column == next_joint - joint:
+            found |= zip(positions[column + 1 : next_column], joints[joint + 1 : next_joint], strict=True)
+    return found if all(kind_of_joint(name) in (None, model.units[joint]) for name, joint in found.items()) else {}
+
+
+def without_missing_joints(columns: Sequence[Guess], found: Mapping[str, str], model: Coordinates) -> list[Guess]:
+    """The columns without those of joints that the model lacks, and the actions as those of its actuators.
+
+    A position without a coordinate is that of a joint that the model lacks, if all its joints have a column. An action
+    is that of the actuator that moves the joint of the position with the same name, but for the words that all
+    actions, and all positions, have: ``action.elbow.pos`` and ``state.elbow.pos``. Other actions are left out if all
+    actuators have one.
+
+    Args:
+        columns: the columns.
+        found: the model's coordinate of each position and velocity.
+        model: the coordinates of the model.
+    """
+    joints = {name for name in model.units if not name.endswith("_velocity")}
+    lacks = {one.name for one in columns if one.kind == "position" and one.name not in found}
+    lacks = lacks if joints <= set(found.values()) else set()
+    of_actuator: dict[str, str] = {}
+    if not any(one.of_model for one in columns if one.kind == "action"):
+        positions, actions = (
+            _own_words([one for one in columns if one.kind == kind]) for kind in ("position", "action")
+        )
+        joint_of = {words: found.get(name) for name, words in positions.items()}
+        actuators = {joint: actuator for actuator, joint in model.driven.items()}
+        of_joint = {name: actuators.get(joint_of.get(words) or "") for name, words in actions.items()}
+        own = {name: actuator for name, actuator in of_joint.items() if actuator is not None}
+        if sorted(own.values()) == sorted(model.actuators):
+            of_actuator, lacks = own, lacks | (set(actions) - set(own))
+    note = "of a joint that the model does not have"
+    return [
+        replace(one, kind="unknown", note=note)
+        if one.name in lacks
+        else replace(one, of_model=of_actuator.get(one.name, one.of_model))
+        for one in columns
+    ]
+
+
+def _own_words(columns: Sequence[Guess]) -> dict[str, tuple[str, ...]]:
+    """The words of each column's name that not all of them have."""
+    words = {one.name: words_of(one.name) for one in columns}
+    shared = set.intersection(*map(set, words.values())) if words else set()
+    return {name: tuple(word for word in own if word not in shared) for name, own in words.items()}
 
 
 def _by_kind(positions: Sequence[str], joints: Sequence[str], model: Coordinates, in_order: bool) -> dict[str, str]:

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents, read_contents
-from torchrl_h2o.data.readers.guess.coordinates import Coordinates, coordinates_of, without_constants
+from torchrl_h2o.data.readers.guess.coordinates import (
+    Coordinates,
+    coordinates_of,
+    without_constants,
+    without_missing_joints,
+)
 from torchrl_h2o.data.readers.guess.free_body import FreeBody, free_body, velocities_together
 from torchrl_h2o.data.readers.guess.layout_text import layout_text
+from torchrl_h2o.data.readers.guess.normalised import scaled
 from torchrl_h2o.data.readers.guess.roles import (
     PERHAPS,
     Guess,
@@ -32,26 +38,16 @@ _AS_GOOD = 0.05  # difference of mean correlations up to which two sets of veloc
 _RELATED = 0.5  # correlation of both below which the column is not that velocity
 
 
-@dataclass(frozen=True)
-class GuessedLayout:
-    """A guess for the user to correct.
-
-    Args:
-        text: the YAML file.
-        coordinates: the model's coordinate of each observed column whose name differs; empty without a model.
-    """
-
-    text: str
-    coordinates: Mapping[str, str]
-
-
-def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedLayout:
+def guess_layout(path: str | Path, model: Coordinates | None = None) -> str:
     """Guess the layout of a log from the names and values of its columns.
 
     Args:
         path: the log, in any format.
         model: the coordinates to which the observed columns are matched: by name; or if there are as many, lengths to
             sliding joints, angles to hinges, and the others in order.
+
+    Returns:
+        The YAML file, for the user to correct.
 
     Raises:
         DataError: for a file that cannot be read as a table.
@@ -61,7 +57,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         >>> from torchrl_h2o.data.readers.guess import guess_layout
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
         >>> _ = path.write_text("t,hip,hip_vel,tau\\n0,0,1,0\\n0.01,0.01,1,0\\n0.02,0.02,1,0\\n")
-        >>> print(guess_layout(path).text.split("columns:")[1])
+        >>> print(guess_layout(path).split("columns:")[1])
         <BLANKLINE>
           - {name: "t", role: time, unit: "s"}  # check: the median step is 0.01, which is 0.01 s, 100 Hz
           - {name: "hip", role: observation, unit: "rad"}  # check the unit: the largest value is 0.02
@@ -94,12 +90,11 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> GuessedL
         column.name: pairs[column.name] for column in columns if column.kind == "velocity" and column.name in pairs
     }
     found = {} if model is None else coordinates_of(columns, pairs, model, body.coordinates)
+    columns = columns if model is None else without_missing_joints(columns, found, model)
+    columns = scaled(columns, contents, found, model)
     units = {column.name: column.unit for column in columns}
     columns = [_checked(column, slopes, pairs, found, model, units) for column in columns]
-    return GuessedLayout(
-        layout_text(path, contents, columns, pairs, slopes, [] if model is None else model.actuators),
-        {name: other for name, other in found.items() if name != other},
-    )
+    return layout_text(path, contents, columns, pairs, slopes, found, [] if model is None else model.actuators)
 
 
 def _of_actuators(columns: Sequence[Guess], model: Coordinates) -> list[Guess]:

@@ -23,6 +23,7 @@ def layout_text(
     columns: Sequence[Guess],
     pairs: Mapping[str, str],
     slopes: Slopes,
+    coordinates: Mapping[str, str],
     actuators: Sequence[str],
 ) -> str:
     """Return the YAML file.
@@ -33,6 +34,7 @@ def layout_text(
         columns: what each column is.
         pairs: positions by velocities; positions without one get an estimated velocity.
         slopes: the columns and the time.
+        coordinates: the model's coordinate of each observed column.
         actuators: the model's actuators, whose order the actions get if they have their names.
     """
     kinds = [column.kind for column in columns]
@@ -61,17 +63,28 @@ def layout_text(
         elif role == "unknown":
             role, note = "ignore", note or "not recognised: observation, action or ignore?"
         unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""
+        unit += "" if column.scale == 1.0 else f", scale: {column.scale:.6g}"
+        unit += "" if column.offset == 0.0 else f", offset: {column.offset:.6g}"
         if role in ("observation", "action") and is_wrapped(contents.values.get(column.name), column.unit):
             unit += ", unwrap: true"
             note = f"jumps by a turn; {'check that it begins in the turn of its position; ' * (role == 'action')}{note}"
         comment = f"  # {note}" if note else ""
-        lines.append(f'  - {{name: "{column.name}", role: {role}{unit}}}{comment}')
+        lines.append(
+            f'  - {{name: "{column.name}", role: {role}{unit}{_coordinate(column.name, coordinates)}}}{comment}'
+        )
     for column in columns:
         if column.kind == "position" and column.name not in pairs.values():
             name = estimated_velocity(column.name, contents.values)
-            entry = f'{{name: "{name}", role: observation, derivative_of: "{column.name}"}}'
+            of = f'derivative_of: "{column.name}"{_coordinate(name, coordinates)}'
+            entry = f'{{name: "{name}", role: observation, {of}}}'
             lines.append(f"  - {entry}  # no such column was found: it is estimated")
     return "\n".join(lines) + "\n"
+
+
+def _coordinate(name: str, coordinates: Mapping[str, str]) -> str:
+    """The entry with the model's coordinate of an observed column, if it has another name."""
+    coordinate = coordinates.get(name, name)
+    return "" if coordinate == name else f', coordinate: "{coordinate}"'
 
 
 def _step(columns: Sequence[Guess], slopes: Slopes, pairs: Mapping[str, str]) -> str:

@@ -61,6 +61,8 @@ class Guess:
         stem: the name without the words of its kind and its unit, by which positions and velocities are paired.
         note: what the user should check; empty if nothing is doubtful.
         of_model: the model's name of this quantity, if the column has it, apart from words such as "desired".
+        scale: a factor in addition to the unit's.
+        offset: a constant in SI that is added.
     """
 
     name: str
@@ -69,6 +71,8 @@ class Guess:
     stem: str = ""
     note: str = ""
     of_model: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
 
 
 def guess_columns(
