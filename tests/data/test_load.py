@@ -151,7 +151,7 @@ def test_environment_without_an_observation_entry_is_refused():
         check_specs(make_recording(), Dictionary(GymEnv("Pendulum-v1")))
 
 
-@pytest.mark.parametrize("source", [None, 3, {"data": "log.csv"}, [None]])
+@pytest.mark.parametrize("source", [None, 3, [None]])
 def test_what_is_no_source_is_refused(source):
     with pytest.raises(DataError, match="is neither a path nor a list of paths"):
         load(source)
@@ -191,28 +191,3 @@ def test_code_in_a_file_of_tensors_is_not_run(tmp_path, protocol):
     with pytest.raises(DataError, match="it holds more than tensors by name"):
         load(path, columns="simple_pendulum")
     assert not sign.exists()
-
-
-def columns_of_one_run(folder, begin=0.0):
-    """Positions and efforts of one run, a file each; the second one has stamps of its own, ``begin`` s later."""
-    time = 0.01 * np.arange(50)
-    for name, values, first in (("position", np.sin(time), 0.0), ("effort", np.cos(time), begin)):
-        rows = np.stack([time + first, values], 1)
-        np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header=f"t,hip_{name}", comments="")
-    return [folder / "position.csv", folder / "effort.csv"]
-
-
-def test_files_of_columns_of_one_run_are_not_taken_for_runs(tmp_path):
-    columns = [("t", "time", "s"), ("hip_position", "observation", "rad"), ("hip_effort", "action", "N·m")]
-    described = {"columns": [dict(zip(("name", "role", "unit"), one, strict=True)) for one in columns]}
-    described |= {"separator": ",", "header": True}
-    with pytest.raises(
-        DataError, match=r"position\.csv, effort\.csv have the same times.*one run in 2 files; join them"
-    ):
-        load(columns_of_one_run(tmp_path, begin=0.003), columns=described)
-    with pytest.raises(DataError, match="the column is missing"):
-        load(columns_of_one_run(tmp_path, begin=7.0), columns=described)
-    (tmp_path / "broken.csv").write_text("nothing")
-    with pytest.raises(DataError, match="the column is missing") as caught:
-        load([*columns_of_one_run(tmp_path), tmp_path / "broken.csv"], columns=described)
-    assert caught.value.source.endswith("position.csv")

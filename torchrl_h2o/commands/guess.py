@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
+from omegaconf import OmegaConf
 
 from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.contents import require_several_runs
@@ -40,10 +41,14 @@ def guess_columns(arguments: Sequence[str]) -> None:
         raise ValueError(
             f"{problem}; write close-the-loop --guess data=log.csv [simulator=robot.xml] [columns=log.yaml]"
         )
-    logs = sources_of([part.strip() for part in given["data"].strip("[]").split(",")])
+    data = given["data"]
+    if data.startswith("{"):
+        logs = sources_of(dict(OmegaConf.create(data)))
+    else:
+        logs = sources_of([part.strip() for part in data.strip("[]").split(",")])
     require_several_runs(logs)
-    log = Path(logs[0])
-    path = Path(given.get("columns", f"{log.stem}.yaml"))
+    log = logs[0]
+    path = Path(given.get("columns", f"{Path(log).stem}.yaml"))
     text = guess_layout(log, _coordinates_of(given["simulator"]) if "simulator" in given else None)
     if path.exists():
         problem = "the file exists and is not overwritten"

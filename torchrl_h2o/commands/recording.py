@@ -19,7 +19,7 @@ from torchrl_h2o.data import LogColumns, load, sources_of
 from torchrl_h2o.data.audit.log import find_turning
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
 from torchrl_h2o.data.readers.quaternion_signs import continuous_quaternions
-from torchrl_h2o.data.readers.sources import Source, is_log, names_of, unique, words_of
+from torchrl_h2o.data.readers.sources import One, Source, is_log, names_of, unique, words_of
 from torchrl_h2o.data.readers.units import to_si
 from torchrl_h2o.residuals.measured.transitions import HELD_OUT
 from torchrl_h2o.residuals.simulation.simulation import Simulation
@@ -153,8 +153,7 @@ def read_recording(cfg: DictConfig) -> Recording:
         recorded = hydra.compose("recorded", [f"env={cfg.simulator.recorded}"])
         transitions, logs = Task.from_config(recorded.env).read_real_data(RECORDED), (RECORDED,)
     else:
-        data = cfg.data if isinstance(cfg.data, str) else list(cfg.data)
-        sources, held_out = split_by_name(data, held_out)
+        sources, held_out = split_by_name(cfg.data, held_out)
         logs = names_of(sources)
         name = cfg.columns or (cfg.simulator.get("columns") if is_log(sources) else None)
         columns = None if name is None else LogColumns.load(name)
@@ -177,8 +176,8 @@ def read_recording(cfg: DictConfig) -> Recording:
 
 
 def split_by_name(
-    data: Source, held_out: float | Source | Sequence[str]
-) -> tuple[tuple[str | Path, ...], float | tuple[str, ...]]:
+    data: Source, held_out: float | str | Sequence[str]
+) -> tuple[tuple[One, ...], float | tuple[str, ...]]:
     """Finds the logs of a recording, those held out at the end.
 
     Args:
@@ -194,8 +193,8 @@ def split_by_name(
     sources = list(sources_of(data))
     if isinstance(held_out, float | int):
         return tuple(sources), held_out
-    chosen: list[str | Path] = []
-    for name in [held_out] if isinstance(held_out, str | Path) else list(held_out):
+    chosen: list[One] = []
+    for name in [held_out] if isinstance(held_out, str) else held_out:
         among = [one for one in sources if str(name) == str(one) or fnmatchcase(Path(one).name, str(name))]
         if not among and not Path(name).exists() and not any(sign in str(name) for sign in "*?["):
             logs = ", ".join(names_of(sources))

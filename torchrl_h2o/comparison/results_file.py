@@ -7,6 +7,7 @@ evaluation, for learning curves.
 import json
 import shlex
 from collections.abc import Iterable, Mapping
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,9 @@ def _strength(cfg: DictConfig) -> float:
 
 def _short(data: Source) -> str:
     """Return the data set's name; for an absolute path, its last two parts, which have the form of a Minari name."""
-    if not isinstance(data, str | Path):
+    if isinstance(data, Mapping):
+        data = list(data.values())
+    if not isinstance(data, str | PathLike):
         return " + ".join(_short(one) for one in data)
     path = Path(data)
     return "/".join(path.parts[-2:]) if path.is_absolute() else str(data)

@@ -67,7 +67,9 @@ class CloseTheLoopOptions(Options):
 
     simulator: SimulatorOptions
     data: Data = option(
-        "recorded", "recorded, Minari name, D4RL file, log, TED folder; several logs: [a.csv,b.csv], *.csv"
+        "recorded",
+        "recorded, Minari name, D4RL file, log, TED folder; several: [a.csv,b.csv], *.csv; one run in "
+        "several files: {position: a.csv, effort: b.csv}",
     )
     columns: Layout | None = option(None, "layout of a log: a YAML file, or the name of one of the library's")
     transitions: Count | None = option(5_000, "consecutive rows to use of each log; null for all")

@@ -105,4 +105,5 @@ Layout = Annotated[str, AfterValidator(require_layout)]
 DataSource = Annotated[
     str, AfterValidator(require_data), Field(description="a file, a folder or the name of a data set")
 ]
-Data = DataSource | Annotated[list[DataSource], Field(min_length=1, description="a list of these")]
+Files = Annotated[dict[str, AnyPath], Field(min_length=2, description="the files of one run by name")]
+Data = DataSource | Files | Annotated[list[DataSource | Files], Field(min_length=1, description="a list of these")]

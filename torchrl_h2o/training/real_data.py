@@ -36,8 +36,6 @@ def read_real_data(
     """
     if data == RECORDED:
         return _recorded(config, reality)
-    if not isinstance(data, str | Path):
-        data = list(data)  # of Hydra's own type
     if columns is None and is_log(data):
         columns = config.get("columns")
     reward = instantiate(config["reward"]) if "reward" in config else None

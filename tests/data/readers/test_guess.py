@@ -407,3 +407,13 @@ def test_the_number_of_an_episode_separates_runs(tmp_path):
     (tmp_path / "log.yaml").write_text(text)
     read = load(tmp_path / "log.csv", columns=tmp_path / "log.yaml")
     assert int(read["next", "done"].sum()) == 3
+
+
+@pytest.mark.parametrize(("rate", "unit"), [(0.2, "rad"), (3.0, "deg")])
+def test_positions_and_their_slopes_have_the_same_unit_of_angle(tmp_path, rate, unit):
+    """An angle of 28 is four turns if its velocity is at most 6, or degrees if it is at most 84."""
+    found = guessed(
+        tmp_path, "t,hip,hip_vel,tau", [TIME, 28.0 * np.sin(rate * TIME), 28.0 * rate * np.cos(rate * TIME), COMMAND]
+    )
+    assert f'"hip", role: observation, unit: "{unit}"' in found
+    assert f'"hip_vel", role: observation, unit: "{unit}/s"' in found

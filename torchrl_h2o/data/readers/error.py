@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from os import PathLike
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class DataError(ValueError):
         problem: str,
         remedy: str,
         *,
-        source: str | Path | None = None,
+        source: str | PathLike[str] | None = None,
         column: str | None = None,
         row: int | None = None,
     ):
@@ -59,7 +59,11 @@ class DataError(ValueError):
 
 @contextmanager
 def unreadable(
-    problem: str, remedy: str = "copy or export the file again", *, source: str | Path, column: str | None = None
+    problem: str,
+    remedy: str = "copy or export the file again",
+    *,
+    source: str | PathLike[str],
+    column: str | None = None,
 ) -> Iterator[None]:
     """Raise DataError in place of any other exception of the block.
 
@@ -102,7 +106,7 @@ def require_finite(
     values: np.ndarray,
     columns: Sequence[str],
     *,
-    source: str | Path,
+    source: str | PathLike[str],
     row_of: Callable[[int], int] = lambda index: index + 1,
     largest: float = float(np.finfo(np.float32).max),
 ) -> None:
@@ -132,7 +136,7 @@ def require_finite(
     )
 
 
-def require_real(values: np.ndarray, column: str, *, source: str | Path) -> None:
+def require_real(values: np.ndarray, column: str, *, source: str | PathLike[str]) -> None:
     """Raise DataError unless an array holds real numbers or booleans.
 
     A complex number would lose its imaginary part in the conversion to float32.
@@ -155,7 +159,11 @@ def require_real(values: np.ndarray, column: str, *, source: str | Path) -> None
 
 
 def require_flags(
-    values: np.ndarray, column: str, *, source: str | Path, row_of: Callable[[int], int] = lambda index: index + 1
+    values: np.ndarray,
+    column: str,
+    *,
+    source: str | PathLike[str],
+    row_of: Callable[[int], int] = lambda index: index + 1,
 ) -> np.ndarray:
     """Return flags as booleans.
 

@@ -14,12 +14,13 @@ from torchrl_h2o.data.readers.d4rl import read_d4rl
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats.lerobot import is_lerobot
+from torchrl_h2o.data.readers.formats.split_log import SplitLog
 from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.log_columns import LogColumns
 from torchrl_h2o.data.readers.memory_map import read_ted
 from torchrl_h2o.data.readers.minari_dataset import read_minari
 from torchrl_h2o.data.readers.robot_log import Reward, read_robot_log
-from torchrl_h2o.data.readers.sources import Source, is_hdf5, sources_of, words_of
+from torchrl_h2o.data.readers.sources import One, Source, is_hdf5, sources_of, words_of
 from torchrl_h2o.data.readers.specs import check_specs, warn_of_unknown_task
 from torchrl_h2o.data.readers.ted import entry_name
 
@@ -44,7 +45,9 @@ def load(
     Args:
         source: a Minari name (``"halfcheetah/medium-v0"``) or folder, an HDF5 file, a log (.csv, .txt, .parquet, .npz,
             .mat, .pt, .mcap), the folder of a LeRobot dataset, or one written by :func:`write_ted`; or several of them:
-            a list, a glob (``"logs/*.csv"``), or a folder of logs. See :func:`sources_of` for their order.
+            a list, a glob (``"logs/*.csv"``), or a folder of logs; see :func:`sources_of` for their order. A mapping is
+            one run in several files of columns, ``{"position": "a.csv", "effort": "b.csv"}``, whose columns are then
+            called ``position.hip`` and ``effort.hip``.
         env: an environment; the data's dimensions, kinds of numbers and action bounds are checked against it.
         columns: for a log, the layout of its columns; see :func:`read_robot_log`.
         reward: for a log, its reward function; see :func:`read_robot_log`.
@@ -80,10 +83,10 @@ def load(
     return td
 
 
-def _read(source: str | Path, columns: Columns | None, reward: Reward | None, task: str | None) -> TensorDict:
+def _read(source: One, columns: Columns | None, reward: Reward | None, task: str | None) -> TensorDict:
     path = Path(source).expanduser()
-    if is_lerobot(path):
-        return _read_log(path, columns, reward)
+    if isinstance(source, SplitLog) or is_lerobot(path):
+        return _read_log(source, columns, reward)
     if path.is_dir():
         _require_no_columns(columns, source)
         return _read_folder(path, task)
@@ -93,7 +96,7 @@ def _read(source: str | Path, columns: Columns | None, reward: Reward | None, ta
     return read_minari(str(source), task=task)
 
 
-def _joined(tds: Sequence[TensorDict], sources: Sequence[str | Path]) -> TensorDict:
+def _joined(tds: Sequence[TensorDict], sources: Sequence[One]) -> TensorDict:
     """Join the transitions of several sources, whose last transitions are done, with the entry ``log``."""
     keys, first = set(tds[0].keys(True, True)), tds[0]
     for index, (td, source) in enumerate(zip(tds, sources, strict=True)):
@@ -112,7 +115,7 @@ def _joined(tds: Sequence[TensorDict], sources: Sequence[str | Path]) -> TensorD
     return cast("TensorDict", torch.cat(list(tds)))
 
 
-def _require_no_columns(columns: Columns | None, source: str | Path) -> None:
+def _require_no_columns(columns: Columns | None, source: One) -> None:
     if columns is not None:
         raise DataError(
             "columns were given, but the source is not a log: its entries have names",
@@ -142,7 +145,7 @@ def _read_file(
     return _read_log(path, columns, reward)
 
 
-def _read_log(path: Path, columns: Columns | None, reward: Reward | None) -> TensorDict:
+def _read_log(path: One, columns: Columns | None, reward: Reward | None) -> TensorDict:
     if columns is None:
         raise DataError(
             "a log does not describe its columns",
@@ -152,6 +155,6 @@ def _read_log(path: Path, columns: Columns | None, reward: Reward | None) -> Ten
     return read_robot_log(path, columns, reward=reward)
 
 
-def looks_like_a_path(source: str | Path) -> bool:
+def looks_like_a_path(source: One) -> bool:
     """Whether a source is a path; a Minari name has no file suffix, does not start with / and ends in a version."""
-    return isinstance(source, Path) or not re.fullmatch(r"[-\w]+(/[-\w]+)*-v\d+", source)
+    return not isinstance(source, str) or not re.fullmatch(r"[-\w]+(/[-\w]+)*-v\d+", source)

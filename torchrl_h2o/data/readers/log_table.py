@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from pathlib import Path
+from os import PathLike
 from typing import cast
 
 import numpy as np
@@ -46,7 +46,7 @@ class LogTable:
         return self.values[:, [self.names.index(name) for name in names]]
 
 
-def read_table(path: str | Path, layout: LogColumns) -> LogTable:
+def read_table(path: str | PathLike[str], layout: LogColumns) -> LogTable:
     """Read and check the numbers of a log.
 
     Args:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,7 +28,7 @@ Reward = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def read_robot_log(
-    path: str | Path,
+    path: str | PathLike[str],
     columns: LogColumns | str | Path | Mapping[str, Any],
     *,
     reward: Reward | None = None,

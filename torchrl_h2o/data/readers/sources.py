@@ -5,26 +5,30 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.formats import FORMATS
 from torchrl_h2o.data.readers.formats.lerobot import is_lerobot
+from torchrl_h2o.data.readers.formats.split_log import SplitLog
 
-Source = str | Path | Sequence[str | Path]
+One = str | PathLike[str]
+Source = One | Mapping[str, One] | Sequence[One | Mapping[str, One]]
 
 _HDF5_SUFFIXES = {".hdf5", ".h5", ".hdf"}
 _HDF5_START = b"\x89HDF\r\n\x1a\n"
 
 
-def sources_of(source: Source) -> tuple[str | Path, ...]:
+def sources_of(source: Source) -> tuple[One, ...]:
     """Return the single sources that a source stands for, each once.
 
     Args:
         source: a source of :func:`~torchrl_h2o.data.load`: a file, a Minari name or a folder with a data set; a folder
             of logs, which stands for its files of known suffixes in the order of their names; a glob, such as
-            ``"logs/*.csv"``; or a list of all these.
+            ``"logs/*.csv"``; a mapping of names to the files of one run, which are joined on time; or a list of all
+            these.
 
     Raises:
         DataError: for an empty list, a glob without matches, a folder without data, or what is no path.
@@ -38,7 +42,11 @@ def sources_of(source: Source) -> tuple[str | Path, ...]:
         >>> [path.name for path in sources_of(folder)]
         ['a.csv', 'b.csv']
     """
-    if not isinstance(source, str | Path):
+    if isinstance(source, SplitLog):
+        return (source,)
+    if isinstance(source, Mapping):
+        return (_split(source),)
+    if not isinstance(source, str | PathLike):
         if not isinstance(source, Sequence):
             problem = f"{source!r} is neither a path nor a list of paths"
             raise DataError(problem, "give a file, a folder, a glob or a Minari name", source="data")
@@ -56,9 +64,9 @@ def sources_of(source: Source) -> tuple[str | Path, ...]:
     return (source,)
 
 
-def unique(sources: Sequence[str | Path]) -> tuple[str | Path, ...]:
+def unique(sources: Sequence[One]) -> tuple[One, ...]:
     """Return the sources without repetitions: ``a.csv`` and ``./a.csv`` are the same."""
-    first: dict[str, str | Path] = {}
+    first: dict[str, One] = {}
     for one in sources:
         first.setdefault(os.path.abspath(one), one)
     return tuple(first.values())
@@ -86,7 +94,7 @@ def is_log(source: Source) -> bool:
     return all(is_lerobot(one) or (Path(one).is_file() and not is_hdf5(Path(one))) for one in sources_of(source))
 
 
-def names_of(sources: Sequence[str | Path]) -> tuple[str, ...]:
+def names_of(sources: Sequence[One]) -> tuple[str, ...]:
     """Return a short name for each source: the name of the file, with its folders where two have the same.
 
     Example:
@@ -99,14 +107,24 @@ def names_of(sources: Sequence[str | Path]) -> tuple[str, ...]:
 
 
 def words_of(source: Source) -> str:
-    """Return a source in words for reports and errors; a list by its names.
+    """Return a source in words for reports and errors; several by their names.
 
     Example:
         >>> from torchrl_h2o.data.readers.sources import words_of
         >>> words_of(["a.csv", "b.csv"])
         'a.csv, b.csv'
     """
-    return str(source) if isinstance(source, str | Path) else ", ".join(map(str, source))
+    if isinstance(source, Mapping):
+        return ", ".join(f"{name}: {path}" for name, path in source.items())
+    return str(source) if isinstance(source, str | PathLike) else ", ".join(map(str, source))
+
+
+def _split(files: Mapping[str, One]) -> SplitLog:
+    paths = {str(name): Path(path).expanduser() for name, path in files.items() if isinstance(path, str | PathLike)}
+    if len(paths) < max(2, len(files)) or not all(path.is_file() for path in paths.values()):
+        problem = f"{dict(files)!r} does not name the files of one run"
+        raise DataError(problem, "give two or more, such as {position: a.csv, effort: b.csv}", source="data")
+    return SplitLog(paths)
 
 
 def _in_folder(folder: Path) -> tuple[Path, ...]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats.arrays import read_mat, read_npz, read_pt
 from torchrl_h2o.data.readers.formats.lerobot import is_lerobot, read_lerobot
 from torchrl_h2o.data.readers.formats.mcap_bag import read_mcap
 from torchrl_h2o.data.readers.formats.parquet import read_parquet
 from torchrl_h2o.data.readers.formats.raw_table import RawTable
+from torchrl_h2o.data.readers.formats.split_log import SplitLog, read_split
 from torchrl_h2o.data.readers.formats.text import read_text
 
 if TYPE_CHECKING:
@@ -29,11 +32,11 @@ FORMATS = {
 """Reader of a file by its suffix; a file with any other suffix is read as text."""
 
 
-def read_raw(path: str | Path, layout: LogColumns | None = None) -> RawTable:
+def read_raw(path: str | PathLike[str], layout: LogColumns | None = None) -> RawTable:
     """Read the columns of a log before they are selected and converted.
 
     Args:
-        path: the log, or the folder of a LeRobot dataset.
+        path: the log, the folder of a LeRobot dataset, or several files of one run.
         layout: the columns, which must be those of the file, with separator, header, comment and decimal of a text
             file and the topic of a bag. A file that names its columns can be read without it.
 
@@ -51,7 +54,12 @@ def read_raw(path: str | Path, layout: LogColumns | None = None) -> RawTable:
         >>> read_raw(path).names
         ('q[0]', 'q[1]', 'u')
     """
+    if isinstance(path, SplitLog):
+        if layout is None:
+            problem = "files of one run do not describe their columns"
+            raise DataError(problem, "give a column description", source=path)
+        return read_split(path, layout, read_raw)
     if is_lerobot(path):
         return read_lerobot(Path(path).expanduser(), layout)
-    path = require_file(path)
+    path = require_file(Path(path))
     return FORMATS.get(path.suffix.lower(), read_text)(path, layout)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import partial
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ _TURN = 4096  # counts a turn of Feetech STS and Dynamixel X servos
 _NO_NUMBERS = ("video", "image", "string")
 
 
-def is_lerobot(path: str | Path) -> bool:
+def is_lerobot(path: str | PathLike[str]) -> bool:
     """Whether a path is the folder of a LeRobot dataset."""
     return (Path(path).expanduser() / INFO).is_file()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,7 +33,7 @@ class RawTable:
         topic: the topic whose messages are the rows of a bag, if several have joint states.
     """
 
-    source: Path
+    source: str | PathLike[str]
     names: tuple[str, ...] | None
     width: int
     rows: np.ndarray
@@ -73,7 +74,9 @@ def columns_of(name: str, values: np.ndarray) -> dict[str, Callable[[], np.ndarr
     return {f"{name}[{i}]": partial(np.asarray, values[:, i]) for i in range(values.shape[1])}
 
 
-def require_names(names: Sequence[str], layout: LogColumns | None, path: Path, row: int | None = None) -> None:
+def require_names(
+    names: Sequence[str], layout: LogColumns | None, path: str | PathLike[str], row: int | None = None
+) -> None:
     """Raise DataError unless the names of a file's columns are those of a layout.
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats import FORMATS, read_raw
 from torchrl_h2o.data.readers.formats.lerobot import is_lerobot, read_calibration
 from torchrl_h2o.data.readers.formats.raw_table import RawTable
+from torchrl_h2o.data.readers.formats.split_log import SplitLog
 from torchrl_h2o.data.readers.formats.text import number_of, read_text, split_rows, with_lists
 from torchrl_h2o.data.readers.guess.roles import guess_columns
 from torchrl_h2o.data.readers.sources import is_hdf5
@@ -40,7 +42,7 @@ class Contents:
     calibration: Mapping[str, float] | None = None
 
 
-def read_contents(path: str | Path) -> Contents:
+def read_contents(path: str | PathLike[str]) -> Contents:
     """Read the names and values of a log's columns.
 
     Args:
@@ -57,6 +59,8 @@ def read_contents(path: str | Path) -> Contents:
         >>> read_contents(path).options
         {'separator': '";"', 'header': 'true', 'decimal': '","'}
     """
+    if isinstance(path, SplitLog):
+        return _joined(path)
     path = Path(path).expanduser()
     if is_lerobot(path) or FORMATS.get(require_file(path).suffix.lower(), read_text) is not read_text:
         raw = read_raw(path)
@@ -71,7 +75,7 @@ def read_contents(path: str | Path) -> Contents:
     return _text(lines, path)
 
 
-def require_several_runs(paths: Sequence[str | Path]) -> None:
+def require_several_runs(paths: Sequence[str | PathLike[str]]) -> None:
     """Raise DataError if files hold different columns of one run: other names, and the same times.
 
     Args:
@@ -95,9 +99,29 @@ def require_several_runs(paths: Sequence[str | Path]) -> None:
     raise DataError(
         f"{', '.join(path.name for path in logs)} have the same times and other columns: they are one run in "
         f"{len(logs)} files",
-        "join them on time, for example with pandas.merge_asof, and give the joined file",
+        f"give data={{{', '.join(f'{path.stem}: {path.name}' for path in logs)}}}, which joins them on time",
         source=logs[0].parent,
     )
+
+
+def _joined(log: SplitLog) -> Contents:
+    """The contents of the files of one run, joined on time."""
+    parts = {name: read_contents(path) for name, path in log.files.items()}
+    clocks: dict[str, str] = {}
+    for name, part in parts.items():
+        found = [guess.name for guess in guess_columns(part.values) if guess.kind == "time"]
+        if not found or part.options != next(iter(parts.values())).options:
+            problem = "no column of time was found" if not found else "it is written in another way than the first file"
+            raise DataError(problem, "files of one run are joined on time; join them", source=log.files[name])
+        clocks[name] = found[0]
+    log.name_of_time(list(clocks.values()))
+    rows = log.rows({name: np.asarray(part.values[clocks[name]]) for name, part in parts.items()})
+    values = {
+        f"{name}.{column}": None if numbers is None else numbers[rows[name]]
+        for name, part in parts.items()
+        for column, numbers in part.values.items()
+    }
+    return Contents(values, next(iter(parts.values())).options)
 
 
 def _time(contents: Contents) -> np.ndarray | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
+from os import PathLike
 
 import numpy as np
 
@@ -35,14 +36,16 @@ from torchrl_h2o.data.readers.units import to_si
 
 _SURPLUS = "a position beyond the model's joints"
 _AS_GOOD = 0.05  # difference of mean correlations up to which two sets of velocities are alike
+_SAME_UNIT = 0.3  # logarithm of the ratio of a velocity to the slope of its position up to which units agree
+_SLOW = 40.0  # largest velocity of a log below which it is taken to be in rad/s, not in deg/s
 _RELATED = 0.5  # correlation of both below which the column is not that velocity
 
 
-def guess_layout(path: str | Path, model: Coordinates | None = None) -> str:
+def guess_layout(path: str | PathLike[str], model: Coordinates | None = None) -> str:
     """Guess the layout of a log from the names and values of its columns.
 
     Args:
-        path: the log, in any format.
+        path: the log, in any format, or the files of one run.
         model: the coordinates to which the observed columns are matched: by name; or if there are as many, lengths to
             sliding joints, angles to hinges, and the others in order.
 
@@ -89,6 +92,7 @@ def guess_layout(path: str | Path, model: Coordinates | None = None) -> str:
     pairs = {
         column.name: pairs[column.name] for column in columns if column.kind == "velocity" and column.name in pairs
     }
+    columns = _in_one_unit(columns, slopes, pairs)
     found = {} if model is None else coordinates_of(columns, pairs, model, body.coordinates)
     columns = columns if model is None else without_missing_joints(columns, found, model)
     columns = scaled(columns, contents, found, model)
@@ -276,6 +280,24 @@ def _checked(
     if position is not None and (slope := slopes.of(position, column.name, units[position])) is not None:
         note = f"slope of {position}: {slope[1]:.3g} times this; {note}"
     return replace(column, unit=unit, note=note)
+
+
+def _in_one_unit(columns: Sequence[Guess], slopes: Slopes, pairs: Mapping[str, str]) -> list[Guess]:
+    """The columns, with the same unit of angle for positions and velocities that are their slopes in the file's units.
+
+    Angles that are large for rad are degrees, unless their velocities would then be slow.
+    """
+    units = {column.name: column.unit for column in columns}
+    for velocity, position in pairs.items():
+        slope = slopes.of(position, velocity, units[position])
+        stated = any(without_unit(name)[1] is not None for name in (position, velocity))
+        if stated or slope is None or (units[position], units[velocity]) != ("deg", "rad/s"):
+            continue
+        if abs(math.log(max(abs(slope[1]), 1e-12))) < _SAME_UNIT:
+            speeds = slopes.values.get(velocity)
+            is_slow = speeds is None or float(np.nanmax(np.abs(speeds))) < _SLOW
+            units |= {position: "rad"} if is_slow else {velocity: "deg/s"}
+    return [replace(column, unit=units[column.name]) for column in columns]
 
 
 def _without_strangers(

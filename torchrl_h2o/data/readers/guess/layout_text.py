@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ UNEVEN, MANY = 0.2, 0.02  # clocks are irregular if more than a share of the ste
 
 
 def layout_text(
-    path: str | Path,
+    path: str | PathLike[str],
     contents: Contents,
     columns: Sequence[Guess],
     pairs: Mapping[str, str],
