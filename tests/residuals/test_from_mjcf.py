@@ -103,17 +103,37 @@ def test_a_model_that_cannot_move_or_holds_nan_is_refused(text, said, tmp_path):
         Simulation.from_mjcf(tmp_path / "robot.xml", ["hinge"], 0.005)
 
 
-def test_a_urdf_with_meshes_and_a_massless_link_says_what_to_change(tmp_path):
-    (tmp_path / "arm.urdf").write_text(
-        """<robot name="arm"><link name="base">
-             <inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-             <visual><geometry><mesh filename="package://arm/base.stl"/></geometry></visual></link>
-           <link name="tool"/><joint name="wrist" type="continuous">
-             <parent link="base"/><child link="tool"/><axis xyz="0 0 1"/></joint></robot>"""
-    )
-    said = r"remove all <visual>.*do not matter.*give an <inertial> .* links tool$"
-    with pytest.raises(ValueError, match=said) as caught:
-        Simulation.from_mjcf(tmp_path / "arm.urdf", ["wrist"], 0.005)
+URDF = """<robot name="arm"><link name="base"><visual><geometry><mesh filename="package://arm/base.stl"/></geometry></visual>
+  <collision><geometry><mesh filename="package://arm/base.stl"/></geometry></collision></link>
+  <link name="upper">{upper}<visual><geometry><mesh filename="package://arm/upper.dae"/></geometry></visual></link>
+  <link name="tool"/>
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit lower="-9" upper="9" effort="3" velocity="5"/><dynamics damping="0.02" friction="0"/></joint>
+  <joint name="flange" type="fixed"><parent link="upper"/><child link="tool"/></joint></robot>"""
+INERTIAL = """<inertial><origin xyz="0 0 -0.2"/><mass value="1.5"/>
+  <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.001"/></inertial>"""
+SAME = """<mujoco><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" damping="0.02"/>
+  <inertial pos="0 0 -0.2" mass="1.5" diaginertia="0.02 0.02 0.001"/></body></worldbody>
+  <actuator><motor joint="shoulder"/></actuator></mujoco>"""
+
+
+def test_a_urdf_file_moves_without_its_meshes_by_a_motor_on_each_joint(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF.format(upper=INERTIAL))
+    (tmp_path / "arm.xml").write_text(SAME)
+    arms = [
+        Simulation.from_mjcf(tmp_path / name, ["shoulder", "shoulder_velocity"], 0.01)
+        for name in ("arm.urdf", "arm.xml")
+    ]
+    assert [arms[0].model.actuator(i).name for i in range(arms[0].model.nu)] == ["shoulder"]
+    start, commands = np.array([[0.3, -0.5]]), np.sin(np.arange(20.0))[None, :, None]
+    ends = [arm.rollout(start, commands) for arm in arms]
+    assert ends[0] == pytest.approx(ends[1], abs=1e-9)
+
+
+def test_a_moving_link_of_a_urdf_file_without_a_mass_is_named(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF.format(upper=""))
+    with pytest.raises(ValueError, match=r"give an <inertial> with a mass to the links upper$") as caught:
+        Simulation.from_mjcf(tmp_path / "arm.urdf", ["shoulder"], 0.005)
     assert "\n" not in str(caught.value)
 
 

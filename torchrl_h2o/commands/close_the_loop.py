@@ -190,7 +190,7 @@ def print_files(report: Report, directory: Path) -> None:
 def expanded(argument: str) -> list[str]:
     """Expand the short forms ``simulator=robot.xml`` and ``simulator=HalfCheetah-v5`` to options that Hydra accepts."""
     key, _, name = argument.partition("=")
-    if key == "simulator" and name.endswith(".xml"):
+    if key == "simulator" and name.endswith((".xml", ".urdf")):
         return ["simulator=mjcf", f"simulator.path={name}"]
     if key == "simulator" and re.search(r"-v\d+$", name):
         return ["simulator=gymnasium", f"simulator.task={name}"]

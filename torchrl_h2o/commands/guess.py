@@ -15,7 +15,7 @@ from torchrl_h2o.data.readers.guess.coordinates import Coordinates
 from torchrl_h2o.data.readers.guess.layout import guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
 from torchrl_h2o.effects.model.servo import is_servo
-from torchrl_h2o.residuals.simulation.source import read_model
+from torchrl_h2o.residuals.simulation.model_file import read_model, read_spec
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names
 from torchrl_h2o.whole_file import write_text
 
@@ -68,7 +68,7 @@ def guess_columns(arguments: Sequence[str]) -> None:
 
 def _coordinates_of(simulator: str) -> Coordinates:
     try:
-        model, spec = read_model(Path(simulator)), mujoco.MjSpec.from_file(simulator)
+        model, spec = read_model(Path(simulator)), read_spec(Path(simulator))
     except ValueError as error:
         raise ValueError(f"simulator={simulator}: {error}") from None
     names, units = coordinate_names(model)

@@ -1,9 +1,8 @@
-"""Reads simulators: from a TorchRL env, or from an MJCF file with the names of its observed coordinates."""
+"""Reads simulators: from a TorchRL env, or from an MJCF or URDF file with the names of its observed coordinates."""
 
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -14,10 +13,11 @@ import numpy as np
 from torchrl import torchrl_logger
 from torchrl.envs import EnvBase
 
-from torchrl_h2o.effects import Effect, compile_model
+from torchrl_h2o.effects import Effect
 from torchrl_h2o.effects.effect import checked_effects
 from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 from torchrl_h2o.envs.mujoco_model import find_backend
+from torchrl_h2o.residuals.simulation.model_file import read_model, read_spec
 from torchrl_h2o.residuals.simulation.state_map import StateMap, coordinate_names, probe_gymnasium
 
 # share of the control step by which a recording's may differ from a multiple of the model's timestep
@@ -75,7 +75,7 @@ def source_of_mjcf(
     control_step: float,
     effects: Sequence[Effect] = (),
 ) -> SimulatorSource:
-    """Reads the simulator of an MJCF file; see :meth:`Simulation.from_mjcf`.
+    """Reads the simulator of an MJCF or URDF file; see :meth:`Simulation.from_mjcf`.
 
     Args:
         path: the file.
@@ -94,7 +94,7 @@ def source_of_mjcf(
     frame_skip, timestep = _steps(control_step, model.opt.timestep, path)
 
     def spec() -> mujoco.MjSpec:
-        parsed = mujoco.MjSpec.from_file(str(path))
+        parsed = read_spec(path)
         parsed.option.timestep = timestep
         return parsed
 
@@ -106,50 +106,6 @@ def source_of_mjcf(
             f"{model.nv} velocities"
         )
     return SimulatorSource(spec, frame_skip, state_map, effects, path.stem)
-
-
-def read_model(path: Path) -> mujoco.MjModel:
-    """Compiles the model of an MJCF file.
-
-    Raises:
-        ValueError: for a file that is not a model, that has no joints, or that contains NaN, which MuJoCo would replace
-            by default values; for a URDF file with the links that lack a mass.
-    """
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}; give the path of an MJCF file")
-    try:
-        model = compile_model(mujoco.MjSpec.from_file(str(path)))
-    except ValueError as error:
-        raise ValueError(
-            f"MuJoCo cannot make a model of {path}: {' '.join(str(error).split())}{_help_with_urdf(path)}"
-        ) from error
-    if not model.njnt:
-        raise ValueError(f"the model of {path} has no joints, so nothing in it can move; add joints to its bodies")
-    for element in ElementTree.parse(path).iter():
-        for name, value in element.attrib.items():
-            if any(word.lstrip("+-").lower() == "nan" for word in value.split()) and name != "name":
-                raise ValueError(f"{path}: {name}={value!r} of <{element.tag}> is not a number; give a finite one")
-    return model
-
-
-def _help_with_urdf(path: Path) -> str:
-    """Returns what to change in a URDF file that MuJoCo does not read; nothing for another file."""
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError:
-        return ""
-    if root.tag != "robot":
-        return ""
-    massless = [
-        link.get("name", "")
-        for link in root.iter("link")
-        if not any(float(mass.get("value", 0)) > 0.0 for mass in link.iter("mass"))
-    ]
-    without = f"; give an <inertial> with a mass to the links {', '.join(massless)}" if massless else ""
-    return (
-        ". In this URDF file, remove all <visual> and <collision> elements with meshes, which do not matter for the "
-        f"dynamics{without}"
-    )
 
 
 def _map_of(coordinates: Mapping[str, str] | Sequence[str], model: mujoco.MjModel, path: Path) -> StateMap:
