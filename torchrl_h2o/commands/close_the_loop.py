@@ -4,6 +4,7 @@ close-the-loop                                           # the wheel-legged robo
 close-the-loop data=standing_still.txt                   # the same simulator with the real robot's log
 close-the-loop simulator=HalfCheetah-v5 simulator.gap=gravity data=halfcheetah/medium-replay-v0
 close-the-loop simulator=robot.xml data=log.csv columns=log.yaml       # your own model and log
+close-the-loop simulator=a.xml data=b.xml                # what one simulator lacks compared with another one
 close-the-loop --guess data=log.csv simulator=robot.xml                # writes a first log.yaml for you to correct
 """
 

@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig, ListConfig
 from tensordict import TensorDictBase
 
+from torchrl_h2o.commands.other_simulator import is_model, record_simulator
 from torchrl_h2o.data import LogColumns, load, sources_of
 from torchrl_h2o.data.audit.log import find_turning
 from torchrl_h2o.data.readers.observed import EstimatedVelocity, estimated_velocities
@@ -152,6 +153,13 @@ def read_recording(cfg: DictConfig) -> Recording:
             raise ValueError(f"held_out={words_of(held_out)}: data=recorded is one run; give a share, such as 0.3")
         recorded = hydra.compose("recorded", [f"env={cfg.simulator.recorded}"])
         transitions, logs = Task.from_config(recorded.env).read_real_data(RECORDED), (RECORDED,)
+    elif is_model(cfg.data):
+        if "path" not in cfg.simulator or not isinstance(held_out, float | int):
+            raise ValueError(
+                f"data={cfg.data} is a second simulator: give simulator=robot.xml, and a share to hold out"
+            )
+        transitions, columns = record_simulator(cfg.data, cfg.simulator.control_step, cfg.seed)
+        logs = (Path(cfg.data).name,)
     else:
         sources, held_out = split_by_name(cfg.data, held_out)
         logs = names_of(sources)
