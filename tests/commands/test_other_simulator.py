@@ -18,8 +18,9 @@ ARM = """<mujoco><option timestep="0.005"/><worldbody><body name="upper">
   <body pos="0 0 -0.3"><joint name="elbow" axis="0 1 0" damping="0.05"/>
   <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.5"/></body></body></worldbody>
   <actuator>{actuators}</actuator></mujoco>"""
-MOTORS = '<motor name="m1" joint="shoulder"/><motor name="m2" joint="elbow" ctrlrange="-0.2 0.4" gear="2"/>'
-SERVOS = '<position name="s1" joint="shoulder" kp="20" kv="1"/><position name="s2" joint="elbow" kp="9" ctrlrange="-0.4 0.4"/>'
+MOTORS = """<motor name="m1" joint="shoulder"/><motor name="m2" joint="elbow" ctrlrange="-0.2 0.4" gear="2"/>"""
+SERVOS = """<position name="s1" joint="shoulder" kp="20" kv="1"/>
+  <position name="s2" joint="elbow" kp="9" ctrlrange="-0.4 0.4"/>"""
 
 
 @pytest.fixture

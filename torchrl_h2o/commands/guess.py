@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 from omegaconf import OmegaConf
@@ -14,7 +15,7 @@ from torchrl_h2o.data.readers.guess.contents import require_several_runs
 from torchrl_h2o.data.readers.guess.coordinates import Coordinates
 from torchrl_h2o.data.readers.guess.layout import guess_layout
 from torchrl_h2o.data.readers.robot_log import read_robot_log
-from torchrl_h2o.effects.model.servo import is_servo
+from torchrl_h2o.effects.model.servo import is_servo, is_velocity_servo
 from torchrl_h2o.residuals.simulation.model_file import read_model, read_spec
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names
 from torchrl_h2o.whole_file import write_text
@@ -76,7 +77,7 @@ def _coordinates_of(simulator: str) -> Coordinates:
     return Coordinates(
         dict(zip(names, units, strict=True)),
         [model.actuator(i).name or str(i) for i in range(model.nu)],
-        servos=model.nu > 0 and all(map(is_servo, spec.actuators)),
+        servos=_servos(spec),
         forces=model.nu > 0 and all(_pushes(model, actuator) for actuator in range(model.nu)),
         driven={
             model.actuator(i).name or str(i): joints[model.actuator_trnid[i, 0]]
@@ -85,6 +86,15 @@ def _coordinates_of(simulator: str) -> Coordinates:
         },
         ranges={name: tuple(model.jnt_range[i]) for i, name in enumerate(joints) if model.jnt_limited[i]},
     )
+
+
+def _servos(spec: mujoco.MjSpec) -> Literal["position", "velocity"] | None:
+    """What the commands of the actuators are, if all are servos of one kind."""
+    if not spec.actuators:
+        return None
+    if all(map(is_servo, spec.actuators)):
+        return "position"
+    return "velocity" if all(map(is_velocity_servo, spec.actuators)) else None
 
 
 def _pushes(model: mujoco.MjModel, actuator: int) -> bool:

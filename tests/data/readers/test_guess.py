@@ -107,9 +107,9 @@ def test_names_of_the_model_say_what_a_column_is(tmp_path):
 def test_the_command_of_a_servo_has_the_unit_of_its_position(tmp_path):
     rows = np.cumsum(np.ones((50, 4)), axis=0) * [0.02, 2.0, 1.9, 0.1]
     np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="time,command,angle,effort", comments="")
-    model = Coordinates({"arm": "rad", "arm_velocity": "rad/s"}, ["servo"], servos=True)
+    model = Coordinates({"arm": "rad", "arm_velocity": "rad/s"}, ["servo"], servos="position")
     text = guess_layout(tmp_path / "log.csv", model)
-    assert '{name: "command", role: action, unit: "deg"}  # the model\'s actuators are servos' in text
+    assert '{name: "command", role: action, unit: "deg"}  # the model\'s actuators are position servos' in text
     assert '{name: "effort", role: ignore}' in text
 
 
@@ -324,9 +324,9 @@ LEGS = [f"{leg}_{part}" for leg in ("FL", "RR") for part in ("hip", "thigh", "ca
 @pytest.mark.parametrize(
     ("model", "suffix"),
     [
-        (Coordinates({f"{leg}_joint": "rad" for leg in LEGS}, LEGS, servos=True), "des"),
-        (Coordinates(dict.fromkeys(LEGS, "rad"), LEGS, servos=True), "target"),
-        (Coordinates(dict.fromkeys(LEGS, "rad"), [f"m{i}" for i in range(6)], servos=True), "cmd"),
+        (Coordinates({f"{leg}_joint": "rad" for leg in LEGS}, LEGS, servos="position"), "des"),
+        (Coordinates(dict.fromkeys(LEGS, "rad"), LEGS, servos="position"), "target"),
+        (Coordinates(dict.fromkeys(LEGS, "rad"), [f"m{i}" for i in range(6)], servos="position"), "cmd"),
     ],
     ids=["names of actuators", "names of joints", "as many as actuators"],
 )
@@ -417,3 +417,12 @@ def test_positions_and_their_slopes_have_the_same_unit_of_angle(tmp_path, rate, 
     )
     assert f'"hip", role: observation, unit: "{unit}"' in found
     assert f'"hip_vel", role: observation, unit: "{unit}/s"' in found
+
+
+def test_the_commands_of_velocity_servos_are_desired_velocities(tmp_path):
+    model = Coordinates({"hip": "rad", "hip_velocity": "rad/s"}, ["drive"], servos="velocity")
+    columns = [TIME, ANGLE, 4.0 * np.cos(TIME), 4.0 * np.cos(TIME) + 0.1, ANGLE, COMMAND]
+    found = guessed(tmp_path, "t,hip,hip_vel,hip_vel_des,hip_pos_des,hip_tau", columns, model)
+    assert '"hip_vel_des", role: action, unit: "rad/s"}  # the model\'s actuators are velocity servos' in found
+    assert '"hip_pos_des", role: ignore' in found
+    assert '"hip_tau", role: ignore}  # the model\'s actuators are velocity servos' in found

@@ -19,7 +19,7 @@ JOINTS = ("Rotation", "Elbow", "Wrist")
 ARM = Coordinates(
     dict.fromkeys(JOINTS, "rad") | {f"{name}_velocity": "rad/s" for name in JOINTS},
     ["wrist_servo", "pan_servo", "elbow_servo"],
-    servos=True,
+    servos="position",
     driven={"wrist_servo": "Wrist", "pan_servo": "Rotation", "elbow_servo": "Elbow"},
 )
 ROWS = 40
@@ -93,7 +93,7 @@ def test_shares_of_a_servo_s_range_are_angles_by_its_calibration(tmp_path):
 
 
 def test_shares_of_a_range_are_angles_by_the_range_of_the_joint_in_the_model(tmp_path):
-    model = Coordinates(ARM.units, ARM.actuators, servos=True, driven=ARM.driven, ranges={"Elbow": (-1.0, 2.0)})
+    model = Coordinates(ARM.units, ARM.actuators, servos="position", driven=ARM.driven, ranges={"Elbow": (-1.0, 2.0)})
     text = guess_layout(dataset(tmp_path / "arm"), model)
     for name in ("observation.state.elbow_flex.pos", "action.elbow_flex.pos"):
         assert 'unit: "rad", scale: 0.015, offset: 0.5' in entry(text, name)

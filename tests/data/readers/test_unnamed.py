@@ -115,7 +115,7 @@ def test_another_set_that_may_be_meant_is_spoken_of(tmp_path):
 
 
 def test_the_command_of_a_servo_follows_its_position(tmp_path):
-    servos = Coordinates(UNITS, ["hip_motor", "knee_motor"], servos=True)
+    servos = Coordinates(UNITS, ["hip_motor", "knee_motor"], servos="position")
     late = np.sin((TIME[:, None] + 0.05) * RATES)
     found = roles(tmp_path, TIME, Q, V, OTHER, late, model=servos)
     assert found == expected(0, (1, 2), (3, 4), (8, 9))

@@ -85,6 +85,11 @@ def is_filter(actuator: mujoco.MjsActuator) -> bool:
     return actuator.dyntype in filters and actuator.dynprm[0] > 0.0
 
 
+def is_velocity_servo(actuator: mujoco.MjsActuator) -> bool:
+    """Whether the force of an actuator is proportional to the difference of its command and its velocity alone."""
+    return not is_servo(actuator) and bool(actuator.biasprm[2] != 0.0 and actuator.gainprm[0] == -actuator.biasprm[2])
+
+
 def is_servo(actuator: mujoco.MjsActuator) -> bool:
     """Whether the force of an actuator is proportional to the difference of its command and its position."""
     affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE

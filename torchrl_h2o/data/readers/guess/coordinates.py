@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from operator import itemgetter
+from typing import Literal
 
 import numpy as np
 
@@ -21,7 +22,7 @@ class Coordinates:
     Args:
         units: the unit of each coordinate by its name, positions before velocities; velocities end in ``_velocity``.
         actuators: the actuators' names.
-        servos: whether all actuators are position servos, whose commands are desired positions.
+        servos: what the commands of the actuators are, desired positions or velocities, if all are such servos.
         forces: whether all actuators push along an axis, as a propeller or a linear motor does.
         driven: the joint that each actuator moves; without those that move none, or several.
         ranges: lowest and highest position of the joints that have a range.
@@ -29,7 +30,7 @@ class Coordinates:
 
     units: Mapping[str, str]
     actuators: Sequence[str]
-    servos: bool = False
+    servos: Literal["position", "velocity"] | None = None
     forces: bool = False
     driven: Mapping[str, str] = field(default_factory=dict)
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)

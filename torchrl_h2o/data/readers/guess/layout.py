@@ -170,26 +170,26 @@ def _unnamed_velocities(
 
 
 def _servo_commands(columns: Sequence[Guess], model: Coordinates) -> list[Guess]:
-    """The commands of servos, which are positions: those of the actuators' names, or desired positions, or others.
+    """The commands of servos, positions or velocities: those of the actuators' names, or desired ones, or others.
 
     The first of these of which there are as many as actuators. Torques beside them are no actions.
     """
-    unit = next((column.unit for column in columns if column.kind == "position"), "rad")
-    desired = [column for column in columns if column.kind == "desired position"]
+    unit = next((column.unit for column in columns if column.kind == model.servos), "rad")
+    desired = [column for column in columns if column.kind == f"desired {model.servos}"]
     others = [column for column in columns if column.kind == "action" and not is_force(column.name)]
     own = [column for column in others if column.of_model is not None]
     fitting = [each for each in (own, desired, desired + others) if len(each) == len(model.actuators)]
     commands = {column.name for column in next(iter(fitting), desired or others)}
     if not commands:
         return list(columns)
-    result = []
+    said, result = f"the model's actuators are {model.servos} servos", []
     for column in columns:
         if column.name in commands:
-            note = "the model's actuators are servos, which take positions: check the unit"
-            own_unit = column.unit if column.kind == "desired position" else unit
+            note = f"{said}: check the unit"
+            own_unit = column.unit if column in desired else unit
             column = replace(column, kind="action", unit=own_unit, note=note)
         elif column.kind == "action":
-            column = replace(column, kind="unknown", note="the model's actuators are servos, which take positions")
+            column = replace(column, kind="unknown", note=said)
         result.append(column)
     return result
 
