@@ -13,8 +13,9 @@ import numpy as np
 
 from torchrl_h2o.data.readers.units import to_si
 
+EULER = ("roll", "pitch", "yaw")
 _MOST_JUMPS = 0.3  # share of rows that may differ from the row before by more than half a turn of the angle
-Role = Literal["observation", "action", "reward", "done", "time", "run", "ignore"]
+Role = Literal["observation", "action", "reward", "done", "time", "run", "euler", "ignore"]
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,10 @@ class Column:
 
     Args:
         name: the column's name; in a file with a header, the name in the header.
-        role: one of observation, action, reward, done, time, run, ignore. ``done`` is 1 in rows in which the task has
-            ended. The ``reward`` of a row is the reward of that row's action. ``run`` is the number of an episode: a
-            run ends where it changes.
+        role: one of observation, action, reward, done, time, run, euler, ignore. ``done`` is 1 in rows in which the
+            task has ended. The ``reward`` of a row is the reward of that row's action. ``run`` is the number of an
+            episode: a run ends where it changes. Of the role ``euler`` are roll, pitch and yaw of a free body, which
+            become its quaternion.
         unit: the unit in the file, which is converted to SI; see :data:`~torchrl_h2o.data.readers.units.UNITS`.
         scale: a factor in addition to the unit's, such as a gear ratio or a sign.
         offset: a constant in SI that is added after unit and scale, such as the zero of an angle.
@@ -36,7 +38,10 @@ class Column:
         index: position in the file, counted from 0, for files without names; all columns have it, or none.
         derivative_of: the observed position whose velocity this column is, for a velocity that is not in the file. It
             is estimated, in SI; see :func:`~torchrl_h2o.data.readers.velocity.estimate_velocity`.
-        coordinate: the coordinate of the model that an observation measures, if it has another name than the column.
+        coordinate: the coordinate of the model that an observation measures, if it has another name than the column;
+            for the role ``euler``, ``root_roll``, ``root_pitch`` or ``root_yaw`` for the free joint ``root``.
+        is_quaternion: whether it is a number of a quaternion that is computed from three columns with the role
+            ``euler``; :class:`LogColumns` adds these.
 
     Example:
         >>> import numpy as np
@@ -58,6 +63,7 @@ class Column:
     index: int | None = None
     derivative_of: str | None = None
     coordinate: str | None = None
+    is_quaternion: bool = False
 
     def __post_init__(self):
         if not isinstance(self.name, str):
@@ -78,6 +84,10 @@ class Column:
             isinstance(self.unwrap, int | float) and 0 < self.unwrap < math.inf
         ):
             raise ValueError(f"unwrap {self.unwrap!r} must be true, false, or the size of a turn in the file")
+        if self.role == "euler" and (si_unit != "rad" or (self.coordinate or "").rpartition("_")[2] not in EULER):
+            raise ValueError(
+                "an Euler angle needs its unit, rad or deg, and coordinate: root_roll, root_pitch or root_yaw"
+            )
         if self.unwrap and (si_unit != "rad" or self.role not in ("observation", "action")):
             raise ValueError("unwrap is for observed or commanded angles: give the unit, rad or deg")
         if self.bounds is not None:
@@ -89,9 +99,10 @@ class Column:
             not isinstance(self.index, int) or isinstance(self.index, bool) or self.index < 0
         ):
             raise ValueError(f"index {self.index!r} must be a number of a column, counted from 0")
-        for name in ("derivative_of", "coordinate"):
-            if getattr(self, name) is not None and self.role != "observation":
-                raise ValueError(f"{name} is for observations only")
+        if self.derivative_of is not None and self.role != "observation":
+            raise ValueError("derivative_of is for observations only")
+        if self.coordinate is not None and self.role not in ("observation", "euler"):
+            raise ValueError("coordinate is for observations only")
         is_plain = (self.index, self.unwrap, self.unit, self.scale, self.offset) == (None, False, "1", 1.0, 0.0)
         if self.derivative_of is not None and not is_plain:
             raise ValueError("a column with derivative_of is not in the file: omit index, unit, scale, offset, unwrap")
@@ -179,6 +190,7 @@ class LogColumns:
         for name, count in Counter(column.name for column in self.columns).items():
             if count > 1:
                 raise ValueError(f"the column name {name!r} occurs {count} times")
+        self._add_quaternion()
         for role in ("observation", "action"):
             names = self._names(role)
             if not names and not (role == "action" and self.free_motion):
@@ -240,10 +252,31 @@ class LogColumns:
             if position not in positions:
                 raise ValueError(f"{name}: derivative_of {position!r} must be one of the observations {positions}")
 
+    def _add_quaternion(self) -> None:
+        """Adds the quaternion of a free joint whose Euler angles the log has."""
+        angles = [column.coordinate or "" for column in self.columns if column.role == "euler"]
+        joints = {coordinate.rpartition("_")[0] for coordinate in angles}
+        if angles and sorted(angles) != sorted(f"{min(joints)}_{name}" for name in EULER):
+            raise ValueError(f"three columns have the role euler, one for each of {', '.join(EULER)} of the same joint")
+        known = {column.name for column in self.columns}
+        names = [f"{joint}_q{axis}" for joint in joints for axis in "wxyz"]
+        added = tuple(Column(name, "observation", is_quaternion=True) for name in names if name not in known)
+        object.__setattr__(self, "columns", self.columns + added)
+
+    @property
+    def euler(self) -> tuple[str, ...]:
+        """The columns of roll, pitch and yaw; empty if there are none."""
+        own = {
+            (column.coordinate or "").rpartition("_")[2]: column.name
+            for column in self.columns
+            if column.role == "euler"
+        }
+        return tuple(own[name] for name in EULER) if own else ()
+
     @property
     def in_file(self) -> tuple[Column, ...]:
-        """The columns that are in the file: all but estimated velocities."""
-        return tuple(column for column in self.columns if column.derivative_of is None)
+        """The columns that are in the file: all but estimated velocities and computed quaternions."""
+        return tuple(one for one in self.columns if one.derivative_of is None and not one.is_quaternion)
 
     @property
     def by_index(self) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from tensordict import TensorDictBase
 from torchrl import torchrl_logger
 
@@ -35,8 +36,13 @@ def observe(table: LogTable, layout: LogColumns, links: Links) -> tuple[np.ndarr
     columns, stds = [], []
     known = np.ones(len(table.rows), bool)
     units = {column.name: to_si(column.unit)[0] for column in layout.columns}
+    quaternion = _quaternion(table, layout)
     for name in layout.observation:
         position = layout.derivatives.get(name)
+        if name in quaternion:
+            columns.append(quaternion[name])
+            stds.append(0.0)
+            continue
         if position is None:
             columns.append(table.columns([name])[:, 0])
             stds.append(0.0)
@@ -58,6 +64,19 @@ def observe(table: LogTable, layout: LogColumns, links: Links) -> tuple[np.ndarr
     if not len(kept.start):
         raise DataError("no two rows have an estimated velocity", "record longer runs", source=table.source)
     return np.stack(columns, axis=1), stds, kept
+
+
+def _quaternion(table: LogTable, layout: LogColumns) -> dict[str, np.ndarray]:
+    """The numbers w, x, y and z of the quaternion of a free joint from its Euler angles, by their names.
+
+    The angles turn about z, then the new y, then the new x, as those of ROS and of aerospace do (yaw, pitch, roll).
+    """
+    if not layout.euler:
+        return {}
+    angles = table.columns(layout.euler)
+    turned = Rotation.from_euler("ZYX", angles[:, ::-1]).as_quat(scalar_first=True)
+    names = [column.name for column in layout.columns if column.is_quaternion]
+    return {name: turned[:, "wxyz".index(name[-1])] for name in names}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from torchrl_h2o.data.readers.guess.contents import Contents
-from torchrl_h2o.data.readers.guess.free_body import ORIENTATION, RATE
+from torchrl_h2o.data.readers.guess.free_body import EULER, ORIENTATION, RATE
 from torchrl_h2o.data.readers.guess.roles import Guess, kind_of_joint, words_of
 
 
@@ -63,7 +63,7 @@ def coordinates_of(
         model,
         in_order=not found,
     )
-    observed = ("position", "velocity", ORIENTATION, RATE)
+    observed = ("position", "velocity", ORIENTATION, EULER, RATE)
     found |= {
         column.name: of_body[column.name] for column in columns if column.name in of_body and column.kind in observed
     }

@@ -11,6 +11,7 @@ from torchrl_h2o.data.readers.guess.roles import Guess, without_unit, words_of
 from torchrl_h2o.data.readers.units import to_si
 
 PLACE, ORIENTATION, VELOCITY, RATE = "position", "orientation", "velocity", "angular velocity"
+EULER = "euler"
 _AXES = {PLACE: "xyz", ORIENTATION: "wxyz", VELOCITY: "xyz", RATE: "xyz"}
 _UNITS = {PLACE: "m", ORIENTATION: "1", VELOCITY: "m/s", RATE: "rad/s"}
 _LETTERS = {"p": PLACE, "q": ORIENTATION, "v": VELOCITY, "w": RATE}  # px, qw, vx, wx
@@ -48,7 +49,7 @@ class FreeBody:
 def free_body(
     columns: Sequence[Guess], values: Mapping[str, np.ndarray | None], coordinates: Sequence[str]
 ) -> FreeBody:
-    """Find the columns of a model's free joint by their names, if it has one such joint and the log its quaternion.
+    """Find the columns of a model's free joint by their names, if it has one such joint and the log its orientation.
 
     Args:
         columns: what each column may be.
@@ -69,7 +70,9 @@ def free_body(
     joints = [name.removesuffix("_qw") for name in coordinates if name.endswith("_qw")]
     joints = [joint for joint in joints if f"{joint}_x" in coordinates]  # a ball joint has no place
     groups = _groups(columns, values) if len(joints) == 1 else {}
-    if ORIENTATION not in groups:
+    if len(joints) == 1 and ORIENTATION not in groups:
+        groups |= _euler(columns)
+    if ORIENTATION not in groups and EULER not in groups:
         return FreeBody(list(columns), {})
     found = {
         name: (kind, axis, _coordinate(joints[0], kind, axis))
@@ -106,6 +109,17 @@ def _groups(columns: Sequence[Guess], values: Mapping[str, np.ndarray | None]) -
     return {kind: groups[0] for kind, groups in whole.items() if groups}
 
 
+def _euler(columns: Sequence[Guess]) -> dict[str, dict[str, str]]:
+    """The columns of roll, pitch and yaw by these names, of one beginning."""
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for column in columns:
+        words = words_of(without_unit(column.name)[0])
+        if words and words[-1] in _TURNS.values() and column.kind == "position" and not set(words) & set(_NO_STATE):
+            found.setdefault(tuple(words[:-1]), {}).setdefault(words[-1], column.name)
+    whole = [names for _, names in sorted(found.items(), key=lambda one: len(one[0])) if len(names) == len(_TURNS)]
+    return {EULER: whole[0]} if whole else {}
+
+
 def _is_quaternion(numbers: Sequence[np.ndarray | None]) -> bool:
     quaternion = np.stack([np.asarray(each) for each in numbers])
     return bool(np.nanmedian(np.abs((quaternion**2).sum(0) - 1.0)) <= 0.1)
@@ -132,14 +146,16 @@ def _kind_and_axis(column: Guess) -> tuple[str | None, str, tuple[str, ...]]:
 
 
 def _coordinate(joint: str, kind: str, axis: str) -> str:
-    if kind == ORIENTATION:
-        return f"{joint}_q{axis}"
+    if kind in (ORIENTATION, EULER):
+        return f"{joint}_q{axis}" if kind == ORIENTATION else f"{joint}_{axis}"
     return {PLACE: f"{joint}_{axis}", VELOCITY: f"{joint}_{axis}_velocity"}.get(
         kind, f"{joint}_{_TURNS[axis]}_velocity"
     )
 
 
 def _of_body(column: Guess, kind: str, axis: str) -> Guess:
+    if kind == EULER:
+        return replace(column, kind=kind, note=f"turns about z, then y, then x: check the order; {column.note}")
     unit = column.unit if to_si(column.unit)[0] == _UNITS[kind] else _UNITS[kind]
     stem = f"free body {axis}" if kind in (PLACE, VELOCITY) else ""
     note = "; ".join(filter(None, [_NOTES.get(kind, ""), column.note if kind != ORIENTATION else ""]))

@@ -274,7 +274,7 @@ def _checked(
         unit = f"{to_si(units[position])[0]}/s"
     coordinate = found.get(column.name)
     if coordinate is not None and model is not None:
-        if to_si(unit)[0] != to_si(model.units[coordinate])[0]:
+        if to_si(unit)[0] != to_si(model.units.get(coordinate, unit))[0]:
             unit = model.units[coordinate]
         note = f"{coordinate} of the model; {note}".rstrip("; ")
     if position is not None and (slope := slopes.of(position, column.name, units[position])) is not None:

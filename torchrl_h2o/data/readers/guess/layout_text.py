@@ -63,7 +63,7 @@ def layout_text(
             role, note = "ignore", f"a {role}; the role is action if the model's actuators are servos"
         elif role == "unknown":
             role, note = "ignore", note or "not recognised: observation, action or ignore?"
-        unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time") else ""
+        unit = f', unit: "{column.unit}"' if role in ("observation", "action", "time", "euler") else ""
         unit += "" if column.scale == 1.0 else f", scale: {column.scale:.6g}"
         unit += "" if column.offset == 0.0 else f", offset: {column.offset:.6g}"
         if role in ("observation", "action") and is_wrapped(contents.values.get(column.name), column.unit):
