@@ -32,6 +32,7 @@ from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.options import CloseTheLoopOptions
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
+from torchrl_h2o.residuals.report.export import export
 from torchrl_h2o.residuals.report.json_file import write_json
 from torchrl_h2o.residuals.report.mended_model import FILE, save_mended_model
 from torchrl_h2o.residuals.report.sentence import sentences
@@ -115,6 +116,9 @@ def main(cfg: DictConfig) -> None:
     if report.mended_model is None or report.mended_model.file is None:
         (directory / FILE).unlink(missing_ok=True)  # of an earlier run, with other effects
     print_files(report, directory)
+    if cfg.export is not None:
+        files = export(report, simulation, cfg.export)
+        print(f"export     {', '.join(str(path) for path in files)}")
 
 
 def minutes_left(minutes: float | None, begin: float) -> float | None:

@@ -79,4 +79,5 @@ class CloseTheLoopOptions(Options):
     start_from: AnyPath | None = option(None, "report.json of an unfinished run, with whose effects the search begins")
     minutes: Positive | None = option(None, "for the command, with the audit and the report; null: as long as it takes")
     catalogue: Pattern | list[Pattern] | None = option(None, "effects to try, as patterns: [Gravity,Joint*]; null: all")
+    export: str | None = option(None, "folder for the ranges of the values, for domain randomisation in other projects")
     seed: Seed = option(0)

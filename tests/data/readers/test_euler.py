@@ -59,7 +59,8 @@ def test_the_euler_angles_of_a_free_body_are_guessed(tmp_path):
     header = ",".join(("t", *names))
     np.savetxt(tmp_path / "fly.csv", np.stack([time, *moving], 1), delimiter=",", header=header, comments="")
     text = guess_layout(tmp_path / "fly.csv", DRONE)
-    assert '"imu_yaw", role: euler, unit: "rad", coordinate: "root_yaw"}  # root_yaw of the model; turns about z, then y, then x' in text
+    assert '"imu_yaw", role: euler, unit: "rad", coordinate: "root_yaw"}' in text
+    assert "# root_yaw of the model; turns about z, then y, then x" in text
     layout = LogColumns.load(yaml.safe_load(text))
     assert set(FREE) <= set(layout.coordinates.values())
     assert renamed(text)["x"] == "root_x"

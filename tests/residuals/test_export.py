@@ -1,0 +1,172 @@
+"""Ranges for domain randomisation in other projects: their values, what changes together, and that they read back."""
+
+import ast
+import csv
+import importlib.util
+import json
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from torchrl_h2o.effects import (
+    ActionDelay,
+    Armature,
+    BodyMass,
+    Gravity,
+    JointDamping,
+    JointFrictionLoss,
+    ServoStiffness,
+)
+from torchrl_h2o.residuals import Report, Simulation
+from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
+from torchrl_h2o.residuals.report.export import export, model_ranges
+
+MODEL = """<mujoco><worldbody><body name="upper"><joint name="hip" axis="0 1 0" damping="0.1"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="1"/>
+  <body name="lower" pos="0 0 -0.3"><joint name="knee" axis="0 1 0" damping="0.1"/>
+  <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.2" mass="0.5"/></body></body></worldbody>
+  <actuator><position name="hip_servo" joint="hip" kp="20"/>
+  <position name="knee_servo" joint="knee" kp="20"/></actuator>
+</mujoco>"""
+
+
+@pytest.fixture
+def simulation(tmp_path):
+    (tmp_path / "leg.xml").write_text(MODEL)
+    return Simulation.from_mjcf(tmp_path / "leg.xml", ["hip", "hip_velocity"], 0.01)
+
+
+def report(*found):
+    parts = [FoundEffect(effect, declared=True, ci95=ci95, error_after=0.01) for effect, ci95 in found]
+    return Report(simulator="leg", data=DataSummary("log.csv", 5000, 1500), found=tuple(parts))
+
+
+FOUND = (
+    (JointDamping(0.2, "*"), {"damping": (0.1, 0.3)}),
+    (JointFrictionLoss(0.05, "knee"), {"torque": (0.04, 0.06)}),
+    (Armature(0.01, "hip"), {"inertia": (0.008, 0.012)}),
+    (BodyMass(1.2, "lower"), {"scale": (1.1, 1.3)}),
+    (ServoStiffness(0.9), {"scale": (0.8, 1.0)}),
+    (ActionDelay(0.005), {"delay": (0.004, 0.006)}),
+    (Gravity(0.98), {"scale": (0.97, 0.99)}),
+)
+
+
+def test_ranges_are_those_of_the_model_s_numbers(simulation):
+    found = {(one.field, one.element, one.index): one for one in model_ranges(report(*FOUND), simulation)}
+    damping = found["dof_damping", "knee", (1,)]
+    assert (damping.nominal, damping.mended) == pytest.approx((0.1, 0.3))
+    assert (damping.low, damping.high) == pytest.approx((0.2, 0.4), abs=0.02)
+    mass = found["body_mass", "lower", (2,)]
+    assert (mass.nominal, mass.mended) == pytest.approx((0.5, 0.6))
+    assert (mass.low, mass.high) == pytest.approx((0.55, 0.65), abs=0.01)
+    assert ("dof_frictionloss", "hip", (0,)) not in found
+    assert ("dof_armature", "hip", (0,)) in found
+
+
+def test_numbers_of_one_cause_are_of_one_group(simulation):
+    found = {(one.field, one.element): one for one in model_ranges(report(*FOUND), simulation)}
+    gain, bias = found["actuator_gainprm", "hip_servo"], found["actuator_biasprm", "hip_servo"]
+    assert gain.group == bias.group == found["actuator_gainprm", "knee_servo"].group
+    assert gain.ends == pytest.approx([-end for end in bias.ends])  # the stiffness stands in both
+    assert found["body_mass", "lower"].group == found["body_inertia", "lower"].group
+    groups = {
+        found[key].group for key in (("dof_damping", "hip"), ("dof_frictionloss", "knee"), ("body_mass", "lower"))
+    }
+    assert len(groups) == 3
+
+
+def test_nothing_is_written_of_what_no_effect_changes(simulation):
+    assert model_ranges(report((ActionDelay(0.005), {"delay": (0.004, 0.006)})), simulation) == []
+
+
+def test_the_files_hold_all_effects(simulation, tmp_path):
+    files = {path.name: path for path in export(report(*FOUND), simulation, tmp_path / "out")}
+    assert list(files) == ["ranges.json", "playground.py", "mjlab.py", "isaaclab.py", "joints.csv"]
+    content = json.loads(files["ranges.json"].read_text())
+    outside = {one["kind"]: (one["value"], one["low"], one["high"]) for one in content["outside_the_model"]}
+    assert outside == {"ActionDelay": (0.005, 0.004, 0.006), "Gravity": (0.98, 0.97, 0.99)}
+    assert {one["element"] for one in content["model"]} == {"hip", "knee", "lower", "hip_servo", "knee_servo"}
+    with files["joints.csv"].open() as file:
+        rows = {row["joint"]: row for row in csv.DictReader(file)}
+    assert float(rows["hip"]["damping (N·m·s/rad)"]) == pytest.approx(0.3)
+    assert float(rows["hip"]["delay (s)"]) == 0.005
+    assert rows["hip"]["frictionloss (N·m)"] == ""
+    for name in ("playground.py", "mjlab.py", "isaaclab.py"):
+        assert "# not here: all actuators late by 0.005 s (delay 0.004 to 0.006)" in files[name].read_text()
+
+
+def test_the_table_for_playground_gives_possible_models(simulation, tmp_path):
+    text = export(report(*FOUND), simulation, tmp_path)[1].read_text()
+    tree = {node.targets[0].id: node.value for node in ast.parse(text).body if isinstance(node, ast.Assign)}
+    ranges, causes = ast.literal_eval(tree["RANGES"]), ast.literal_eval(tree["CAUSES"])
+    model, share = simulation.model, np.random.default_rng(0).uniform(size=causes)
+    for field, own in ranges.items():
+        for index, (cause, begin, end) in own.items():
+            getattr(model, field)[index] = begin + share[cause] * (end - begin)
+    assert model.actuator_gainprm[:, 0].tolist() == (-model.actuator_biasprm[:, 1]).tolist()
+    assert 0.2 < model.dof_damping[0] == model.dof_damping[1] < 0.4
+
+
+def load(path):
+    spec = importlib.util.spec_from_file_location(path.stem + "_export", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_playground_draws_models(simulation, tmp_path):
+    jax = pytest.importorskip("jax")
+    mjx = pytest.importorskip("mujoco.mjx")
+    module = load(export(report(*FOUND), simulation, tmp_path)[1])
+    model = mjx.put_model(simulation.model)
+    drawn, axes = module.domain_randomize(model, jax.random.split(jax.random.PRNGKey(0), 5))
+    assert drawn.dof_damping.shape == (5, 2)
+    assert axes.dof_damping == 0
+    assert axes.opt.timestep is None
+    assert np.ptp(np.asarray(drawn.dof_damping)[:, 0]) > 0.0
+    assert np.asarray(drawn.actuator_gainprm)[:, 0, 0] == pytest.approx(-np.asarray(drawn.actuator_biasprm)[:, 0, 1])
+
+
+@pytest.mark.parametrize("name", ["mjlab", "isaaclab"])
+def test_terms_of_events_have_the_names_and_ranges(simulation, tmp_path, monkeypatch, name):
+    """The projects need a GPU's packages, so their constructors are replaced by ones that keep their arguments."""
+    path = next(path for path in export(report(*FOUND), simulation, tmp_path) if path.stem == name)
+
+    def record(*args, **kwargs):
+        return (*args, kwargs)
+
+    names = types.SimpleNamespace
+    functions = type("Functions", (), {"__getattr__": lambda self, function: function})()
+    modules = {
+        "mjlab.envs.mdp": names(dr=functions),
+        "mjlab.managers.event_manager": names(EventTermCfg=record),
+        "mjlab.managers.scene_entity_config": names(SceneEntityCfg=record),
+        "isaaclab.envs": names(mdp=functions),
+        "isaaclab.envs.mdp": functions,
+        "isaaclab.managers": names(EventTermCfg=record, SceneEntityCfg=record),
+    }
+    for module in ("mjlab", "mjlab.envs", "mjlab.managers", "isaaclab"):
+        modules.setdefault(module, names())
+    modules["isaaclab"] = names(envs=modules["isaaclab.envs"])
+    for module, content in modules.items():
+        monkeypatch.setitem(sys.modules, module, content)
+    events = load(path).events
+    terms = [(one["func"], one["params"]) for (one,) in events.values()]
+    assert all(one["mode"] == "startup" for (one,) in events.values())
+    if name == "mjlab":
+        damping = next(params for function, params in terms if function == "joint_damping")
+        assert damping["asset_cfg"] == ("robot", {"joint_names": ("hip", "knee")})
+        assert damping["ranges"] == pytest.approx((0.2, 0.4), abs=0.02)
+        assert (damping["operation"], damping["shared_random"]) == ("abs", True)
+        mass = next(params for function, params in terms if function == "pseudo_inertia")
+        assert np.exp(2.0 * np.array(mass["alpha_range"])) == pytest.approx([1.1, 1.3], abs=0.02)
+    else:
+        found = {function: params for function, params in terms if params["asset_cfg"][1] == {"joint_names": "knee"}}
+        assert found["randomize_joint_parameters"]["friction_distribution_params"] == pytest.approx(
+            (0.04, 0.06), abs=0.003
+        )
+        assert found["randomize_actuator_gains"]["damping_distribution_params"] == pytest.approx((0.2, 0.4), abs=0.02)
+        assert "randomize_rigid_body_mass" in dict(terms)
