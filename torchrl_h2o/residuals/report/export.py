@@ -222,12 +222,13 @@ def _playground(fields: Sequence[FieldRange], outside: Sequence[EffectRange]) ->
             for one in rows
         )
         tables.append(f'    "{field}": {{\n{inner}    }},\n')
+    rest = _rest(fields, outside, list(FIELDS))
     return f'''"""Domain randomisation for MuJoCo Playground: give domain_randomize to training as randomization_fn."""
 
 import jax
 import jax.numpy as jp
 
-{_rest(fields, outside, list(FIELDS))}# by field and index: the cause, and the ends of the range. Numbers of one cause change together.
+{rest}# by field and index: the cause, and the ends of the range; numbers of one cause change together
 RANGES = {{
 {"".join(tables)}}}
 CAUSES = {1 + max((one.group for one in fields), default=-1)}
