@@ -294,6 +294,32 @@ def test_an_effect_whose_interval_holds_its_neutral_value_is_left_out_of_the_las
         assert len(half_widths) == len(truth)
 
 
+def together(parts):
+    """Several logs, a run each, as one recording."""
+    arrays = ("observation", "action", "following", "time", "usable", "split")
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    log = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return replace(parts[0], **whole, run=log, log=log)
+
+
+def test_the_interval_of_several_logs_holds_the_values_of_each():
+    """The damping of a machine that warms up differs between logs by far more than the noise within one says."""
+    effect, ends = JointDamping(0.03, "elbow"), []
+    for dampings in ((0.02, 0.03, 0.04), (0.03, 0.03, 0.03)):
+        logs = [
+            recorded(SIMULATION.with_effects(JointDamping(damping, "elbow")), 800, noise=0.01, seed=seed)
+            for seed, damping in enumerate(dampings)
+        ]
+        ground = Ground.of(SIMULATION, together(logs))
+        found, half_widths, _ = with_intervals(ground, ground.found([entry_of(effect, CATALOGUE)], [effect]), [])
+        ends.append((found.effects[0].damping, half_widths[0]["damping"]))
+    (value, half), (same, narrow) = ends
+    assert same == pytest.approx(0.03, abs=3.0 * narrow)
+    assert 0.02 < half < 0.1
+    assert value - half < 0.02 < 0.04 < value + half
+    assert narrow < 0.1 * half
+
+
 def test_a_search_goes_on_from_known_effects():
     truth, first = (Gravity(1.3), ActionDelay(0.013)), []
     measured = recorded(SIMULATION.with_effects(*truth), 1200)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import lsq_linear
+from scipy.stats import t as student
 
 from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
 from torchrl_h2o.likelihood import TAIL, log_density
@@ -84,14 +86,24 @@ class SetFit:
     Args:
         effects: the effects with their fitted values.
         half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
+        scatter: half-width, in quadrature beside these, by which the value in another log of the machine may differ.
         slopes: derivatives of the errors by the values, (N, p) for each part.
         score: mean score of the blocks, in nats.
     """
 
     effects: tuple[Effect, ...]
     half_widths: tuple[dict[str, float], ...]
+    scatter: tuple[dict[str, float], ...]
     slopes: Slopes
     score: float
+
+    @property
+    def in_another_log(self) -> tuple[dict[str, float], ...]:
+        """Half-widths of the intervals of the values in another log."""
+        return tuple(
+            {name: math.hypot(half, scatter[name]) for name, half in own.items()}
+            for own, scatter in zip(self.half_widths, self.scatter, strict=True)
+        )
 
 
 def variables_of(
@@ -175,12 +187,14 @@ def fit_set(
         if gain < SMALLEST_GAIN:
             break
     widths: tuple[dict[str, float], ...] = tuple({} for _ in effects)
+    scatter: tuple[dict[str, float], ...] = tuple({} for _ in effects)
     if intervals and variables:
         slopes = slopes_of(parts, effects, variables, errors)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
-        for variable, half in zip(variables, _half_widths(parts, weighted, slopes), strict=True):
+        for variable, half, between in zip(variables, *_half_widths(parts, weighted, slopes), strict=True):
             widths[variable.effect][variable.name] = half * abs(variable.slope(0.0))
-    return SetFit(effects, widths, slopes, float(by_block.mean()))
+            scatter[variable.effect][variable.name] = between * abs(variable.slope(0.0))
+    return SetFit(effects, widths, scatter, slopes, float(by_block.mean()))
 
 
 def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:
@@ -273,18 +287,93 @@ def _step(parts: Sequence[Whitened], slopes: Slopes, variables: Sequence[Variabl
     return best
 
 
-def _half_widths(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Slopes) -> np.ndarray:
-    """Half-widths of the variables' 95 % intervals: a sandwich estimate with each block as one observation."""
-    curvature, scatter, blocks = 0.0, 0.0, 0
+def _half_widths(
+    parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Slopes
+) -> tuple[np.ndarray, np.ndarray]:
+    """Half-widths of the variables' 95 % intervals, a sandwich estimate with each block as one observation, (p,).
+
+    Of several logs also, in quadrature, what the scatter between them adds for the value in another log; else 0.
+    """
+    size = slopes[0].shape[1]
+    by_log: dict[int, _Normal] = {}
     for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
         scaled, weight = slope * inverse[:, None], share * weights(white)
-        curvature = curvature + scaled.T @ (weight[:, None] * scaled)
-        pulls = np.zeros((len(part.blocks), slope.shape[1]))
-        np.add.at(pulls, block_of(part), scaled * (weight * white)[:, None])
-        scatter, blocks = scatter + pulls.T @ pulls, blocks + len(pulls)
-    bread = np.linalg.pinv(np.atleast_2d(curvature))
-    spare = blocks / max(1, blocks - len(bread))
-    return CONFIDENCE * np.sqrt(np.maximum(np.diag(bread @ np.atleast_2d(scatter) @ bread) * spare, 0.0))
+        block, log = block_of(part), part.record.measured.log
+        log_of = np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first]
+        for index in np.unique(log_of):
+            rows, own = log_of[block] == index, np.flatnonzero(log_of == index)
+            pulls = np.zeros((len(part.blocks), size))
+            np.add.at(pulls, block[rows], scaled[rows] * (weight * white)[rows, None])
+            curvature = scaled[rows].T @ (weight[rows, None] * scaled[rows])
+            by_log[index] = by_log.get(index, _Normal.nothing(size)).beside(curvature, pulls[own])
+    together = _Normal.nothing(size)
+    for one in by_log.values():
+        together = together.beside(one.curvature, one.pulls)
+    half, logs = CONFIDENCE * np.sqrt(together.variance), len(by_log)
+    if logs == 1:
+        return half, np.zeros(size)
+    each = [(one.move, one.variance) for one in by_log.values()]
+    between = scatter_between(*map(np.stack, zip(*each, strict=True)))
+    return half, student.ppf(0.975, logs - 1) * np.sqrt(between * (1.0 + 1.0 / logs))
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations of a fit's variables.
+
+    Args:
+        curvature: (p, p).
+        pulls: gradient of each block, (B, p).
+    """
+
+    curvature: np.ndarray
+    pulls: np.ndarray
+
+    @classmethod
+    def nothing(cls, size: int) -> _Normal:
+        return cls(np.zeros((size, size)), np.zeros((0, size)))
+
+    def beside(self, curvature: np.ndarray, pulls: np.ndarray) -> _Normal:
+        return _Normal(self.curvature + curvature, np.concatenate([self.pulls, pulls]))
+
+    @cached_property
+    def _bread(self) -> np.ndarray:
+        return np.linalg.pinv(self.curvature)
+
+    @property
+    def move(self) -> np.ndarray:
+        """The move of the variables, (p,), to the best values of these rows alone, if the errors are linear."""
+        return -self._bread @ self.pulls.sum(0)
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Squared standard errors of the variables, (p,), from the scatter between blocks."""
+        blocks, size = self.pulls.shape
+        spare = blocks / max(1, blocks - size)
+        covariance = self._bread @ self.pulls.T @ self.pulls @ self._bread
+        return np.maximum(np.diag(covariance) * spare, 0.0)
+
+
+def scatter_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Variance between logs of values that are known with errors, (p,).
+
+    R. DerSimonian and N. Laird, *Meta-analysis in clinical trials*, Controlled Clinical Trials 7 (1986), 177-188.
+
+    Args:
+        values: the values in each log, (logs, p).
+        variances: squared standard errors of these, (logs, p).
+
+    Examples:
+        >>> import numpy as np
+        >>> errors = np.full((3, 2), 0.01)
+        >>> scatter_between(np.array([[1.0, 0.0], [2.0, 0.1], [3.0, -0.1]]), errors).round(2).tolist()
+        [0.99, 0.0]
+    """
+    weight = 1.0 / np.maximum(variances, 1e-300)
+    total = weight.sum(0)
+    mean = (weight * values).sum(0) / total
+    excess = (weight * (values - mean) ** 2).sum(0) - (len(values) - 1)
+    return np.maximum(excess / np.maximum(total - (weight**2).sum(0) / total, 1e-300), 0.0)
 
 
 def interval(parameter: Parameter, half_width: float) -> tuple[float, float]:

@@ -241,6 +241,8 @@ def with_intervals(
 ) -> tuple[Found, Sequence[Mapping[str, float]], Sequence[Sequence[Found]]]:
     """A set fitted to the rows for fits and for selection, with half-widths of its intervals, and its alternatives.
 
+    Of several logs, an interval is that of the value in another log of the machine: it holds the scatter between logs.
+
     Every horizon counts alike in this fit: values hold for simulations of any length, and small errors in the many
     short windows do not outweigh large ones far ahead. Effects whose interval holds their neutral value are left out,
     the least certain ones first, while there is time. What several joints or motors have, such as friction, is left out
@@ -281,7 +283,7 @@ def with_intervals(
             if entry.name not in idle
         ]
         found, fit = fewer, refit
-    return replace(found, effects=fit.effects), fit.half_widths, alike
+    return replace(found, effects=fit.effects), fit.in_another_log, alike
 
 
 def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:

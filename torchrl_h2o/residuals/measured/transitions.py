@@ -68,6 +68,7 @@ class Measured:
         estimated_std: (n), standard deviation of the errors of columns that were estimated from others, such as
             velocities from positions, and 0 for measured ones; None if all were measured.
         block: neighbouring windows that are kept or left out together.
+        log: (T,), index of the log of each transition; None for one log.
     """
 
     observation: np.ndarray
@@ -81,6 +82,7 @@ class Measured:
     source: str
     estimated_std: np.ndarray | None = None
     block: int = 1
+    log: np.ndarray | None = None
     _results: OrderedDict[tuple[Hashable, Simulation | None], Any] = field(
         default_factory=OrderedDict, init=False, repr=False
     )
@@ -135,6 +137,7 @@ class Measured:
             str(source),
             _rms(_float64(data["observation_std"])) if "observation_std" in data.keys() else None,
             WINDOWS_IN_BLOCK if simulation.state_map.hidden else 1,
+            logs,
         )
         if not simulation.state_map.hidden:
             return measured
