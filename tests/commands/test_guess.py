@@ -177,7 +177,7 @@ def test_a_place_that_cannot_be_written_is_named(folder):
 def test_columns_of_one_run_in_several_files_are_not_described_by_the_first(folder):
     for name in ("position", "effort"):
         np.savetxt(f"{name}.csv", np.stack([T, T], 1), delimiter=",", header=f"t,hip_{name}", comments="")
-    with pytest.raises(DataError, match="one run in 2 files; give data="):
+    with pytest.raises(DataError, match="one run in 2 files; give 'data="):
         guess_columns(["--guess", "data=[position.csv, effort.csv]"])
 
 

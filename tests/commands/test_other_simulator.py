@@ -50,8 +50,8 @@ def test_the_record_of_a_model_is_its_own_motion_and_not_that_of_another(models)
 
 
 def test_motors_move_their_joints_within_their_ranges(models):
-    td, layout = record_simulator("a.xml", 0.01, seed=0)
-    assert (layout.dt, layout.action) == (0.01, ("m1", "m2"))
+    td, layout = record_simulator("a.xml", "a.xml", 0.01, seed=0)
+    assert (layout.dt, layout.action) == (0.01, ("command of m1", "command of m2"))
     assert layout.observation == ("shoulder", "elbow", "shoulder_velocity", "elbow_velocity")
     assert len(td) == 2000
     assert bool(td["next", "truncated"][-1])
@@ -63,7 +63,7 @@ def test_motors_move_their_joints_within_their_ranges(models):
 
 
 def test_servos_follow_targets_about_their_pose(models):
-    td, _ = record_simulator("servos.xml", None, seed=0)
+    td, _ = record_simulator("servos.xml", "servos.xml", None, seed=0)
     largest = td["action"].abs().amax(0)
     assert largest.tolist() == pytest.approx([TURN, TURN * 0.4], rel=1e-3)
     follows = torch.corrcoef(torch.stack([td["action"][:, 0], td["observation"][:, 0]]))[0, 1]
@@ -71,7 +71,7 @@ def test_servos_follow_targets_about_their_pose(models):
 
 
 def test_the_phases_are_those_of_the_seed(models):
-    first, again, other = (record_simulator("a.xml", 0.01, seed)[0]["action"] for seed in (0, 0, 1))
+    first, again, other = (record_simulator("a.xml", "a.xml", 0.01, seed)[0]["action"] for seed in (0, 0, 1))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -80,3 +80,29 @@ def test_a_second_simulator_needs_a_first_one(models):
     cfg = composed("close_the_loop", "data=a.xml", folder=COMMANDS)
     with pytest.raises(ValueError, match=r"data=a\.xml is a second simulator: give simulator=robot\.xml"):
         read_recording(cfg)
+
+
+def test_actuators_are_matched_by_name_or_else_by_joint(models, tmp_path):
+    """Unnamed motors in another order would move another joint without a word."""
+    swapped = """<motor joint="elbow" gear="2" ctrlrange="-0.2 0.4"/><motor joint="shoulder"/>"""
+    (tmp_path / "c.xml").write_text(ARM.format(damping=0.05, actuators=swapped))
+    assert largest_residual(*recorded("data=c.xml")) < 1e-5
+    (tmp_path / "few.xml").write_text(ARM.format(damping=0.05, actuators='<motor joint="elbow"/>'))
+    with pytest.raises(ValueError, match=r"the actuators of few\.xml, elbow, are not those of a\.xml, shoulder, elbow"):
+        recorded("data=few.xml")
+    with pytest.raises(ValueError, match=r"shoulder is a position servo in servos\.xml and a motor in a\.xml"):
+        recorded("data=servos.xml")
+
+
+def test_commands_fit_the_gain_of_a_motor_and_the_speed_of_a_velocity_servo(models, tmp_path):
+    sizes = []
+    for actuators in (
+        """<general joint="shoulder" gainprm="100"/>""",
+        """<motor joint="shoulder"/>""",
+        """<velocity joint="shoulder" kv="1"/>""",
+    ):
+        (tmp_path / "d.xml").write_text(ARM.format(damping=0.05, actuators=actuators))
+        td, _ = record_simulator("d.xml", "d.xml", 0.01, seed=0)
+        sizes.append(float(td["action"].abs().max()))
+    assert sizes[1] == pytest.approx(100.0 * sizes[0], rel=1e-3)
+    assert sizes[2] == pytest.approx(TURN, rel=1e-3)

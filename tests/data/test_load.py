@@ -175,6 +175,17 @@ def test_tensors_of_torch_are_read_by_name(tmp_path):
     assert td["action"][:, 0].tolist() == angle.half()[:-1].tolist()
 
 
+def test_tensors_that_are_no_numbers_of_the_file_are_refused(tmp_path):
+    path = tmp_path / "log.pt"
+    for values, said in (
+        (torch.zeros(1).expand(4 * 10**8), "states 3200000000 bytes of values"),
+        (torch.zeros(5, 5).to_sparse(), "tensors that are no plain numbers"),
+    ):
+        torch.save({"q": values}, path)
+        with pytest.raises(DataError, match=said):
+            load(path, columns="simple_pendulum")
+
+
 @pytest.mark.parametrize("protocol", [0, 2])
 def test_code_in_a_file_of_tensors_is_not_run(tmp_path, protocol):
     path, sign = tmp_path / "log.pt", tmp_path / "ran"

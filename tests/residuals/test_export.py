@@ -7,18 +7,22 @@ import json
 import sys
 import types
 
+import mujoco
 import numpy as np
 import pytest
 
 from torchrl_h2o.effects import (
     ActionDelay,
     Armature,
+    BodyInertia,
     BodyMass,
     Gravity,
     JointDamping,
     JointFrictionLoss,
+    Payload,
     ServoStiffness,
 )
+from torchrl_h2o.options.sources import require_folder
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
 from torchrl_h2o.residuals.report.export import export, model_ranges
@@ -90,10 +94,10 @@ def test_the_files_hold_all_effects(simulation, tmp_path):
     assert outside == {"ActionDelay": (0.005, 0.004, 0.006), "Gravity": (0.98, 0.97, 0.99)}
     assert {one["element"] for one in content["model"]} == {"hip", "knee", "lower", "hip_servo", "knee_servo"}
     with files["joints.csv"].open() as file:
-        rows = {row["joint"]: row for row in csv.DictReader(file)}
-    assert float(rows["hip"]["damping (N·m·s/rad)"]) == pytest.approx(0.3)
-    assert float(rows["hip"]["delay (s)"]) == 0.005
-    assert rows["hip"]["frictionloss (N·m)"] == ""
+        rows = {row["joint"]: {key: float(row[key]) for key in row if key != "joint"} for row in csv.DictReader(file)}
+    assert (rows["hip"]["damping"], rows["hip"]["armature"], rows["hip"]["delay"]) == pytest.approx((0.3, 0.01, 0.005))
+    assert rows["hip"]["friction"] == rows["hip"]["friction low"] == 0.0
+    assert rows["knee"]["friction low"] == pytest.approx(0.04, abs=0.003)
     for name in ("playground.py", "mjlab.py", "isaaclab.py"):
         assert "# not here: all actuators late by 0.005 s (delay 0.004 to 0.006)" in files[name].read_text()
 
@@ -170,3 +174,43 @@ def test_terms_of_events_have_the_names_and_ranges(simulation, tmp_path, monkeyp
         )
         assert found["randomize_actuator_gains"]["damping_distribution_params"] == pytest.approx((0.2, 0.4), abs=0.02)
         assert "randomize_rigid_body_mass" in dict(terms)
+
+
+def test_a_delay_of_one_motor_is_in_the_row_of_its_joint(simulation, tmp_path):
+    found = report((ActionDelay(0.005, actuators=(1,)), {"delay": (0.004, 0.006)}))
+    with export(found, simulation, tmp_path)[4].open() as file:
+        delays = {row["joint"]: float(row["delay"]) for row in csv.DictReader(file)}
+    assert delays == {"hip": 0.0, "knee": 0.005}
+
+
+def test_an_inertia_without_its_mass_is_named_where_it_cannot_be_written(simulation, tmp_path):
+    files = {
+        path.name: path.read_text() for path in export(report((BodyInertia(1.5, "lower"), {})), simulation, tmp_path)
+    }
+    for name in ("mjlab.py", "isaaclab.py"):
+        assert "# not here: body_inertia of lower (see ranges.json)" in files[name]
+    assert '"body_inertia"' in files["playground.py"]
+
+
+def test_inertias_are_along_the_axes_of_the_body_without_effects(simulation):
+    """A payload beside the axis of a link turns its principal axes, which the exported numbers do not hold."""
+    payload = Payload(0.4, x=0.1, z=-0.2, bodies="lower")
+    found = {
+        one.index: one.mended for one in model_ranges(report((payload, {})), simulation) if one.field == "body_inertia"
+    }
+    loaded, body = simulation.with_effects(payload).model, 2
+    matrices = []
+    for model in (simulation.model, loaded):
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, model.body_iquat[body])
+        matrices.append(matrix.reshape(3, 3))
+    turned = matrices[0].T @ matrices[1]
+    expected = np.diag(turned @ np.diag(loaded.body_inertia[body]) @ turned.T)
+    assert [found[body, axis] for axis in range(3)] == pytest.approx(expected.tolist())
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_the_search(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert require_folder(str(tmp_path / "new" / "ranges"))
+    with pytest.raises(ValueError, match=r"no folder can be made there, because .*file is a file"):
+        require_folder(str(tmp_path / "file" / "ranges"))

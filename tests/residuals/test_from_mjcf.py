@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchrl_h2o.effects import Gravity, JointDamping
+from torchrl_h2o.effects import BodyCentreOfMass, BodyInertia, Gravity, JointDamping, Payload
 from torchrl_h2o.residuals import Simulation, StateMap
 
 PENDULUM = Path(__file__).parents[2] / "recipes" / "models" / "simple_pendulum.xml"
@@ -128,6 +128,19 @@ def test_a_urdf_file_moves_without_its_meshes_by_a_motor_on_each_joint(tmp_path)
     start, commands = np.array([[0.3, -0.5]]), np.sin(np.arange(20.0))[None, :, None]
     ends = [arm.rollout(start, commands) for arm in arms]
     assert ends[0] == pytest.approx(ends[1], abs=1e-9)
+
+
+def test_effects_on_bodies_act_on_the_links_of_a_urdf_file(tmp_path):
+    """The link that stands still is a body of the specification, and must be one of the model."""
+    (tmp_path / "arm.urdf").write_text(URDF.format(upper=INERTIAL))
+    arm = Simulation.from_mjcf(tmp_path / "arm.urdf", ["shoulder", "shoulder_velocity"], 0.01)
+    for entry in arm.catalogue():
+        if isinstance(entry.effect, BodyInertia | BodyCentreOfMass | Payload):
+            changed = arm.with_effects(entry.starts[-1]).model
+            assert changed.nbody == arm.model.nbody
+            assert changed.body("upper").mass > 0.0
+    heavier = arm.with_effects(BodyInertia(2.0, "upper")).model
+    assert sorted(heavier.body("upper").inertia) == pytest.approx(sorted(2.0 * arm.model.body("upper").inertia))
 
 
 def test_a_moving_link_of_a_urdf_file_without_a_mass_is_named(tmp_path):

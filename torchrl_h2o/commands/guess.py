@@ -9,6 +9,7 @@ from typing import Literal
 
 import mujoco
 from omegaconf import OmegaConf
+from yaml import YAMLError
 
 from torchrl_h2o.data import DataError, sources_of
 from torchrl_h2o.data.readers.guess.contents import require_several_runs
@@ -44,7 +45,10 @@ def guess_columns(arguments: Sequence[str]) -> None:
         )
     data = given["data"]
     if data.startswith("{"):
-        logs = sources_of(dict(OmegaConf.create(data)))
+        try:
+            logs = sources_of(dict(OmegaConf.create(data)))
+        except YAMLError:
+            raise ValueError(f"data={data} is no mapping; write 'data={{position: a.csv, effort: b.csv}}'") from None
     else:
         logs = sources_of([part.strip() for part in data.strip("[]").split(",")])
     require_several_runs(logs)

@@ -12,7 +12,7 @@ from torchrl import torchrl_logger
 
 from torchrl_h2o.data import Column, LogColumns
 from torchrl_h2o.data.readers.ted import to_ted
-from torchrl_h2o.effects.model.servo import is_servo
+from torchrl_h2o.effects.model.servo import is_servo, is_velocity_servo
 from torchrl_h2o.residuals.simulation.model_file import read_model, read_spec
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.simulation.state_map import coordinate_names
@@ -21,9 +21,7 @@ MODELS = (".xml", ".urdf")
 SECONDS = 20.0  # of the recording
 STEP = 0.01  # s, control step, if none is given and the model's timestep is shorter
 FREQUENCIES = np.geomspace(0.1, 2.5, 8)  # Hz, of the sines in each command
-TURN = (
-    0.5  # amplitude of a servo's targets about its middle, in rad, m or half-ranges of its commands if those are less
-)
+TURN = 0.5  # amplitude of a servo's targets, in rad, rad/s, m, m/s or half-ranges of its commands if those are less
 ACCELERATION = 15.0  # rad/s² or m/s² to which the largest command of a motor without a range leads, beyond its weight
 
 
@@ -32,11 +30,14 @@ def is_model(source: object) -> bool:
     return isinstance(source, str) and source.lower().endswith(MODELS)
 
 
-def record_simulator(path: str | Path, control_step: float | None, seed: int) -> tuple[TensorDict, LogColumns]:
+def record_simulator(
+    path: str | Path, like: str | Path, control_step: float | None, seed: int
+) -> tuple[TensorDict, LogColumns]:
     """Records 20 s of a model that begins in its initial pose, under sums of sines on all actuators.
 
     Args:
         path: an MJCF or URDF file.
+        like: the model that is compared with it; the actions are in the order of its actuators.
         control_step: the time between two rows, in s.
         seed: seed of the sines' phases.
 
@@ -44,15 +45,15 @@ def record_simulator(path: str | Path, control_step: float | None, seed: int) ->
         The transitions, batch size (T,), of all coordinates, and the description of their columns.
 
     Raises:
-        ValueError: for a file that is not a model, or a simulation that diverges.
+        ValueError: for a file that is not a model, actuators that do not match, or a simulation that diverges.
     """
-    path = Path(path)
-    model, spec = read_model(path), read_spec(path)
+    path, like = Path(path), Path(like)
+    model = read_model(path)
+    order = matched_actuators(path, like)
     step = control_step or max(STEP, model.opt.timestep)
     names, units = coordinate_names(model)
     simulation = Simulation.from_mjcf(path, names, step)
-    servos = [is_servo(actuator) for actuator in spec.actuators]
-    actions = commands(model, servos, round(SECONDS / step), step, np.random.default_rng(seed))
+    actions = commands(model, _kinds(path), round(SECONDS / step), step, np.random.default_rng(seed))
     start = np.concatenate([model.qpos0, np.zeros(model.nv)])[None]
     states = np.concatenate([start, simulation.rollout(start, actions[None])[0]])
     if not np.isfinite(states).all():
@@ -61,26 +62,47 @@ def record_simulator(path: str | Path, control_step: float | None, seed: int) ->
     last = np.arange(len(actions)) == len(actions) - 1
     transitions = to_ted(
         observation=observed[:-1],
-        action=actions,
+        action=actions[:, order],
         next_observation=observed[1:],
         terminated=np.zeros(len(actions), bool),
         truncated=last,
     )
     transitions["time"] = step * torch.arange(len(actions), dtype=torch.float64)[:, None]
-    torchrl_logger.info(
-        f"{path}: recorded for {SECONDS:g} s under sines of {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g} Hz"
-    )
+    torchrl_logger.info(f"{path}: {SECONDS:g} s under sines of {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g} Hz")
     columns = [Column(name, "observation", unit) for name, unit in zip(names, units, strict=True)]
-    columns += [Column(model.actuator(i).name or f"actuator {i}", "action") for i in range(model.nu)]
+    columns += [Column(f"command of {_label(model, i)}", "action") for i in order]
     return transitions, LogColumns(tuple(columns), dt=step, free_motion=not model.nu)
 
 
-def commands(model: mujoco.MjModel, servos: list[bool], rows: int, step: float, rng: np.random.Generator) -> np.ndarray:
+def matched_actuators(path: Path, like: Path) -> list[int]:
+    """The actuators of one model in the order of another one's: by their names, or else by the joints that they move.
+
+    Raises:
+        ValueError: if there are others, or a servo in the place of a motor.
+    """
+    own, other = read_model(path), read_model(like)
+    for label in (_label, _moved):
+        labels, wanted = ([label(model, i) for i in range(model.nu)] for model in (own, other))
+        if sorted(labels) == sorted(wanted) and len(set(labels)) == len(labels):
+            break
+    else:
+        raise ValueError(
+            f"the actuators of {path}, {', '.join(labels) or 'none'}, are not those of {like}, "
+            f"{', '.join(wanted) or 'none'}; give them the same names"
+        )
+    order, kinds, others = [labels.index(name) for name in wanted], _kinds(path), _kinds(like)
+    for index, kind in zip(order, others, strict=True):
+        if kinds[index] != kind:
+            raise ValueError(f"{labels[index]} is a {kinds[index]} in {path} and a {kind} in {like}; make them alike")
+    return order
+
+
+def commands(model: mujoco.MjModel, kinds: list[str], rows: int, step: float, rng: np.random.Generator) -> np.ndarray:
     """Commands of all actuators: sums of sines with random phases, (rows, nu).
 
     Args:
         model: the model.
-        servos: whether each actuator is a position servo.
+        kinds: for each actuator, "position servo", "velocity servo" or "motor".
         rows: number of control steps.
         step: the control step in s.
         rng: random numbers for the phases.
@@ -92,12 +114,34 @@ def commands(model: mujoco.MjModel, servos: list[bool], rows: int, step: float, 
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     low, high = model.actuator_ctrlrange.T
-    half = np.where(model.actuator_ctrllimited.astype(bool), 0.5 * (high - low), np.inf)
+    limited = model.actuator_ctrllimited.astype(bool)
+    half = np.where(limited, 0.5 * (high - low), np.inf)
     moved = np.zeros((model.nu, model.nv))
     sparse = (data.moment_rownnz, data.moment_rowadr, data.moment_colind)
     mujoco.mju_sparse2dense(moved, data.actuator_moment, *sparse)
     load = np.abs(moved) @ (ACCELERATION * model.dof_M0 + np.abs(data.qfrc_bias))
-    force = load / np.maximum((moved**2).sum(1), 1e-12)
-    sizes = np.where(servos, np.minimum(TURN, TURN * half), np.minimum(force, half))
-    middle = np.where(servos, data.actuator_length, np.where(np.isfinite(half), np.nan_to_num(0.5 * (low + high)), 0.0))
-    return np.clip(middle + sizes * waves, middle - sizes, middle + sizes)
+    gain = np.abs(model.actuator_gainprm[:, 0]) * (moved**2).sum(1)
+    is_motor = np.array([kind == "motor" for kind in kinds], bool)
+    sizes = np.where(is_motor, np.minimum(load / np.maximum(gain, 1e-12), half), np.minimum(TURN, TURN * half))
+    at_rest = np.where([kind == "position servo" for kind in kinds], data.actuator_length, 0.0)
+    middle = np.where(is_motor & limited, 0.5 * (low + high), at_rest)
+    return middle + sizes * waves
+
+
+def _kinds(path: Path) -> list[str]:
+    """What each actuator is."""
+    return [
+        "position servo" if is_servo(one) else "velocity servo" if is_velocity_servo(one) else "motor"
+        for one in read_spec(path).actuators
+    ]
+
+
+def _label(model: mujoco.MjModel, actuator: int) -> str:
+    return model.actuator(actuator).name or _moved(model, actuator)
+
+
+def _moved(model: mujoco.MjModel, actuator: int) -> str:
+    """The joint that an actuator moves; for other transmissions, its number."""
+    kind = model.actuator_trntype[actuator]
+    joint = model.actuator_trnid[actuator, 0]
+    return model.joint(joint).name if kind == mujoco.mjtTrn.mjTRN_JOINT else f"actuator {actuator}"

@@ -158,7 +158,7 @@ def read_recording(cfg: DictConfig) -> Recording:
             raise ValueError(
                 f"data={cfg.data} is a second simulator: give simulator=robot.xml, and a share to hold out"
             )
-        transitions, columns = record_simulator(cfg.data, cfg.simulator.control_step, cfg.seed)
+        transitions, columns = record_simulator(cfg.data, cfg.simulator.path, cfg.simulator.control_step, cfg.seed)
         logs = (Path(cfg.data).name,)
     else:
         sources, held_out = split_by_name(cfg.data, held_out)

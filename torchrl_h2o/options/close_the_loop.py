@@ -11,7 +11,7 @@ import torchrl_h2o.effects
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.options.run import MakeOptions
-from torchrl_h2o.options.sources import AnyPath, Data, Layout
+from torchrl_h2o.options.sources import AnyPath, Data, Layout, NewFolder
 from torchrl_h2o.options.types import Count, Gap, Inside, Options, Positive, Seed, option
 
 EFFECTS = sorted(
@@ -79,5 +79,7 @@ class CloseTheLoopOptions(Options):
     start_from: AnyPath | None = option(None, "report.json of an unfinished run, with whose effects the search begins")
     minutes: Positive | None = option(None, "for the command, with the audit and the report; null: as long as it takes")
     catalogue: Pattern | list[Pattern] | None = option(None, "effects to try, as patterns: [Gravity,Joint*]; null: all")
-    export: str | None = option(None, "folder for the ranges of the values, for domain randomisation in other projects")
+    export: NewFolder | None = option(
+        None, "folder for the ranges of the values, for domain randomisation in other projects"
+    )
     seed: Seed = option(0)

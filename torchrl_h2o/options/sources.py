@@ -99,6 +99,21 @@ def _without_version(name: str) -> str:
     return name.rpartition("-v")[0]
 
 
+def require_folder(name: str) -> str:
+    """Requires a folder, or a name at which one can be made.
+
+    Raises:
+        ValueError: if there is a file, or the folder may not be written.
+    """
+    there = Path(name).expanduser().absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise ValueError(f"no folder can be made there, because {there} is a file or may not be written")
+    return name
+
+
+NewFolder = Annotated[str, AfterValidator(require_folder)]
 AnyPath = Annotated[str, AfterValidator(require_path)]
 RunFolder = Annotated[str, AfterValidator(require_run)]
 Layout = Annotated[str, AfterValidator(require_layout)]

@@ -100,9 +100,15 @@ def test_shares_of_a_range_are_angles_by_the_range_of_the_joint_in_the_model(tmp
         assert "share of the range of Elbow in the model; check" in entry(text, name)
 
 
-def test_positions_beyond_the_range_are_degrees(tmp_path):
-    text = guess_layout(dataset(tmp_path / "arm", size=120.0), ARM)
-    assert "degrees, because some are beyond 100" in entry(text, "observation.state.pan.pos")
+@pytest.mark.parametrize("motor", MOTORS[:3])
+def test_one_unit_is_decided_for_all_positions(tmp_path, motor):
+    """A joint that hardly moves is in the unit of the others, and so is its action."""
+    model = Coordinates(ARM.units, ARM.actuators, servos="position", driven=ARM.driven, ranges={"Elbow": (-1.0, 2.0)})
+    for size, unit in ((120.0, "deg"), (1.0, "rad")):
+        text = guess_layout(dataset(tmp_path / unit, size=size), model)
+        for name in (f"observation.state.{motor}.pos", f"action.{motor}.pos"):
+            assert f'unit: "{unit}"' in entry(text, name)
+            assert "scale" not in entry(text, name)
 
 
 def test_a_dataset_without_its_tables_or_with_another_description_says_so(tmp_path):

@@ -59,6 +59,21 @@ def test_faster_commands_are_those_at_the_row(tmp_path):
     assert td["action"].numpy() == pytest.approx(td["observation"].numpy(), abs=1e-6)
 
 
+def test_rows_where_another_file_has_a_gap_are_left_out(tmp_path):
+    sent = 0.01 * np.concatenate([np.arange(20), np.arange(30, 50)])
+    td = load(run_of(tmp_path, sent), columns={**COLUMNS, "on_time_jump": "split"})
+    assert (td["action"] - td["observation"]).abs().max() < 0.021
+    assert int(td["next", "done"].sum()) == 2
+
+
+def test_runs_that_share_a_file_are_different_runs(tmp_path):
+    files = run_of(tmp_path, 0.01 * np.arange(50))
+    (tmp_path / "other.csv").write_text(files["effort"].read_text())
+    assert len(sources_of([files, {**files, "effort": tmp_path / "other.csv"}])) == 2
+    with pytest.raises(DataError, match=r"nowhere\.csv: there is no such file"):
+        sources_of({**files, "effort": tmp_path / "nowhere.csv"})
+
+
 def test_the_guessed_layout_reads_the_run(tmp_path):
     files = run_of(tmp_path, 0.01 * np.arange(50))
     write(tmp_path, "velocity", 0.01 * np.arange(50), np.ones(50))
@@ -84,7 +99,11 @@ def test_runs_of_several_files_are_runs(tmp_path):
 @pytest.mark.parametrize(
     ("effort_times", "said"),
     [
-        (7.0 + 0.01 * np.arange(50), "the files share no two moments; give files of the same run"),
+        (
+            7.0 + 0.01 * np.arange(50),
+            "share less than half of their time: position from 0 to 0.49; effort from 7 to 7.49",
+        ),
+        (10.0 * np.arange(50), r"effort from 0 to 490; give files of one run whose times have the same unit"),
         (0.01 * np.arange(50)[::-1], r"effort.csv: the time goes back"),
     ],
 )
@@ -112,7 +131,10 @@ def test_files_of_columns_of_one_run_are_not_taken_for_runs(tmp_path):
     described = {"columns": [dict(zip(("name", "role", "unit"), one, strict=True)) for one in columns]}
     described |= {"separator": ",", "header": True}
     time = 0.01 * np.arange(50)
-    for begin, said in ((0.003, r"one run in 2 files; give data={hip: hip.csv, effort: effort.csv}"), (7.0, "missing")):
+    for begin, said in (
+        (0.003, r"one run in 2 files; give 'data={hip: .*hip.csv, effort: .*effort.csv}'"),
+        (7.0, "missing"),
+    ):
         files = [write(tmp_path, "hip", time, time), write(tmp_path, "effort", time + begin, time, "effort")]
         with pytest.raises(DataError, match=said):
             load(files, columns=described)

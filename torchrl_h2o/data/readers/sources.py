@@ -10,6 +10,7 @@ from os import PathLike
 from pathlib import Path
 
 from torchrl_h2o.data.readers.error import DataError
+from torchrl_h2o.data.readers.file_kind import require_file
 from torchrl_h2o.data.readers.formats import FORMATS
 from torchrl_h2o.data.readers.formats.lerobot import is_lerobot
 from torchrl_h2o.data.readers.formats.split_log import SplitLog
@@ -68,7 +69,7 @@ def unique(sources: Sequence[One]) -> tuple[One, ...]:
     """Return the sources without repetitions: ``a.csv`` and ``./a.csv`` are the same."""
     first: dict[str, One] = {}
     for one in sources:
-        first.setdefault(os.path.abspath(one), one)
+        first.setdefault(str(one) if isinstance(one, SplitLog) else os.path.abspath(one), one)
     return tuple(first.values())
 
 
@@ -121,7 +122,9 @@ def words_of(source: Source) -> str:
 
 def _split(files: Mapping[str, One]) -> SplitLog:
     paths = {str(name): Path(path).expanduser() for name, path in files.items() if isinstance(path, str | PathLike)}
-    if len(paths) < max(2, len(files)) or not all(path.is_file() for path in paths.values()):
+    for path in paths.values():
+        require_file(path)
+    if len(paths) < max(2, len(files)):
         problem = f"{dict(files)!r} does not name the files of one run"
         raise DataError(problem, "give two or more, such as {position: a.csv, effort: b.csv}", source="data")
     return SplitLog(paths)

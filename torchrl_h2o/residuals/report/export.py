@@ -6,14 +6,14 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects import Effect, Gravity, GravityTilt, ModelEffect, Timestep
+from torchrl_h2o.effects import ActionDelay, Effect, Gravity, GravityTilt, ModelEffect, Timestep
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.report.sampling import explanations_of, sample
 from torchrl_h2o.residuals.report.words import effect_words
@@ -22,6 +22,7 @@ from torchrl_h2o.whole_file import write_text
 
 DRAWS = 400  # of Report.sample, from which ranges are taken
 LEVELS = (0.025, 0.975)  # of the ranges' ends
+ALIKE = 0.02  # relative difference of a mass's and an inertia's factors up to which one number scales both
 TOGETHER = 0.99  # correlation over the draws from which numbers have the same cause
 CHANGED = 1e-6  # relative change of a number of the model below which it is not one of the report's
 FIELDS = {  # numbers of a model that effects change, with the kind of the element that has them
@@ -31,7 +32,6 @@ FIELDS = {  # numbers of a model that effects change, with the kind of the eleme
     **dict.fromkeys(("geom_friction", "geom_size", "geom_pos", "geom_solref"), "geom"),
     **dict.fromkeys(("actuator_gainprm", "actuator_biasprm", "actuator_dynprm"), "actuator"),
 }
-_UNITS = {"dof_damping": "N·m·s/rad", "dof_frictionloss": "N·m", "dof_armature": "kg·m²", "body_mass": "kg"}
 _MJLAB = {"dof_damping": "joint_damping", "dof_frictionloss": "joint_friction", "dof_armature": "joint_armature"}
 _ISAAC = {"dof_frictionloss": "friction_distribution_params", "dof_armature": "armature_distribution_params"}
 
@@ -119,7 +119,8 @@ def model_ranges(report: ReportContents, simulation: Simulation) -> list[FieldRa
 def _group(drawn: np.ndarray, causes: list[np.ndarray]) -> tuple[int, bool]:
     """The cause with which a number, (draws,), changes, and whether it falls with it; a new one is added."""
     changes = drawn - drawn.mean()
-    changes = changes / max(float(np.sqrt((changes**2).sum())), 1e-300)
+    size = float(np.sqrt((changes**2).sum()))
+    changes = changes / size if size > CHANGED * float(np.abs(drawn).max()) else np.zeros(len(drawn))
     for number, cause in enumerate(causes):
         if abs(likeness := float(changes @ cause)) > TOGETHER:
             return number, likeness < 0.0
@@ -152,17 +153,19 @@ def export(report: ReportContents, simulation: Simulation, folder: str | Path) -
 
     Returns:
         The files: ``ranges.json``, ``playground.py`` (``domain_randomize`` for ``randomization_fn``), ``mjlab.py`` and
-        ``isaaclab.py`` (``events``), and ``joints.csv``, a row for each joint as PACE reports them.
+        ``isaaclab.py`` (``events``), and ``joints.csv``, a row for each hinge and slide, in SI
+        units. Inertias are along the axes that the bodies have without effects; products of inertia are left out.
     """
     fields, outside = model_ranges(report, simulation), effect_ranges(report, simulation)
+    singles = _of_single_joints(fields, simulation)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
         "ranges.json": _json(fields, outside),
         "playground.py": _playground(fields, outside),
-        "mjlab.py": _mjlab(fields, outside),
-        "isaaclab.py": _isaaclab(fields, outside),
-        "joints.csv": _joints(fields, outside),
+        "mjlab.py": _mjlab(singles, outside),
+        "isaaclab.py": _isaaclab(singles, outside),
+        "joints.csv": _joints(report, simulation, fields),
     }
     for name, text in texts.items():
         write_text(folder / name, text)
@@ -170,8 +173,19 @@ def export(report: ReportContents, simulation: Simulation, folder: str | Path) -
 
 
 def _fields(simulation: Simulation, effects: Sequence[Effect]) -> dict[str, np.ndarray]:
-    model = simulation.with_effects(*effects).model
-    return {field: np.array(getattr(model, field), float) for field in FIELDS}
+    """Numbers of the model with effects; inertias along the principal axes that the bodies have without effects."""
+    plain, model = simulation.model, simulation.with_effects(*effects).model
+    found = {field: np.array(getattr(model, field), float) for field in FIELDS}
+    for body in range(model.nbody):
+        turned = (_axes(plain.body_iquat[body]).T @ _axes(model.body_iquat[body])) ** 2
+        found["body_inertia"][body] = turned @ model.body_inertia[body]
+    return found
+
+
+def _axes(quaternion: np.ndarray) -> np.ndarray:
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
 
 
 def _name(model: mujoco.MjModel, field: str, kind: str, index: int) -> str:
@@ -199,15 +213,56 @@ def _of(fields: Sequence[FieldRange], names: Mapping[str, str]) -> Iterator[tupl
 
 
 def _masses(fields: Sequence[FieldRange]) -> dict[str, FieldRange]:
-    return {one.element: one for one in fields if one.field == "body_mass" and one.nominal > 0.0}
+    """The masses by body whose inertias have the same factor, so that one number scales both."""
+    inertias: dict[str, list[FieldRange]] = {}
+    for one in fields:
+        if one.field == "body_inertia":
+            inertias.setdefault(one.element, []).append(one)
+    return {
+        one.element: one
+        for one in fields
+        if one.field == "body_mass" and one.nominal > 0.0 and _scale_alike(one, inertias.get(one.element, []))
+    }
 
 
-def _rest(fields: Sequence[FieldRange], outside: Sequence[EffectRange], written: Sequence[str]) -> str:
-    """Comments with what a file cannot hold."""
+def _scale_alike(mass: FieldRange, inertias: Sequence[FieldRange]) -> bool:
+    factors = np.array([[one.low / one.nominal, one.high / one.nominal] for one in inertias if one.nominal > 0.0])
+    own = np.array([mass.low, mass.high]) / mass.nominal
+    return len(factors) > 0 and bool((np.abs(factors / own - 1.0) < ALIKE).all())
+
+
+def _of_single_joints(fields: Sequence[FieldRange], simulation: Simulation) -> list[FieldRange]:
+    """The numbers but those of the degrees of freedom of free and ball joints, which have no joint of their own."""
+    singles = _single_joints(simulation.model)
+    return [one for one in fields if not one.field.startswith("dof_") or one.element in singles]
+
+
+def _single_joints(model: mujoco.MjModel) -> dict[str, int]:
+    """The degree of freedom of each hinge and slide, by its name."""
+    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    return {
+        model.joint(i).name or f"joint {i}": int(model.jnt_dofadr[i])
+        for i in range(model.njnt)
+        if mujoco.mjtJoint(model.jnt_type[i]) in kinds
+    }
+
+
+def _rest(
+    fields: Sequence[FieldRange], outside: Sequence[EffectRange], written: Collection[str], masses: Collection[str]
+) -> str:
+    """Comments with what a file does not hold.
+
+    Args:
+        fields: the numbers of the model.
+        outside: the other effects.
+        written: the fields that the file holds.
+        masses: bodies whose masses and inertias it holds.
+    """
     lines = []
-    for field in dict.fromkeys(one.field for one in fields if one.field not in written):
-        own = [one for one in fields if one.field == field]
-        names = ", ".join(dict.fromkeys(one.element for one in own))
+    left = [one for one in fields if one.field not in written]
+    left = [one for one in left if not (one.field in ("body_mass", "body_inertia") and one.element in masses)]
+    for field in dict.fromkeys(one.field for one in left):
+        names = ", ".join(dict.fromkeys(one.element for one in left if one.field == field))
         lines.append(f"# not here: {field} of {names} (see ranges.json)")
     lines += [f"# not here: {one.effect} ({one.parameter} {one.low:.6g} to {one.high:.6g})" for one in outside]
     return "".join(f"{line}\n" for line in lines)
@@ -222,7 +277,7 @@ def _playground(fields: Sequence[FieldRange], outside: Sequence[EffectRange]) ->
             for one in rows
         )
         tables.append(f'    "{field}": {{\n{inner}    }},\n')
-    rest = _rest(fields, outside, list(FIELDS))
+    rest = _rest(fields, outside, FIELDS, ())
     return f'''"""Domain randomisation for MuJoCo Playground: give domain_randomize to training as randomization_fn."""
 
 import jax
@@ -282,7 +337,7 @@ from mjlab.envs.mdp import dr
 from mjlab.managers.event_manager import EventTermCfg
 from mjlab.managers.scene_entity_config import SceneEntityCfg
 
-{_rest(fields, outside, [*_MJLAB, "body_mass", "body_inertia"])}events = {{
+{_rest(fields, outside, _MJLAB, _masses(fields))}events = {{
 {"".join(terms)}}}
 '''
 
@@ -317,29 +372,26 @@ that of a joint without its servo's: add the servo's to it.
 import isaaclab.envs.mdp as mdp
 from isaaclab.managers import EventTermCfg, SceneEntityCfg
 
-{_rest(fields, outside, [*_ISAAC, "dof_damping", "body_mass", "body_inertia"])}events = {{
+{_rest(fields, outside, (*_ISAAC, "dof_damping"), _masses(fields))}events = {{
 {"".join(terms)}}}
 '''
 
 
-def _joints(fields: Sequence[FieldRange], outside: Sequence[EffectRange]) -> str:
-    """A row for each joint: armature, damping and friction with their ranges, and the delay of the actions."""
-    columns = ("dof_armature", "dof_damping", "dof_frictionloss")
-    by_joint: dict[str, dict[str, FieldRange]] = {}
-    for one in fields:
-        if one.field in columns:
-            by_joint.setdefault(one.element, {})[one.field] = one
-    delays = [one for one in outside if one.kind == "ActionDelay"]
+def _joints(report: ReportContents, simulation: Simulation, fields: Sequence[FieldRange]) -> str:
+    """A row for each hinge and slide: armature, damping and friction with their ranges, and the delay of its motor."""
+    model, by_place = simulation.model, {(one.field, one.index[0]): one for one in fields}
+    columns = {"dof_armature": "armature", "dof_damping": "damping", "dof_frictionloss": "friction"}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    heads = [f"{name.removeprefix('dof_')} ({_UNITS[name]})" for name in columns]
-    writer.writerow(["joint", *(f"{head}{end}" for head in heads for end in ("", " low", " high")), "delay (s)"])
-    for joint, own in by_joint.items():
-        cells = [own.get(name) for name in columns]
-        numbers = ["" if one is None else f"{value:.6g}" for one in cells for value in _three(one)]
-        writer.writerow([joint, *numbers, f"{delays[0].value:.6g}" if delays else ""])
+    writer.writerow(["joint", *(f"{name}{end}" for name in columns.values() for end in ("", " low", " high")), "delay"])
+    for joint, dof in _single_joints(model).items():
+        cells = []
+        for field in columns:
+            own, nominal = by_place.get((field, dof)), float(getattr(model, field)[dof])
+            values = (nominal,) * 3 if own is None else (own.mended, own.low, own.high)
+            cells += [f"{value:.6g}" for value in values]
+        driven = [i for i in range(model.nu) if model.actuator_trnid[i, 0] == model.dof_jntid[dof]]
+        delays = [one for one in report.effects if isinstance(one, ActionDelay)]
+        delay = sum(one.delay for one in delays if driven and (one.actuators is None or driven[0] in one.actuators))
+        writer.writerow([joint, *cells, f"{delay:.6g}"])
     return text.getvalue()
-
-
-def _three(one: FieldRange | None) -> tuple[float, float, float]:
-    return (0.0, 0.0, 0.0) if one is None else (one.mended, one.low, one.high)

@@ -9,13 +9,15 @@ import mujoco
 
 from torchrl_h2o.effects import compile_model
 
+_SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
 
 def read_spec(path: Path) -> mujoco.MjSpec:
     """Parses a model file.
 
     Of a URDF file, shapes that are only seen and meshes are left out, because they do not matter for the dynamics but
-    for contacts; each joint that moves gets a motor of its name, with a torque or force as its command, if the file has
-    no actuators.
+    for contacts; each hinge and slide that follows no other joint gets a motor of its name, with a torque or force as
+    its command, if the file has no actuators.
 
     Args:
         path: the file.
@@ -33,7 +35,10 @@ def read_spec(path: Path) -> mujoco.MjSpec:
         ]:
             link.remove(shape)
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-    for joint in [] if spec.actuators else spec.joints:
+    spec.compiler.fusestatic = False  # effects find bodies by their place in the specification
+    mimics = {joint.get("name") for joint in root.iter("joint") if joint.find("mimic") is not None}
+    moving = [one for one in spec.joints if one.type in _SINGLE and one.name not in mimics]
+    for joint in [] if spec.actuators else moving:
         motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
     return spec

@@ -88,7 +88,10 @@ def read_pt(path: Path, layout: LogColumns | None) -> RawTable:
         content = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(content, Mapping):
         raise DataError(f"it holds a {type(content).__name__}, whose columns have no names", remedy, source=path)
-    arrays = {name: values.detach().resolve_conj().numpy() for name, values in _tensors(content)}
+    tensors = dict(_tensors(content))
+    require_plausible_size(sum(8 * values.numel() for values in tensors.values()), path)
+    with unreadable("it holds tensors that are no plain numbers", remedy, source=path):
+        arrays = {name: values.detach().to(torch.float64).numpy() for name, values in tensors.items()}
     return _columns(arrays, path, layout)
 
 
@@ -98,7 +101,7 @@ def _tensors(content: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str
         if isinstance(value, Mapping):
             yield from _tensors(value, f"{prefix}{name}.")
         elif isinstance(value, torch.Tensor):
-            yield f"{prefix}{name}", value.float() if value.dtype == torch.bfloat16 else value
+            yield f"{prefix}{name}", value
 
 
 def _require_stored(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str, path: Path) -> None:

@@ -46,8 +46,8 @@ def read_lerobot(folder: Path, layout: LogColumns | None) -> RawTable:
         raise DataError(problem, "download the data folder, too; videos are not needed", source=folder)
     parts = [read_parquet(path, None) for path in tables]
     columns: dict[str, Callable[[], np.ndarray]] = {}
-    for feature, described in _features(folder).items():
-        for column, name in _named(feature, described):
+    for named in _features(folder).values():
+        for column, name in named:
             columns[name] = partial(_column, parts, column)
     return table_of(columns, sum(len(part.rows) for part in parts), folder, layout)
 
@@ -60,26 +60,32 @@ def read_calibration(folder: Path) -> dict[str, float]:
     """
     found: dict[str, float] = {}
     for path in (*sorted(folder.glob("*.json")), *sorted(folder.glob("meta/*.json"))):
-        with unreadable("the file cannot be read as JSON", source=path):
+        with unreadable("the file cannot be read as a calibration", source=path):
             content = json.loads(path.read_text(encoding="utf-8"))
-        for motor, own in content.items() if isinstance(content, dict) else ():
-            if isinstance(own, dict) and {"range_min", "range_max"} <= own.keys():
-                found[motor] = (-1 if own.get("drive_mode") else 1) * (own["range_max"] - own["range_min"]) / _TURN
+            own = {
+                motor: (-1 if one.get("drive_mode") else 1) * (one["range_max"] - one["range_min"]) / _TURN
+                for motor, one in (content.items() if isinstance(content, dict) else ())
+                if isinstance(one, dict) and {"range_min", "range_max"} <= one.keys()
+            }
+        # two arms have a file each, with the same motors: left.json is of the columns with left_elbow
+        found |= {motor if motor not in found else f"{path.stem}_{motor}": range_ for motor, range_ in own.items()}
     return found
 
 
-def _features(folder: Path) -> dict[str, Any]:
+def _features(folder: Path) -> dict[str, list[tuple[str, str]]]:
+    """The columns of each feature in the tables, each with its name."""
     with unreadable("the description of the LeRobot dataset cannot be read", source=folder / INFO):
         features = json.loads((folder / INFO).read_text(encoding="utf-8"))["features"]
-        return {name: one for name, one in features.items() if one["dtype"] not in _NO_NUMBERS}
+        numbers = {name: one for name, one in features.items() if one["dtype"] not in _NO_NUMBERS}
+        return {name: _named(name, one) for name, one in numbers.items()}
 
 
 def _named(feature: str, described: dict[str, Any]) -> list[tuple[str, str]]:
-    """The columns of a feature in the tables, each with its name: ``action[0]`` is ``action.elbow.pos``."""
+    """The columns of a feature: ``action[0]`` is ``action.elbow.pos``."""
     names, count = described.get("names"), int(np.prod(described["shape"]))
     if isinstance(names, dict):  # version 2: {"motors": [...]}
         names = next(iter(names.values()), None)
-    if not isinstance(names, list) or len(names) != count:
+    if not isinstance(names, list) or len(set(map(str, names))) != count:
         names = [f"[{index}]" for index in range(count)]
     dotted = [name if name.startswith("[") else f".{name}" for name in map(str, names)]
     return (

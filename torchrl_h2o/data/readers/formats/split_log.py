@@ -16,6 +16,8 @@ from torchrl_h2o.data.readers.formats.raw_table import RawTable, require_names
 if TYPE_CHECKING:
     from torchrl_h2o.data.readers.log_columns import LogColumns
 
+_SHARED = 0.5  # share of the longest file's time that all files have in common
+_FAR = 2.5  # steps from a row to that of another file beyond which this has a gap, and the row is left out
 _AS_FAST = 1.5  # ratio of two files' steps up to which rows of the same moment belong together
 
 
@@ -62,7 +64,8 @@ class SplitLog(PathLike):
             times: time of each file's rows, increasing, in the same unit.
 
         Raises:
-            DataError: for a file without two rows, time that goes back, or files that share no two moments.
+            DataError: for a file without two rows, time that goes back, or files that share less than half of the
+                longest one's time.
         """
         for name, time in times.items():
             if len(time) < 2 or (np.diff(time) < 0.0).any():
@@ -72,15 +75,20 @@ class SplitLog(PathLike):
         step = {name: float(np.median(np.diff(time))) for name, time in times.items()}
         begin, end = max(time[0] for time in times.values()), min(time[-1] + step[name] for name, time in times.items())
         moments = np.flatnonzero((clock >= begin - 0.5 * step[first]) & (clock < end))
-        if len(moments) < 2:
-            raise DataError("the files share no two moments", "give files of the same run", source=str(self))
-        found, clock = {first: moments}, clock[moments]
+        longest = max(time[-1] - time[0] for time in times.values())
+        if len(moments) < 2 or end - begin < _SHARED * longest:
+            spans = "; ".join(f"{name} from {time[0]:g} to {time[-1]:g}" for name, time in times.items())
+            remedy = "give files of one run whose times have the same unit and begin, such as seconds since 1970"
+            raise DataError(f"the files share less than half of their time: {spans}", remedy, source=str(self))
+        clock, found, known = clock[moments], {first: moments}, np.ones(len(moments), bool)
         for name, time in others:
             after = np.searchsorted(time, clock, side="right").clip(1, len(time) - 1)
             is_nearer = np.abs(time[after] - clock) < np.abs(clock - time[after - 1])
             is_fast = step[name] < _AS_FAST * step[first]
-            found[name] = after - 1 + (is_nearer if is_fast else time[after] <= clock)
-        return found
+            row = after - 1 + (is_nearer if is_fast else time[after] <= clock)
+            known &= np.abs(time[row] - clock) < _FAR * max(step[name], step[first])
+            found[name] = row
+        return {name: rows[known] for name, rows in found.items()}
 
 
 def read_split(log: SplitLog, layout: LogColumns, read: Callable[[Path, LogColumns], RawTable]) -> RawTable:

@@ -99,7 +99,7 @@ def require_several_runs(paths: Sequence[str | PathLike[str]]) -> None:
     raise DataError(
         f"{', '.join(path.name for path in logs)} have the same times and other columns: they are one run in "
         f"{len(logs)} files",
-        f"give data={{{', '.join(f'{path.stem}: {path.name}' for path in logs)}}}, which joins them on time",
+        f"give 'data={{{', '.join(f'{path.stem}: {path}' for path in logs)}}}', which joins them on time",
         source=logs[0].parent,
     )
 
