@@ -48,9 +48,17 @@ def test_draws_that_chose_something_are_counted_apart_with_their_intervals(folde
 def test_rows_of_different_code_make_no_table(folder, other):
     saved(folder, drawn("slow", 4, ok=True), drawn("slow", 6, ok=True, **other))
     before = (folder / "page.md").read_text()
-    with pytest.raises(ValueError, match=r"(?s)drawn: its rows must come from one commit.*slow_6_0"):
+    with pytest.raises(ValueError, match=r"(?s)drawn slow: its rows must come from one commit.*slow_6_0"):
         make.make(folder)
     assert (folder / "page.md").read_text() == before
+
+
+def test_families_of_drawn_cases_may_be_of_different_commits(folder):
+    saved(folder, drawn("slow", 4, ok=True), drawn("decoy", 0, ok=True, commit="def5678"))
+    make.make(folder)
+    lines = (folder / "page.md").read_text().splitlines()
+    commits = {name: line.split("|")[-2].strip() for line in lines for name in ("slow", "decoy") if f"`{name}`" in line}
+    assert commits == {"slow": "abc1234", "decoy": "def5678"}
 
 
 def test_a_marker_of_no_table_is_refused(folder):
