@@ -168,12 +168,12 @@ def print_result(report: Report) -> None:
             low, high = found.ci95.get(name, (float("nan"), float("nan")))
             label = found.name if row == 0 else ""
             print(
-                f"{label:<48}{quantity_name(name, symbol):<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}"
+                f"{label:<47} {quantity_name(name, symbol):<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}"
             )
     if report.error is not None:
         print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
         for dimension in report.error.per_dimension:
-            print(f"{dimension.name:<48}{dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
+            print(f"{dimension.name:<47} {dimension.unit:<14}{dimension.before:>12.3g}{dimension.after:>12.3g}")
 
 
 def print_files(report: Report, directory: Path) -> None:

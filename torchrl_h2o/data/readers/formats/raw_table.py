@@ -110,13 +110,14 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def as_numbers(values: np.ndarray, column: str, path: Path) -> np.ndarray:
-    """Convert the values of one column to float64; a date becomes the time since the first row in s.
+    """Convert the values of one column to float64; a date becomes the time in s since the midnight before the first
+    row, which files of one run have in common.
 
     Raises:
         DataError: for complex numbers, text and objects.
     """
     if values.dtype.kind in "Mm":
-        return (values - values[0]) / np.timedelta64(1, "s") if values.dtype.kind == "M" else values / _SECOND
+        return (values - values[0].astype("datetime64[D]")) / _SECOND if values.dtype.kind == "M" else values / _SECOND
     require_real(values, column, source=path)
     return values.astype(np.float64)
 
