@@ -25,7 +25,8 @@ from torchrl_h2o.effects import (
 from torchrl_h2o.options.sources import require_folder
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
-from torchrl_h2o.residuals.report.export import export, model_ranges
+from torchrl_h2o.residuals.report.export import export
+from torchrl_h2o.residuals.report.ranges import model_ranges
 
 MODEL = """<mujoco><worldbody><body name="upper"><joint name="hip" axis="0 1 0" damping="0.1"/>
   <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="1"/>
@@ -162,17 +163,23 @@ def test_terms_of_events_have_the_names_and_ranges(simulation, tmp_path, monkeyp
     assert all(one["mode"] == "startup" for (one,) in events.values())
     if name == "mjlab":
         damping = next(params for function, params in terms if function == "joint_damping")
-        assert damping["asset_cfg"] == ("robot", {"joint_names": ("hip", "knee")})
+        assert damping["asset_cfg"] == ("robot", {"joint_names": ["hip", "knee"]})
         assert damping["ranges"] == pytest.approx((0.2, 0.4), abs=0.02)
         assert (damping["operation"], damping["shared_random"]) == ("abs", True)
         mass = next(params for function, params in terms if function == "pseudo_inertia")
         assert np.exp(2.0 * np.array(mass["alpha_range"])) == pytest.approx([1.1, 1.3], abs=0.02)
     else:
-        found = {function: params for function, params in terms if params["asset_cfg"][1] == {"joint_names": "knee"}}
-        assert found["randomize_joint_parameters"]["friction_distribution_params"] == pytest.approx(
-            (0.04, 0.06), abs=0.003
-        )
-        assert found["randomize_actuator_gains"]["damping_distribution_params"] == pytest.approx((0.2, 0.4), abs=0.02)
+        joints = {
+            function: (params["asset_cfg"][1]["joint_names"], params)
+            for function, params in terms
+            if "friction_distribution_params" in params or "damping_distribution_params" in params
+        }
+        names, friction = joints["randomize_joint_parameters"]
+        assert names == ["knee"]
+        assert friction["friction_distribution_params"] == pytest.approx((0.04, 0.06), abs=0.003)
+        names, damping = joints["randomize_actuator_gains"]
+        assert names == ["hip", "knee"]
+        assert damping["damping_distribution_params"] == pytest.approx((0.2, 0.4), abs=0.02)
         assert "randomize_rigid_body_mass" in dict(terms)
 
 
