@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -294,64 +293,32 @@ def _half_widths(
 
     Of several logs also, in quadrature, what the scatter between them adds for the value in another log; else 0.
     """
-    size = slopes[0].shape[1]
-    by_log: dict[int, _Normal] = {}
+    count, logs, blocks, rows = 0, [], [], []
     for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
-        scaled, weight = slope * inverse[:, None], share * weights(white)
         block, log = block_of(part), part.record.measured.log
-        log_of = np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first]
-        for index in np.unique(log_of):
-            rows, own = log_of[block] == index, np.flatnonzero(log_of == index)
-            pulls = np.zeros((len(part.blocks), size))
-            np.add.at(pulls, block[rows], scaled[rows] * (weight * white)[rows, None])
-            curvature = scaled[rows].T @ (weight[rows, None] * scaled[rows])
-            by_log[index] = by_log.get(index, _Normal.nothing(size)).beside(curvature, pulls[own])
-    together = _Normal.nothing(size)
-    for one in by_log.values():
-        together = together.beside(one.curvature, one.pulls)
-    half, logs = CONFIDENCE * np.sqrt(together.variance), len(by_log)
-    if logs == 1:
-        return half, np.zeros(size)
-    each = [(one.move, one.variance) for one in by_log.values()]
-    between = scatter_between(*map(np.stack, zip(*each, strict=True)))
-    return half, student.ppf(0.975, logs - 1) * np.sqrt(between * (1.0 + 1.0 / logs))
+        logs.append(np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first])
+        blocks.append(count + block)
+        weight = share * weights(white)
+        rows.append((slope * inverse[:, None], weight, weight * white))
+        count += len(part.blocks)
+    log_of, block = np.concatenate(logs), np.concatenate(blocks)
+    scaled, weight, pull = (np.concatenate(one) for one in zip(*rows, strict=True))
 
+    def solved(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The move to the best values of some blocks alone, if the errors are linear, and its squared errors."""
+        own = chosen[block]
+        pulls = np.zeros((count, scaled.shape[1]))
+        np.add.at(pulls, block[own], scaled[own] * pull[own, None])
+        bread = np.linalg.pinv(scaled[own].T @ (weight[own, None] * scaled[own]))
+        spare = chosen.sum() / max(1, chosen.sum() - len(bread))
+        return -bread @ pulls.sum(0), np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0)
 
-@dataclass(frozen=True)
-class _Normal:
-    """Normal equations of a fit's variables.
-
-    Args:
-        curvature: (p, p).
-        pulls: gradient of each block, (B, p).
-    """
-
-    curvature: np.ndarray
-    pulls: np.ndarray
-
-    @classmethod
-    def nothing(cls, size: int) -> _Normal:
-        return cls(np.zeros((size, size)), np.zeros((0, size)))
-
-    def beside(self, curvature: np.ndarray, pulls: np.ndarray) -> _Normal:
-        return _Normal(self.curvature + curvature, np.concatenate([self.pulls, pulls]))
-
-    @cached_property
-    def _bread(self) -> np.ndarray:
-        return np.linalg.pinv(self.curvature)
-
-    @property
-    def move(self) -> np.ndarray:
-        """The move of the variables, (p,), to the best values of these rows alone, if the errors are linear."""
-        return -self._bread @ self.pulls.sum(0)
-
-    @property
-    def variance(self) -> np.ndarray:
-        """Squared standard errors of the variables, (p,), from the scatter between blocks."""
-        blocks, size = self.pulls.shape
-        spare = blocks / max(1, blocks - size)
-        covariance = self._bread @ self.pulls.T @ self.pulls @ self._bread
-        return np.maximum(np.diag(covariance) * spare, 0.0)
+    half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool))[1])
+    every = [solved(log_of == log) for log in np.unique(log_of)]
+    if len(every) == 1:
+        return half, np.zeros(len(half))
+    between = scatter_between(*map(np.stack, zip(*every, strict=True)))
+    return half, student.ppf(0.975, len(every) - 1) * np.sqrt(between * (1.0 + 1.0 / len(every)))
 
 
 def scatter_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
