@@ -90,7 +90,7 @@ def test_actuators_are_matched_by_name_or_else_by_joint(models, tmp_path):
     (tmp_path / "few.xml").write_text(ARM.format(damping=0.05, actuators='<motor joint="elbow"/>'))
     with pytest.raises(ValueError, match=r"the actuators of few\.xml, elbow, are not those of a\.xml, shoulder, elbow"):
         recorded("data=few.xml")
-    with pytest.raises(ValueError, match=r"shoulder is a position servo in servos\.xml and a motor in a\.xml"):
+    with pytest.raises(ValueError, match=r"s1 is a position servo in servos\.xml and a motor in a\.xml"):
         recorded("data=servos.xml")
 
 

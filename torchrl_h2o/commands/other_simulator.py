@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -49,11 +51,12 @@ def record_simulator(
     """
     path, like = Path(path), Path(like)
     model = read_model(path)
-    order = matched_actuators(path, like)
+    actuators = actuators_of(path)
+    order = matched(actuators, actuators_of(like), path, like)
     step = control_step or max(STEP, model.opt.timestep)
     names, units = coordinate_names(model)
     simulation = Simulation.from_mjcf(path, names, step)
-    actions = commands(model, _kinds(path), round(SECONDS / step), step, np.random.default_rng(seed))
+    actions = commands(model, [one.kind for one in actuators], round(SECONDS / step), step, np.random.default_rng(seed))
     start = np.concatenate([model.qpos0, np.zeros(model.nv)])[None]
     states = np.concatenate([start, simulation.rollout(start, actions[None])[0]])
     if not np.isfinite(states).all():
@@ -70,19 +73,37 @@ def record_simulator(
     transitions["time"] = step * torch.arange(len(actions), dtype=torch.float64)[:, None]
     torchrl_logger.info(f"{path}: {SECONDS:g} s under sines of {FREQUENCIES[0]:g} to {FREQUENCIES[-1]:g} Hz")
     columns = [Column(name, "observation", unit) for name, unit in zip(names, units, strict=True)]
-    columns += [Column(f"command of {_label(model, i)}", "action") for i in order]
+    columns += [Column(f"command of {actuators[i].name}", "action") for i in order]
     return transitions, LogColumns(tuple(columns), dt=step, free_motion=not model.nu)
 
 
-def matched_actuators(path: Path, like: Path) -> list[int]:
-    """The actuators of one model in the order of another one's: by their names, or else by the joints that they move.
+class Actuator(NamedTuple):
+    """An actuator: its name, the joint that it moves, and what it is."""
+
+    name: str
+    joint: str
+    kind: Literal["position servo", "velocity servo", "motor"]
+
+
+def actuators_of(path: Path) -> list[Actuator]:
+    """The actuators of a model; one without a name is called like its joint, one without a joint by its number."""
+    model, found = read_model(path), []
+    for index, one in enumerate(read_spec(path).actuators):
+        on_joint = model.actuator_trntype[index] == mujoco.mjtTrn.mjTRN_JOINT
+        joint = model.joint(model.actuator_trnid[index, 0]).name if on_joint else f"actuator {index}"
+        kind = "position servo" if is_servo(one) else "velocity servo" if is_velocity_servo(one) else "motor"
+        found.append(Actuator(one.name or joint, joint, kind))
+    return found
+
+
+def matched(own: Sequence[Actuator], other: Sequence[Actuator], path: Path, like: Path) -> list[int]:
+    """Indices of a model's actuators in the order of another one's: by their names, or else by their joints.
 
     Raises:
         ValueError: if there are others, or a servo in the place of a motor.
     """
-    own, other = read_model(path), read_model(like)
-    for label in (_label, _moved):
-        labels, wanted = ([label(model, i) for i in range(model.nu)] for model in (own, other))
+    for label in ("name", "joint"):
+        labels, wanted = ([getattr(one, label) for one in actuators] for actuators in (own, other))
         if sorted(labels) == sorted(wanted) and len(set(labels)) == len(labels):
             break
     else:
@@ -90,14 +111,16 @@ def matched_actuators(path: Path, like: Path) -> list[int]:
             f"the actuators of {path}, {', '.join(labels) or 'none'}, are not those of {like}, "
             f"{', '.join(wanted) or 'none'}; give them the same names"
         )
-    order, kinds, others = [labels.index(name) for name in wanted], _kinds(path), _kinds(like)
-    for index, kind in zip(order, others, strict=True):
-        if kinds[index] != kind:
-            raise ValueError(f"{labels[index]} is a {kinds[index]} in {path} and a {kind} in {like}; make them alike")
+    order = [labels.index(name) for name in wanted]
+    for mine, its in zip([own[index] for index in order], other, strict=True):
+        if mine.kind != its.kind:
+            raise ValueError(f"{mine.name} is a {mine.kind} in {path} and a {its.kind} in {like}; make them alike")
     return order
 
 
-def commands(model: mujoco.MjModel, kinds: list[str], rows: int, step: float, rng: np.random.Generator) -> np.ndarray:
+def commands(
+    model: mujoco.MjModel, kinds: Sequence[str], rows: int, step: float, rng: np.random.Generator
+) -> np.ndarray:
     """Commands of all actuators: sums of sines with random phases, (rows, nu).
 
     Args:
@@ -126,22 +149,3 @@ def commands(model: mujoco.MjModel, kinds: list[str], rows: int, step: float, rn
     at_rest = np.where([kind == "position servo" for kind in kinds], data.actuator_length, 0.0)
     middle = np.where(is_motor & limited, 0.5 * (low + high), at_rest)
     return middle + sizes * waves
-
-
-def _kinds(path: Path) -> list[str]:
-    """What each actuator is."""
-    return [
-        "position servo" if is_servo(one) else "velocity servo" if is_velocity_servo(one) else "motor"
-        for one in read_spec(path).actuators
-    ]
-
-
-def _label(model: mujoco.MjModel, actuator: int) -> str:
-    return model.actuator(actuator).name or _moved(model, actuator)
-
-
-def _moved(model: mujoco.MjModel, actuator: int) -> str:
-    """The joint that an actuator moves; for other transmissions, its number."""
-    kind = model.actuator_trntype[actuator]
-    joint = model.actuator_trnid[actuator, 0]
-    return model.joint(joint).name if kind == mujoco.mjtTrn.mjTRN_JOINT else f"actuator {actuator}"

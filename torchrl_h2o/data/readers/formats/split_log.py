@@ -40,20 +40,6 @@ class SplitLog(PathLike):
     def __hash__(self) -> int:
         return hash(str(self))
 
-    def name_of_time(self, times: Sequence[str]) -> str:
-        """The name of the time, which must be the same in all files.
-
-        Args:
-            times: the name in each file.
-
-        Raises:
-            DataError: if it differs.
-        """
-        if len(set(times)) > 1:
-            problem = f"the columns of time are called {', '.join(times)}"
-            raise DataError(problem, "give them the same name in all files", source=str(self))
-        return times[0]
-
     def rows(self, times: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Indices of the rows of each file that belong together, one for each moment at which all have begun.
 

@@ -21,7 +21,6 @@ from torchrl_h2o.data.readers.guess.roles import guess_columns
 from torchrl_h2o.data.readers.sources import is_hdf5
 
 _LINES = 50_000  # lines of a text file that are looked at, to find gaps and jumps behind its beginning
-_SHARED = 0.9  # share of the longest duration that files of one run have in common
 _INSIDE = re.compile(r"\"[^\"]*\"|\[[^\]]*\]")  # quoted cells and lists, which may hold the separator
 
 
@@ -60,7 +59,7 @@ def read_contents(path: str | PathLike[str]) -> Contents:
         {'separator': '";"', 'header': 'true', 'decimal': '","'}
     """
     if isinstance(path, SplitLog):
-        return _joined(path)
+        return _joined(path, {name: read_contents(part) for name, part in path.files.items()})
     path = Path(path).expanduser()
     if is_lerobot(path) or FORMATS.get(require_file(path).suffix.lower(), read_text) is not read_text:
         raw = read_raw(path)
@@ -85,17 +84,13 @@ def require_several_runs(paths: Sequence[str | PathLike[str]]) -> None:
     if len(logs) < 2 or len(logs) < len(paths):
         return
     try:
-        contents = [read_contents(path) for path in logs]
-    except DataError:  # the readers say what is wrong with a file
+        parts = {path.stem: read_contents(path) for path in logs}
+        names = [set(part.values) for part in parts.values()]
+        if len(parts) < len(logs) or names[0] in names[1:]:
+            return
+        _joined(SplitLog(dict(zip(parts, logs, strict=True))), parts)
+    except DataError:  # they have no common time, or the readers say what is wrong with a file
         return
-    times = [_time(each) for each in contents]
-    first, begin = contents[0], times[0]
-    for each, time in zip(contents[1:], times[1:], strict=True):
-        if begin is None or time is None or set(each.values) == set(first.values):
-            return
-        shared = min(begin[-1], time[-1]) - max(begin[0], time[0])
-        if shared < _SHARED * max(np.ptp(begin), np.ptp(time)):
-            return
     raise DataError(
         f"{', '.join(path.name for path in logs)} have the same times and other columns: they are one run in "
         f"{len(logs)} files",
@@ -104,9 +99,8 @@ def require_several_runs(paths: Sequence[str | PathLike[str]]) -> None:
     )
 
 
-def _joined(log: SplitLog) -> Contents:
+def _joined(log: SplitLog, parts: Mapping[str, Contents]) -> Contents:
     """The contents of the files of one run, joined on time."""
-    parts = {name: read_contents(path) for name, path in log.files.items()}
     clocks: dict[str, str] = {}
     for name, part in parts.items():
         found = [guess.name for guess in guess_columns(part.values) if guess.kind == "time"]
@@ -114,7 +108,9 @@ def _joined(log: SplitLog) -> Contents:
             problem = "no column of time was found" if not found else "it is written in another way than the first file"
             raise DataError(problem, "files of one run are joined on time; join them", source=log.files[name])
         clocks[name] = found[0]
-    log.name_of_time(list(clocks.values()))
+    if len(set(clocks.values())) > 1:
+        problem = f"the columns of time are called {', '.join(clocks.values())}"
+        raise DataError(problem, "give them the same name in all files", source=str(log))
     rows = log.rows({name: np.asarray(part.values[clocks[name]]) for name, part in parts.items()})
     values = {
         f"{name}.{column}": None if numbers is None else numbers[rows[name]]
@@ -122,11 +118,6 @@ def _joined(log: SplitLog) -> Contents:
         for column, numbers in part.values.items()
     }
     return Contents(values, next(iter(parts.values())).options)
-
-
-def _time(contents: Contents) -> np.ndarray | None:
-    found = [guess.name for guess in guess_columns(contents.values) if guess.kind == "time"]
-    return contents.values[found[0]] if found else None
 
 
 def _numbers(raw: RawTable, index: int, name: str) -> np.ndarray | None:
