@@ -19,6 +19,7 @@ from torchrl_h2o.effects import (
     JointForce,
     JointFrictionLoss,
     JointSpring,
+    Payload,
     ResidualForce,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
@@ -330,6 +331,18 @@ def test_a_search_goes_on_from_known_effects():
     assert explanation.steps[0].gain > 0.0
     assert [type(effect) for effect in first[0].effects] == [Gravity, ActionDelay]
     assert values(explanation.effects) == pytest.approx(values(truth), rel=0.01)
+
+
+def test_of_sets_that_explain_the_data_equally_the_one_with_fewer_values_is_taken():
+    """A payload with its place has two values more than a mass, and takes up what other missing effects cause."""
+    catalogue, scores = double_pendulum().catalogue(), np.random.default_rng(0).normal(size=20)
+    mass, payload = (
+        next(entry for entry in catalogue if type(entry.effect) is kind and len(entry.fitted) == values)
+        for kind, values in ((BodyMass, 1), (Payload, 3))
+    )
+    sets = [Found((entry,), (entry.starts[0],), scores + better) for entry, better in ((mass, 0.0), (payload, 1e-3))]
+    assert sets[1].surprise == sets[0].surprise + 2
+    assert most_usual(sets) is sets[0]
 
 
 def test_what_was_tried_and_not_put_in_is_listed_by_its_evidence():
