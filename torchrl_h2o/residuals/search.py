@@ -218,10 +218,10 @@ def disjoint(
     for entry, effect in zip(found.entries, found.effects, strict=True):
         own = [alone.get((type(effect), index)) for index in all_elements(effect, simulation)]
         further = {one.name for one in own if one is not None} & found.names - {entry.name}
-        if len(effect.parameters) == 1 and further and None not in own and len(own) <= 1 + len(further):
+        if len(entry.fitted) == 1 and further and None not in own and len(own) <= 1 + len(further):
             present = dict(zip((one.name for one in found.entries), found.effects, strict=True))
             singles = [one for one in own if one is not None]
-            shared = {name: parameter.value for name, parameter in effect.parameters.items()}
+            shared = {name: effect.parameters[name].value for name in entry.fitted}
             values = [one.effect.with_parameters(shared) for one in singles]
             values = [
                 summed(value, present[one.name]) if one.name in further else value
