@@ -21,6 +21,7 @@ from torchrl_h2o.effects import (
     ActionLag,
     ActionLead,
     Armature,
+    BodyInertia,
     Effect,
     GearPlay,
     JointDamping,
@@ -180,8 +181,10 @@ def judge_servo(report: Report, case: Case) -> dict:
     Lateness of less than a physics step of the model counts as none.
     """
     assert isinstance(case, ServoCase)
-    own = {kind for group in KINDS[case.cause] for kind in group}
-    others = [effect for effect in report.effects if type(effect) not in {*own, *USUAL} and not _is_of_a_step(effect)]
+    own = {*(kind for group in KINDS[case.cause] for kind in group), *USUAL}
+    if len(case.arm.servos) == 1:
+        own.add(BodyInertia)  # of the only link: the same as a rotor
+    others = [effect for effect in report.effects if type(effect) not in own and not _is_of_a_step(effect)]
     named = named_causes(report)
     is_right = (case.cause in named or case.cause == "M1") and not others
     return {
