@@ -30,9 +30,9 @@ from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
-from torchrl_h2o.residuals.refit import flat
 from torchrl_h2o.residuals.search import disjoint, known_set, with_intervals
 from torchrl_h2o.residuals.sweep import Direction, sweep
+from torchrl_h2o.residuals.whitened import flat
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -290,9 +290,9 @@ def test_an_effect_whose_interval_holds_its_neutral_value_is_left_out_of_the_las
     entries = [entry_of(effect, CATALOGUE) for effect in effects]
     for truth in (effects[:1], (effects[0], JointDamping(0.03, "elbow"))):
         ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(*truth), 800, noise=0.01))
-        found, half_widths, _ = with_intervals(ground, ground.found(entries, effects), [])
+        found, fit, _ = with_intervals(ground, ground.found(entries, effects), [])
         assert [type(effect) for effect in found.effects] == [type(effect) for effect in truth]
-        assert len(half_widths) == len(truth)
+        assert len(fit.in_another_log) == len(truth)
 
 
 def together(parts):
@@ -312,8 +312,8 @@ def test_the_interval_of_several_logs_holds_the_values_of_each():
             for seed, damping in enumerate(dampings)
         ]
         ground = Ground.of(SIMULATION, together(logs))
-        found, half_widths, _ = with_intervals(ground, ground.found([entry_of(effect, CATALOGUE)], [effect]), [])
-        ends.append((found.effects[0].damping, half_widths[0]["damping"]))
+        found, fit, _ = with_intervals(ground, ground.found([entry_of(effect, CATALOGUE)], [effect]), [])
+        ends.append((found.effects[0].damping, fit.in_another_log[0]["damping"]))
     (value, half), (same, narrow) = ends
     assert same == pytest.approx(0.03, abs=3.0 * narrow)
     assert 0.02 < half < 0.1

@@ -20,10 +20,11 @@ from torchrl_h2o.residuals.forces.candidates import force_entry
 from torchrl_h2o.residuals.gains import summed
 from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, grow, is_preferred, with_force
+from torchrl_h2o.residuals.intervals import interval
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.prune import prune, replaced
-from torchrl_h2o.residuals.refit import fit_set, interval
+from torchrl_h2o.residuals.refit import fit_set
 from torchrl_h2o.residuals.report.contents import SearchStep
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.score import Predictions
@@ -238,8 +239,8 @@ def disjoint(
 
 def with_intervals(
     ground: Ground, found: Found, alike: Sequence[Sequence[Found]]
-) -> tuple[Found, Sequence[Mapping[str, float]], Sequence[Sequence[Found]]]:
-    """A set fitted to the rows for fits and for selection, with half-widths of its intervals, and its alternatives.
+) -> tuple[Found, SetFit, Sequence[Sequence[Found]]]:
+    """A set fitted to the rows for fits and for selection, the fit with its intervals, and the set's alternatives.
 
     Of several logs, an interval is that of the value in another log of the machine: it holds the scatter between logs.
 
@@ -283,7 +284,7 @@ def with_intervals(
             if entry.name not in idle
         ]
         found, fit = fewer, refit
-    return replace(found, effects=fit.effects), fit.in_another_log, alike
+    return replace(found, effects=fit.effects), fit, alike
 
 
 def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
@@ -296,26 +297,26 @@ def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
 
 
 def _explanation(
-    found: Found, half_widths: Sequence[Mapping[str, float]] = (), alike: Sequence[Sequence[Found]] = ()
+    found: Found, fit: SetFit | None = None, alike: Sequence[Sequence[Found]] = ()
 ) -> Explanation:
     """The explanation by a set; the terms of forces are put together, at its end."""
     parts, forces = [], []
     for index, effect in enumerate(found.effects):
-        half = half_widths[index] if half_widths else {}
+        half, in_logs = ({}, {}) if fit is None else (fit.in_another_log[index], fit.in_logs[index])
         ci95 = {name: interval(effect.parameters[name], width) for name, width in half.items()}
         if isinstance(effect, ResidualForce):
-            forces.append((effect, ci95))
+            forces.append((effect, ci95, in_logs))
             continue
         instead = [_alternative(other, found) for other in alike[index] if _is_one(other, found)] if alike else []
-        parts.append(Part(effect, True, ci95, tuple(instead)))
+        parts.append(Part(effect, True, ci95, tuple(instead), in_logs))
     if forces:
-        terms = tuple(term for effect, _ in forces for term in effect.terms)
-        ci95 = {
-            f"{name.rsplit('_', 1)[0]}_{index}": ends
-            for index, (_, own) in enumerate(forces, start=1)
-            for name, ends in own.items()
-        }
-        parts.append(Part(ResidualForce(terms), False, ci95))
+        effects, *by_name = zip(*forces, strict=True)
+        terms = tuple(term for effect in effects for term in effect.terms)
+        ci95, in_logs = (
+            {f"{name.rsplit('_', 1)[0]}_{i}": value for i, own in enumerate(owns, start=1) for name, value in own.items()}
+            for owns in by_name
+        )
+        parts.append(Part(ResidualForce(terms), False, ci95, in_logs=in_logs))
     others = {other.names: other.effects for sets in alike for other in sets if not _is_one(other, found)}
     return Explanation(tuple(parts), others=tuple(others.values()))
 

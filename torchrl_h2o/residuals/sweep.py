@@ -24,9 +24,9 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.residuals.elements import elements
 from torchrl_h2o.residuals.model_bounds import lowest_value
-from torchrl_h2o.residuals.refit import flat
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.whitened import flat
 
 #: effects that act otherwise at each size, so that every trial is simulated
 NOT_LINEAR = (
