@@ -44,15 +44,9 @@ class InLogs:
 
     @property
     def p_value(self) -> float | None:
-        """p-value of equal values in all logs, by Cochran's Q; None if fewer than two logs contain the value.
-
-        W. G. Cochran, *The combination of estimates from different experiments*, Biometrics 10 (1954), 101-129.
-        """
-        known = np.isfinite(self.errors)
-        if known.sum() < 2:
-            return None
-        (q,) = _weighted(np.array(self.values)[:, None], np.array(self.errors)[:, None] ** 2)[2]
-        return float(chi2.sf(q, known.sum() - 1))
+        """p-value of equal values in all logs, see :func:`p_values`; None if fewer than two logs contain the value."""
+        found = float(p_values(np.array(self.values)[:, None], np.array(self.errors)[:, None] ** 2)[0])
+        return None if math.isnan(found) else found
 
     @property
     def agree(self) -> bool | None:
@@ -67,6 +61,24 @@ class InLogs:
             if len(values) > 1:
                 return min(values), max(values)
         return math.nan, math.nan
+
+
+def p_values(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """p-values of equal values in all logs by Cochran's Q, (p,); NaN for a value that fewer than two logs contain.
+
+    W. G. Cochran, *The combination of estimates from different experiments*, Biometrics 10 (1954), 101-129.
+
+    Args:
+        values: the values in each log, (logs, p).
+        variances: squared standard errors of these, (logs, p); infinite for a log that does not contain the value.
+
+    Examples:
+        >>> import numpy as np
+        >>> p_values(np.array([[1.0, 1.0], [1.1, 2.0]]), np.array([[0.01, 0.01], [0.01, np.inf]])).round(2).tolist()
+        [0.48, nan]
+    """
+    q, logs = _weighted(values, variances)[2], np.isfinite(variances).sum(0)
+    return np.where(logs > 1, chi2.sf(q, np.maximum(logs - 1, 1)), np.nan)
 
 
 def scatter_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:

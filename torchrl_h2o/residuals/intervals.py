@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
 from torchrl_h2o.effects import Parameter
-from torchrl_h2o.residuals.between_logs import scatter_between
+from torchrl_h2o.residuals.between_logs import LEVEL, p_values, scatter_between
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.whitened import Whitened, block_of, weights
 
@@ -37,13 +38,20 @@ class Spreads:
     errors: np.ndarray
 
 
-def spreads_of(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Sequence[np.ndarray]) -> Spreads:
+def spreads_of(
+    parts: Sequence[Predictions],
+    found: Sequence[Whitened],
+    slopes: Sequence[np.ndarray],
+    white_at: Callable[[np.ndarray], np.ndarray],
+) -> Spreads:
     """Sandwich estimates with each block as one observation, of all logs and of each log alone.
 
     Args:
         parts: predictions of the rows of the fit.
         found: errors of each part, see :func:`~torchrl_h2o.residuals.whitened.whitened`.
         slopes: derivatives of the errors by the variables, (N, p) for each part.
+        white_at: simulates the whitened errors of all parts, (N,), at other values of the variables, (p,). It is called
+            for each log if they differ, because what is not linear in one value then shows in the others.
     """
     count, logs, blocks, rows = 0, [], [], []
     for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
@@ -51,14 +59,14 @@ def spreads_of(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: 
         logs.append(np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first])
         blocks.append(count + block)
         weight = share * weights(white)
-        rows.append((slope * inverse[:, None], weight, weight * white))
+        rows.append((slope * inverse[:, None], weight, white))
         count += len(part.blocks)
     log_of, block = np.concatenate(logs), np.concatenate(blocks)
-    scaled, weight, pull = (np.concatenate(one) for one in zip(*rows, strict=True))
+    scaled, weight, white = (np.concatenate(one) for one in zip(*rows, strict=True))
 
-    def solved(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For some blocks alone, if the errors are linear: the move to the best values, its squared errors, and which
-        values these blocks contain."""
+    def solved(chosen: np.ndarray, begin: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For some blocks alone, if the errors are linear about a move to begin with: the move to the best values, its
+        squared errors, and which values these blocks contain."""
         own = chosen[block]
         curvature = scaled[own].T @ (weight[own, None] * scaled[own])
         size = np.sqrt(np.diag(curvature))
@@ -67,19 +75,31 @@ def spreads_of(parts: Sequence[Predictions], found: Sequence[Whitened], slopes: 
         bread = np.linalg.pinv(curvature, rcond=SINGULAR, hermitian=True)
         is_known = (np.diag(bread @ curvature) > KNOWN) & (chosen.sum() > len(size))
         bread = bread / np.outer(size, size)
-        move = -bread @ (scaled[own].T @ pull[own])
+        move = -bread @ (scaled[own].T @ (weight[own] * white[own]))
         pulls = np.zeros((count, len(size)))
-        np.add.at(pulls, block[own], scaled[own] * (pull[own] + weight[own] * (scaled[own] @ move))[:, None])
+        np.add.at(pulls, block[own], scaled[own] * (weight[own] * (white[own] + scaled[own] @ move))[:, None])
         spare = chosen.sum() / max(1, chosen.sum() - len(size))
-        return move, np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0), is_known
+        return begin + move, np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0), is_known
 
-    half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool))[1])
+    here = np.zeros(scaled.shape[1])
+    half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool), here, white)[1])
     names = np.unique(log_of)
-    moves, variances, is_known = map(np.stack, zip(*(solved(log_of == log) for log in names), strict=True))
-    variances[~is_known] = np.inf
-    known = np.maximum(2, is_known.sum(0))
+    moves, variances = _each([solved(log_of == log, here, white) for log in names])
+    if (p_values(moves, variances) < LEVEL).any():
+        begins = np.where(moves**2 > variances, moves, 0.0)
+        with suppress(ValueError):  # the model does not take these values
+            moves, variances = _each(
+                [solved(log_of == log, begin, white_at(begin)) for log, begin in zip(names, begins, strict=True)]
+            )
+    known = np.maximum(2, np.isfinite(variances).sum(0))
     between = student.ppf(0.975, known - 1) * np.sqrt(scatter_between(moves, variances) * (1.0 + 1.0 / known))
     return Spreads(half, between, tuple(names.tolist()), moves, np.sqrt(variances))
+
+
+def _each(solutions: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """The moves of each log, and their squared errors, infinite where the log does not contain the value, (logs, p)."""
+    moves, variances, is_known = map(np.stack, zip(*solutions, strict=True))
+    return moves, np.where(is_known, variances, np.inf)
 
 
 def interval(parameter: Parameter, half_width: float) -> tuple[float, float]:

@@ -193,7 +193,12 @@ def fit_set(
     if intervals and variables:
         slopes = slopes_of(parts, effects, variables, errors)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
-        spreads = spreads_of(parts, weighted, slopes)
+
+        def white_at(x: np.ndarray) -> np.ndarray:
+            moved = [part.errors(with_values(effects, variables, x)) for part in parts]
+            return np.concatenate([whitened(*each)[0] for each in zip(parts, moved, scales, strict=True)])
+
+        spreads = spreads_of(parts, weighted, slopes, white_at)
         for index, variable in enumerate(variables):
             slope = variable.slope(0.0)
             widths[variable.effect][variable.name] = spreads.half_widths[index] * abs(slope)
@@ -201,7 +206,7 @@ def fit_set(
             if len(spreads.logs) > 1:
                 in_logs[variable.effect][variable.name] = InLogs(
                     spreads.logs,
-                    tuple((variable.value + slope * spreads.moves[:, index]).tolist()),
+                    tuple(map(variable.at, spreads.moves[:, index].tolist())),
                     tuple((abs(slope) * spreads.errors[:, index]).tolist()),
                     abs(variable.value - (variable.neutral if math.isfinite(variable.neutral) else 0.0)),
                 )

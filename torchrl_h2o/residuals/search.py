@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -24,12 +25,14 @@ from torchrl_h2o.residuals.intervals import interval
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.prune import prune, replaced
-from torchrl_h2o.residuals.refit import fit_set
+from torchrl_h2o.residuals.refit import SetFit, fit_set
 from torchrl_h2o.residuals.report.contents import SearchStep
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, alone_on, sweep
+
+T = TypeVar("T")
 
 RESWEPT = 64  # entries of the largest estimated gain, which are simulated again in later sweeps
 NEUTRAL = 0.1  # half-widths from neutral up to which effects are left out together
@@ -296,9 +299,7 @@ def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
     return abs(parameter.value - parameter.neutral) / half if half > 0.0 else math.inf
 
 
-def _explanation(
-    found: Found, fit: SetFit | None = None, alike: Sequence[Sequence[Found]] = ()
-) -> Explanation:
+def _explanation(found: Found, fit: SetFit | None = None, alike: Sequence[Sequence[Found]] = ()) -> Explanation:
     """The explanation by a set; the terms of forces are put together, at its end."""
     parts, forces = [], []
     for index, effect in enumerate(found.effects):
@@ -310,15 +311,16 @@ def _explanation(
         instead = [_alternative(other, found) for other in alike[index] if _is_one(other, found)] if alike else []
         parts.append(Part(effect, True, ci95, tuple(instead), in_logs))
     if forces:
-        effects, *by_name = zip(*forces, strict=True)
+        effects, intervals, each = zip(*forces, strict=True)
         terms = tuple(term for effect in effects for term in effect.terms)
-        ci95, in_logs = (
-            {f"{name.rsplit('_', 1)[0]}_{i}": value for i, own in enumerate(owns, start=1) for name, value in own.items()}
-            for owns in by_name
-        )
-        parts.append(Part(ResidualForce(terms), False, ci95, in_logs=in_logs))
+        parts.append(Part(ResidualForce(terms), False, _of_terms(intervals), in_logs=_of_terms(each)))
     others = {other.names: other.effects for sets in alike for other in sets if not _is_one(other, found)}
     return Explanation(tuple(parts), others=tuple(others.values()))
+
+
+def _of_terms(each: Sequence[Mapping[str, T]]) -> dict[str, T]:
+    """What belongs to the parameters of single terms, by the parameters of the force with all these terms."""
+    return {f"{name.rsplit('_', 1)[0]}_{i}": one for i, own in enumerate(each, start=1) for name, one in own.items()}
 
 
 def _is_one(other: Found, found: Found) -> bool:
