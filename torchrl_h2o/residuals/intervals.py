@@ -84,13 +84,16 @@ def spreads_of(
     here = np.zeros(scaled.shape[1])
     half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool), here, white)[1])
     names = np.unique(log_of)
-    moves, variances = _each([solved(log_of == log, here, white) for log in names])
+    solutions = [solved(log_of == log, here, white) for log in names]
+    moves, variances = _each(solutions)
     if (p_values(moves, variances) < LEVEL).any():
-        begins = np.where(moves**2 > variances, moves, 0.0)
-        with suppress(ValueError):  # the model does not take these values
-            moves, variances = _each(
-                [solved(log_of == log, begin, white_at(begin)) for log, begin in zip(names, begins, strict=True)]
-            )
+        for index, begin in enumerate(np.where(moves**2 > variances, moves, 0.0)):
+            chosen = log_of == names[index]
+            with suppress(ValueError):  # the model does not take these values
+                nearer = white_at(begin)
+                if (weight * (nearer**2 - white**2)) @ chosen[block] < 0.0:
+                    solutions[index] = solved(chosen, begin, nearer)
+        moves, variances = _each(solutions)
     known = np.maximum(2, np.isfinite(variances).sum(0))
     between = student.ppf(0.975, known - 1) * np.sqrt(scatter_between(moves, variances) * (1.0 + 1.0 / known))
     return Spreads(half, between, tuple(names.tolist()), moves, np.sqrt(variances))

@@ -11,6 +11,7 @@ import jinja2
 
 from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.agreement import logged_values
 from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
 from torchrl_h2o.residuals.report.mended_model import REMEDY
 from torchrl_h2o.residuals.report.sentence import sentences
@@ -73,6 +74,7 @@ def report_page(report: ReportContents) -> str:
         parameters=_parameters,
         ranking=_ranking(report),
         shown_runs=sorted(report.runs, key=_worst_first)[:SHOWN_RUNS],
+        logged=logged_values(report),
         remedy=REMEDY,
         held=_held(report),
         pictures=_pictures(report),

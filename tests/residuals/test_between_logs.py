@@ -1,0 +1,71 @@
+"""Several logs of one machine: which values agree between them, which do not, and which a log does not contain."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import pendulum, recorded
+from tests.residuals.test_search import together
+from torchrl_h2o.effects import BodyMass, JointFrictionLoss
+from torchrl_h2o.effects.catalogue.entry import entry_of
+from torchrl_h2o.residuals import close_the_loop
+from torchrl_h2o.residuals.ground import Ground
+from torchrl_h2o.residuals.report.document import Report
+from torchrl_h2o.residuals.report.page import report_page
+from torchrl_h2o.residuals.search import with_intervals
+
+SIMULATION = pendulum()
+KINDS = JointFrictionLoss, BodyMass
+CATALOGUE = [entry for entry in SIMULATION.catalogue() if isinstance(entry.effect, KINDS)]
+MASS = next(entry.effect for entry in CATALOGUE if isinstance(entry.effect, BodyMass)).with_parameters({"scale": 1.3})
+
+
+def logs(*frictions, rows=900):
+    """A log with each friction, in N·m, of a pendulum of one mass."""
+    return [
+        recorded(SIMULATION.with_effects(JointFrictionLoss(friction, "elbow"), MASS), rows, noise=0.01, seed=seed)
+        for seed, friction in enumerate(frictions)
+    ]
+
+
+def fitted(parts):
+    effects = JointFrictionLoss(0.05, "elbow"), MASS
+    ground = Ground.of(SIMULATION, together(parts))
+    return with_intervals(ground, ground.found([entry_of(effect, CATALOGUE) for effect in effects], effects), [])
+
+
+def test_a_report_says_that_the_friction_differs_between_logs_and_the_mass_does_not(tmp_path):
+    report = close_the_loop(SIMULATION, together(logs(0.03, 0.05, 0.07)), CATALOGUE, progress=False)
+    friction, mass = sorted(report.found, key=lambda one: one.name, reverse=True)
+    assert friction.in_logs["torque"].values == pytest.approx((0.03, 0.05, 0.07), abs=0.004)
+    assert not friction.in_logs["torque"].agree
+    assert mass.in_logs["scale"].agree
+    assert f"The 3 logs agree on {mass.words}." in report.sentence()
+    assert f"The 3 logs differ in {friction.words} (" in report.sentence()
+    loaded = Report.load(report.save(tmp_path))
+    assert loaded.found == report.found
+    assert "differ, 0.0" in report_page(loaded)
+
+
+def test_equal_logs_agree():
+    _, fit, _ = fitted(logs(0.05, 0.05, 0.05))
+    assert [one.agree for own in fit.in_logs for one in own.values()] == [True, True]
+    assert {kind for own in fit.in_logs for one in own.values() for kind in one.kinds} == {"identifiable"}
+
+
+def test_one_log_has_nothing_to_agree_with():
+    measured = replace(logs(0.05)[0], log=None)
+    report = close_the_loop(SIMULATION, measured, CATALOGUE, progress=False)
+    assert all(not found.in_logs for found in report.found)
+    assert "logs" not in report.sentence()
+
+
+def test_a_log_at_rest_contains_no_value_and_does_not_widen_the_intervals():
+    moving = logs(0.05, 0.05)
+    still = {name: np.zeros_like(getattr(moving[0], name)) for name in ("observation", "following", "action")}
+    rest = replace(moving[0], **still)
+    (_, two, _), (_, three, _) = fitted(moving), fitted([*moving, rest])
+    for own, more, name in zip(two.in_another_log, three.in_another_log, ("torque", "scale"), strict=True):
+        assert more[name] == pytest.approx(own[name], rel=0.3)
+    assert {own.kinds[2] for each in three.in_logs for own in each.values()} == {"not identifiable"}
