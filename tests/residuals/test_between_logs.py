@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import pendulum, recorded
+from tests.residuals.pendulum import double_pendulum, pendulum, recorded
 from tests.residuals.test_search import together
-from torchrl_h2o.effects import BodyMass, JointFrictionLoss
+from torchrl_h2o.effects import BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import close_the_loop
 from torchrl_h2o.residuals.ground import Ground
@@ -69,3 +69,18 @@ def test_a_log_at_rest_contains_no_value_and_does_not_widen_the_intervals():
     for own, more, name in zip(two.in_another_log, three.in_another_log, ("torque", "scale"), strict=True):
         assert more[name] == pytest.approx(own[name], rel=0.3)
     assert {own.kinds[2] for each in three.in_logs for own in each.values()} == {"not identifiable"}
+
+
+def test_what_is_not_linear_in_a_value_that_differs_does_not_make_another_one_differ():
+    simulation = double_pendulum()
+    parts = [
+        recorded(simulation.with_effects(JointDamping(damping, "elbow"), Gravity(1.3)), 800, noise=0.01, seed=seed)
+        for seed, damping in enumerate((0.02, 0.03, 0.04))
+    ]
+    effects = JointDamping(0.03, "elbow"), Gravity(1.3)
+    entries = [entry_of(effect, simulation.catalogue()) for effect in effects]
+    ground = Ground.of(simulation, together(parts))
+    _, fit, _ = with_intervals(ground, ground.found(entries, effects), [])
+    assert fit.in_logs[0]["damping"].values == pytest.approx((0.02, 0.03, 0.04), abs=0.001)
+    assert not fit.in_logs[0]["damping"].agree
+    assert fit.in_logs[1]["scale"].agree

@@ -3,10 +3,11 @@
 import sys
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from tests.residuals.pendulum import DOUBLE, double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     ActionBias,
     ActionDelay,
@@ -18,11 +19,13 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointForce,
     JointFrictionLoss,
+    JointRange,
     JointSpring,
     Payload,
     ResidualForce,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
+from torchrl_h2o.effects.model.joint import LOCKED
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.evidence import why_no_conclusion
 from torchrl_h2o.residuals.explanation import Tried
@@ -395,3 +398,14 @@ def test_the_most_unusual_of_a_kind_counts_and_each_term_of_a_force():
     assert surprise_of(two) == 2 * surprise_of(one)  # joints have friction in common, but not forces
     one, two = (ResidualForce(("torque on elbow: 0.1 · t",) * n) for n in (1, 2))
     assert 0 < surprise_of([one]) < surprise_of([two])
+
+
+def test_a_joint_that_is_locked_in_reality_is_no_joint_with_a_heavy_rotor():
+    """Both keep the joint at its place, and the lock is the usual cause."""
+    free = '<joint name="elbow" type="hinge" axis="0 1 0"/>'
+    xml = DOUBLE.replace(free, free.replace("/>", ' limited="true" range="-1 1"/>'))
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(xml))
+    measured = recorded(simulation.with_effects(JointRange(LOCKED, "elbow")), 800, noise=0.005)
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, JointRange | Armature)]
+    explanation = search(simulation, measured, catalogue, progress=LoopBar(disable=True))
+    assert explanation.effects == (JointRange(LOCKED, "elbow"),)
