@@ -51,10 +51,11 @@ def test_a_target_does_not_hold_into_the_next_run(tmp_path):
     rows = slower_targets(40) + slower_targets(40, first=20)
     td = load(write(tmp_path, rows), columns={**COLUMNS, "on_time_jump": "split"})
     assert [float(run["time"][0]) for run in episodes(td)] == pytest.approx([0.0, 0.04])
-    numbered = [(*row, i // 40) for i, row in enumerate(rows)]
-    columns = {**COLUMNS, "columns": [*COLUMNS["columns"], {"name": "run", "role": "run"}]}
-    td = load(write(tmp_path, numbered, (*NAMES, "run")), columns=columns)
-    assert [float(run["time"][0]) for run in episodes(td)] == pytest.approx([0.0, 0.04])
+    for role, values in (("run", [i // 40 for i in range(80)]), ("done", [int(i == 39) for i in range(80)])):
+        marked = [(0.002 * i, *row[1:], values[i]) for i, row in enumerate(rows)]
+        columns = {**COLUMNS, "columns": [*COLUMNS["columns"], {"name": role, "role": role}]}
+        td = load(write(tmp_path, marked, (*NAMES, role)), columns={**columns, "after_done": "new_episode"})
+        assert [float(run["time"][0]) for run in episodes(td)] == pytest.approx([0.0, 0.12])
 
 
 def test_rows_without_readings_are_left_out_behind_their_targets(tmp_path, log_messages):
@@ -102,9 +103,13 @@ def test_a_layout_is_guessed_from_targets_and_readings_of_any_rate(tmp_path):
     slow = [(0.002 * i, np.sin(0.1 * i), 50.0 * np.cos(0.1 * i), i if i % 10 == 0 else None) for i in range(200)]
     targets = [(0.002 * i + 0.001, None, None, np.sin(i)) for i in range(200)]
     readings = [(0.01 * i, np.sin(0.1 * i), 10.0 * np.cos(0.1 * i), None) for i in range(41)]
-    for rows in (slow, sorted(targets + readings)):
+    for rows, step in ((slow, 0.002), (sorted(targets + readings), 0.01)):
         path = write(tmp_path, rows, names)
-        layout = LogColumns.load(yaml.safe_load(guess_layout(path)))
+        text = guess_layout(path)
+        assert f"the median step is {step:g}," in text
+        assert "slope of hip_pos: 1 times this" in text
+        layout = LogColumns.load(yaml.safe_load(text))
+        assert layout.resample is None
         assert layout.observation == ("hip_pos", "hip_vel")
         assert layout.action == ("tau",)
         assert len(load(path, columns=layout)) > 35
