@@ -1,15 +1,18 @@
 """Several logs of one machine: which values agree between them, which do not, and which a log does not contain."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from tests.residuals.report.made_up_reports import few_pictures, full_report
 from tests.residuals.test_search import together
 from torchrl_h2o.effects import BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import close_the_loop
+from torchrl_h2o.residuals.between_logs import InLogs
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.page import report_page
@@ -84,3 +87,17 @@ def test_what_is_not_linear_in_a_value_that_differs_does_not_make_another_one_di
     assert fit.in_logs[0]["damping"].values == pytest.approx((0.02, 0.03, 0.04), abs=0.001)
     assert not fit.in_logs[0]["damping"].agree
     assert fit.in_logs[1]["scale"].agree
+
+
+def test_a_report_names_the_logs_that_do_not_contain_a_value_and_keeps_them_in_its_file(tmp_path):
+    report = few_pictures(full_report())
+    gravity, mass, friction = report.found
+    gravity = replace(gravity, in_logs={"scale": InLogs((0, 1, 2), (0.5, 0.5, 0.5), (0.01, 0.3, math.inf), 0.5)})
+    mass = replace(mass, in_logs={"scale": InLogs((0, 1, 2), (1.2, 1.2, 1.2), (0.01, math.inf, math.inf), 0.2)})
+    report = replace(report, found=(gravity, mass, friction))
+    words = report.sentence()
+    assert "The 3 logs agree on gravity × 0.5." in words
+    assert "Not every log contains gravity × 0.5 (weak in log 1, not identifiable in log 2) and mass" in words
+    loaded = Report.load(report.save(tmp_path))
+    assert loaded.found == report.found
+    assert "in one log only" in report_page(loaded)

@@ -16,6 +16,7 @@ from torchrl_h2o.residuals.report.words import number, quantity
 NAMED = 4  # values that a sentence names
 _SIDES = r"left|right|front|back|rear|hind|[fbrh]?[lr]|[fbrh]"  # of a robot, as words in the names of its joints
 _SIDE = re.compile(rf"(?<![^\W\d_])(?:{_SIDES})(?![^\W\d_])[\W_]*", re.IGNORECASE)
+_ONE_VALUE = re.compile(r" [+×] \{\w+\}")  # how the wording of an effect of one value ends
 
 
 @dataclass(frozen=True)
@@ -111,9 +112,9 @@ def equal_joints_words(report: ReportContents) -> list[str]:
         joint = getattr(found.effect, "joints", "*")
         what, _, rest = found.effect.wording.partition(" of {joints}")
         name = _SIDE.sub("", joint).strip("_") if isinstance(joint, str) else ""
-        if rest and name not in ("", joint):
-            for key, parameter in found.effect.parameters.items():
-                groups.setdefault((name, what, found.units[key]), []).append(parameter.value)
+        if _ONE_VALUE.fullmatch(rest) and name not in ("", joint):
+            for _, unit, value, _ in found.values:
+                groups.setdefault((name, what, unit), []).append(value)
     return [
         f"Of the {len(values)} joints {name}, the {what} is {quantity(float(np.mean(values)), unit)} on average, with "
         f"a standard deviation of {number(float(np.std(values, ddof=1)))}."
