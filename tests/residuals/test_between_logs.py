@@ -44,8 +44,8 @@ def test_a_report_says_that_the_friction_differs_between_logs_and_the_mass_does_
     assert friction.in_logs["torque"].values == pytest.approx((0.03, 0.05, 0.07), abs=0.004)
     assert not friction.in_logs["torque"].agree
     assert mass.in_logs["scale"].agree
-    assert f"The 3 logs agree on {mass.words}." in report.sentence()
-    assert f"The 3 logs differ in {friction.words} (" in report.sentence()
+    assert f"The 3 fitted logs agree on {mass.words}." in report.sentence()
+    assert f"The 3 fitted logs differ in {friction.words} (" in report.sentence()
     loaded = Report.load(report.save(tmp_path))
     assert loaded.found == report.found
     assert "differ, 0.0" in report_page(loaded)
@@ -96,7 +96,7 @@ def test_a_report_names_the_logs_that_do_not_contain_a_value_and_keeps_them_in_i
     mass = replace(mass, in_logs={"scale": InLogs((0, 1, 2), (1.2, 1.2, 1.2), (0.01, math.inf, math.inf), 0.2)})
     report = replace(report, found=(gravity, mass, friction))
     words = report.sentence()
-    assert "The 3 logs agree on gravity × 0.5." in words
+    assert "The 3 fitted logs agree on gravity × 0.5." in words
     assert "Not every log contains gravity × 0.5 (weak in log 1, not identifiable in log 2) and mass" in words
     loaded = Report.load(report.save(tmp_path))
     assert loaded.found == report.found

@@ -88,7 +88,7 @@ def agreement_words(report: ReportContents) -> list[str]:
     agree = [one.words for one in values if one.in_logs.agree]
     differ = [f"{one.words} ({one.range})" for one in values if one.in_logs.agree is False]
     lacking = [f"{one.words} ({one.lacking})" for one in values if one.lacking]
-    logs = f"The {len(values[0].in_logs.logs)} logs"
+    logs = f"The {len(values[0].in_logs.logs)} fitted logs"
     return [
         *([f"{logs} agree on {_some(agree)}."] if agree else []),
         *([f"{logs} differ in {_some(differ)}."] if differ else []),
