@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
 from tests.residuals.pendulum import double_pendulum, pendulum, recorded
 from tests.residuals.report.made_up_reports import few_pictures, full_report
@@ -12,8 +13,9 @@ from tests.residuals.test_search import together
 from torchrl_h2o.effects import BodyMass, Gravity, JointDamping, JointFrictionLoss
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals import close_the_loop
-from torchrl_h2o.residuals.between_logs import InLogs
+from torchrl_h2o.residuals.between_logs import InLogs, half_widths_between
 from torchrl_h2o.residuals.ground import Ground
+from torchrl_h2o.residuals.intervals import CONFIDENCE
 from torchrl_h2o.residuals.report.document import Report
 from torchrl_h2o.residuals.report.page import report_page
 from torchrl_h2o.residuals.search import with_intervals
@@ -101,3 +103,27 @@ def test_a_report_names_the_logs_that_do_not_contain_a_value_and_keeps_them_in_i
     loaded = Report.load(report.save(tmp_path))
     assert loaded.found == report.found
     assert "in one log only" in report_page(loaded)
+
+
+@pytest.mark.parametrize("scatter", [0.0, 1.0, 2.0, 10.0])
+@pytest.mark.parametrize("logs", [2, 4])
+def test_the_value_of_another_log_lies_in_the_interval_of_a_few_logs(logs, scatter):
+    """Also where the scatter between logs is about as large as their errors, so that they may agree by chance."""
+    rng, draws = np.random.default_rng(0), 2000
+    errors = np.exp(0.3 * rng.standard_normal((logs, draws)))
+    values = scatter * rng.standard_normal((logs, draws)) + errors * rng.standard_normal((logs, draws))
+    total = (errors**-2.0).sum(0)
+    mean = (values / errors**2).sum(0) / total
+    half = np.hypot(CONFIDENCE / np.sqrt(total), half_widths_between(values, errors**2))
+    share = (np.abs(scatter * rng.standard_normal(draws) - mean) < half).mean()
+    assert 0.935 < share <= (1.0 if scatter < 1.0 else 0.985)
+
+
+def test_a_log_that_does_not_contain_a_value_changes_no_interval():
+    values, errors = np.array([[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [9.0, 9.0]]), np.full((4, 2), 0.1)
+    errors[3] = np.inf
+    half = half_widths_between(values, errors**2)
+    assert half == pytest.approx(half_widths_between(values[:3], errors[:3] ** 2))
+    assert half == pytest.approx(student.ppf(0.975, 2) * np.sqrt(1.0 + 1.0 / 3.0), rel=0.03)  # errors are small
+    errors[1:] = np.inf
+    assert (half_widths_between(values, errors**2) == 0.0).all()

@@ -6,11 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 IDENTIFIABLE, WEAK, NOT_IDENTIFIABLE = "identifiable", "weak", "not identifiable"
 LEVEL = 0.05  # p-value above which logs agree
 _WEAK = 0.5  # standard error, as a share of a value's distance from neutral, above which a log hardly contains it
+_QUANTILES = (np.arange(200) + 0.5) / 200  # of the distributions of a variance and of a value
+_VARIANCES = np.geomspace(1e-6, 1e6, 400)  # between logs, in squared ranges or largest squared errors of the values
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,16 @@ def p_values(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
     return np.where(logs > 1, chi2.sf(q, np.maximum(logs - 1, 1)), np.nan)
 
 
-def scatter_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """Variance between logs of values that are known with errors, (p,); 0 for a value that fewer than two logs contain.
+def half_widths_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
+    """Half-widths of the 95 % intervals by which the value in another log differs from the mean of these, (p,).
 
-    R. DerSimonian and N. Laird, *Meta-analysis in clinical trials*, Controlled Clinical Trials 7 (1986), 177-188.
+    Few logs tell little of the variance between logs: even where they agree, it may be as large as their errors allow.
+    Each variance counts as often as its confidence distribution says, by which Cochran's Q with this variance added is
+    chi-squared. 0 for a value that fewer than two logs contain.
+
+    K. Nagashima, H. Noma and T. A. Furukawa, *Prediction intervals for random-effects meta-analysis: a confidence
+    distribution approach*, Statistical Methods in Medical Research 28 (2019), 1689-1702; W. Viechtbauer, *Confidence
+    intervals for the amount of heterogeneity in meta-analysis*, Statistics in Medicine 26 (2007), 37-52.
 
     Args:
         values: the values in each log, (logs, p).
@@ -93,13 +101,20 @@ def scatter_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
     Examples:
         >>> import numpy as np
         >>> errors = np.full((3, 2), 0.01)
-        >>> scatter_between(np.array([[1.0, 0.0], [2.0, 0.1], [3.0, -0.1]]), errors).round(2).tolist()
-        [0.99, 0.0]
+        >>> half_widths_between(np.array([[1.0, 0.0], [2.0, 0.1], [3.0, -0.1]]), errors).round(1).tolist()
+        [5.0, 0.5]
     """
-    weight, total, q = _weighted(values, variances)
-    logs = np.isfinite(variances).sum(0)
-    between = (q - (logs - 1)) / np.maximum(total - (weight**2).sum(0) / total, 1e-300)
-    return np.where(logs > 1, np.maximum(between, 0.0), 0.0)
+    weight, total, _ = _weighted(values, variances)
+    of_mean = (weight**2).sum(0) / total**2
+    found = np.zeros(values.shape[1])
+    for index in np.flatnonzero(np.isfinite(variances).sum(0) > 1):
+        known = np.isfinite(variances[:, index])
+        value, variance = values[known, index][:, None], variances[known, index][:, None]
+        between = _VARIANCES * max(variance.max(), np.ptp(value) ** 2)
+        at_most = chi2.sf(_weighted(value, variance + between)[2], len(value) - 1)
+        scatter = np.sqrt(np.interp(_QUANTILES, at_most, between, left=0.0))
+        found[index] = np.quantile(np.outer(scatter, norm.isf(0.5 * _QUANTILES)), 0.95)
+    return found * np.sqrt(1.0 + of_mean)
 
 
 def _weighted(values: np.ndarray, variances: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

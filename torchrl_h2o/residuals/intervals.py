@@ -7,11 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
 
 from torchrl_h2o.effects import Parameter
 from torchrl_h2o.likelihood import log_density
-from torchrl_h2o.residuals.between_logs import LEVEL, p_values, scatter_between
+from torchrl_h2o.residuals.between_logs import LEVEL, half_widths_between, p_values
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.whitened import Whitened, block_of, excess_of_weights, weights
 
@@ -100,8 +99,7 @@ def spreads_of(
                 if (shares * (log_density(nearer) - log_density(white))) @ chosen[block] > 0.0:
                     solutions[index] = solved(chosen, begin, nearer)
         moves, variances = _each(solutions)
-    known = np.maximum(2, np.isfinite(variances).sum(0))
-    between = student.ppf(0.975, known - 1) * np.sqrt(scatter_between(moves, variances) * (1.0 + 1.0 / known))
+    between = half_widths_between(moves, variances)
     return Spreads(half, between, tuple(names.tolist()), moves, np.sqrt(variances))
 
 
