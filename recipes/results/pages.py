@@ -204,6 +204,27 @@ def failures_table(runs: Runs) -> str:
     return markdown_table(["case", "true", "found", "verdict"], rows or [[f"none of {cases}", "", "", ""]])
 
 
+# Whether its intervals are right
+def coverage_table(runs: Runs) -> str:
+    """A line for each machine: values of logs that were left out, inside the intervals that its other logs gave."""
+    head = [
+        "machine",
+        "series",
+        "values compared",
+        "inside",
+        "inside, with the log's own interval",
+        "true value inside",
+    ]
+    rows = []
+    for machine, own in runs["coverage"].groupby("machine", sort=False) if "coverage" in runs else ():
+        sums = own[["asked", "values", "inside", "inside_widened", "truths", "truths_inside"]].sum()
+        shares = [share(sums[key], sums["values"]) for key in ("inside", "inside_widened")]
+        counted = [str(len(own)), f"{sums['values']} of {sums['asked']}", *shares]
+        last = [number(own["minutes"].mean()), own["commit"].iloc[0]]
+        rows.append([machine, *counted, share(sums["truths_inside"], sums["truths"]), *last])
+    return markdown_table([*head, "CPU min a series", "commit"], rows or [["", "", NOT_RUN, *[""] * 5]])
+
+
 # Training
 def _trainings(runs: Runs) -> pd.DataFrame:
     if "training" not in runs:
@@ -274,6 +295,7 @@ def overview_table(runs: Runs) -> str:
         ["machines", "what it finds in logs of machines", f"{len(runs.get('machines', ()))} of {len(machines())} run"],
         ["drawn", "how often it is right", f"{share(held.sum(), len(held))} draws held back" if len(held) else NOT_RUN],
         ["failures", "where it fails", f"{len(draws) - draws['ok'].sum()} of {len(draws)} draws"],
+        ["intervals", "whether its intervals are right", _covered(runs)],
         [
             "training",
             "training",
@@ -285,6 +307,13 @@ def overview_table(runs: Runs) -> str:
     )
 
 
+def _covered(runs: Runs) -> str:
+    if "coverage" not in runs:
+        return NOT_RUN
+    told = runs["coverage"]
+    return f"{share(told['truths_inside'].sum(), told['truths'].sum())} true values inside"
+
+
 TABLES: dict[str, Callable[[Runs], str]] = {
     "overview": overview_table,
     "machines": machines_table,
@@ -292,6 +321,7 @@ TABLES: dict[str, Callable[[Runs], str]] = {
     "drawn": drawn_table,
     "audit": audit_table,
     "failures": failures_table,
+    "coverage": coverage_table,
     "training": training_table,
     "by_seed": by_seed_table,
     "speed": speed_table,
