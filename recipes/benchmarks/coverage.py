@@ -38,7 +38,7 @@ TABLE = "coverage"
 LOGS, ROWS = 5, 1500  # logs of a series of arms, and rows of each: 15 s
 SCATTER = (0.1, 0.2)  # standard deviation of a value between the arms of a series, as a share of its mean
 SCATTERED = ("friction", "damping", "rotor", "load")  # parts of a servo that differ between the arms of a series
-#: joints and cause of each series of arms
+#: joints and friction of each series of arms: M1 is dry and viscous, M3 also grows with the load
 ARMS = (*((1, "M1"), (1, "M3")) * 4, *((3, "M1"),) * 3)
 LATER = 0.5 * STEP * (1.0 / MODEL_STEPS - 1.0 / SUBSTEPS)  # s by which a servo acts later in the model than in reality
 
@@ -127,8 +127,8 @@ def arms(number: int, seed: int) -> Series:
     for index, log in enumerate(logs):
         log["log"] = torch.full((len(log),), index)
     truths = tuple(_effects(case.arm) for case in cases)
-    machine = f"simulated arms of {count} joint{'s' * (count > 1)}, friction {cause}"
-    return Series(machine, cases[0].simulation(), torch.cat(logs), _effects(mean), truths)
+    machine = f"simulated arms of {count} joint{'s' * (count > 1)}{', friction by load' * (cause == 'M3')}"
+    return Series(machine, cases[0].simulation(), TensorDict.cat(logs), _effects(mean), truths)
 
 
 def _scattered(servo: Servo, scatter: float, rng: np.random.Generator) -> Servo:
