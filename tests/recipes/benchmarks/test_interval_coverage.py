@@ -1,7 +1,7 @@
 """The benchmark of intervals counts which values are inside."""
 
 import pytest
-from coverage import LeftOut, counts
+from interval_coverage import LeftOut, counts
 
 
 def left_out(own, true=None):

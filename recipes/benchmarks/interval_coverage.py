@@ -1,11 +1,11 @@
 """Measures how often the value of a log lies in the 95 % interval that the other logs of its machine gave for it.
 
-python recipes/benchmarks/coverage.py                       # simulated arms, 20 minutes
-python recipes/benchmarks/coverage.py logs=path/to/logs     # also the real double pendulum, logs/double_pendulum
+python recipes/benchmarks/interval_coverage.py                     # simulated arms, 20 minutes
+python recipes/benchmarks/interval_coverage.py logs=path/to/logs   # also the real double pendulum, logs/double_pendulum
 
 Each log of a series is left out in turn. A known set of effects is fitted to the other logs, with intervals of the
-values in another log, and to this log alone. Writes a record for each series to outputs/benchmark/coverage and skips
-those that the same commit has recorded there.
+values in another log, and to this log alone. Writes a record for each series to outputs/benchmark/interval_coverage and
+skips those that the same commit has recorded there.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def main() -> None:
         series=list(range(len(ARMS))),  # of simulated arms
         seed=0,
         logs=None,  # folder of the real logs: double_pendulum/
-        folder="outputs/benchmark/coverage",
+        folder="outputs/benchmark/interval_coverage",
     )
     torch.set_num_threads(1)
     folder = Path(cfg.folder)
