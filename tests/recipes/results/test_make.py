@@ -44,6 +44,18 @@ def test_draws_that_chose_something_are_counted_apart_with_their_intervals(folde
     assert make.make(folder, check=True) == []
 
 
+def test_values_inside_intervals_are_summed_over_the_series_of_a_machine(folder):
+    (folder / "page.md").write_text("<!-- table: coverage -->\n<!-- end -->\n")
+    told = {"machine": "arm", "asked": 5, "values": 4, "inside": 2, "inside_widened": 3}
+    told |= {"truths": 4, "truths_inside": 4}
+    unknown = told | {"machine": "real", "truths": 0, "truths_inside": 0}
+    saved(folder, *(Record("coverage", name, MADE_BY, one) for name, one in (("a", told), ("b", told), ("c", unknown))))
+    make.make(folder)
+    page = (folder / "page.md").read_text()
+    assert "| arm | 2 | 8 of 10 | 4 of 8 [22, 78 %] | 6 of 8 [41, 93 %] | 8 of 8 [68, 100 %] | 2 | abc1234 |" in page
+    assert "| real | 1 | 4 of 5 | 2 of 4 [15, 85 %] | 3 of 4 [30, 95 %] |  | 2 | abc1234 |" in page
+
+
 @pytest.mark.parametrize("other", [{"commit": "def5678"}, {"dirty": True}, {"dirty": None}])
 def test_rows_of_different_code_make_no_table(folder, other):
     saved(folder, drawn("slow", 4, ok=True), drawn("slow", 6, ok=True, **other))
