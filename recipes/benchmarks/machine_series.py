@@ -1,0 +1,136 @@
+"""Series of machines whose parts scatter, and the worlds of domain randomisation in which policies for them train."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import mujoco
+import numpy as np
+import torch
+from robot_cases import EFFECTS as ROBOT
+from systems import SYSTEMS
+from tensordict import TensorDict
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
+
+from torchrl_h2o.effects import (
+    ActionDelay,
+    ActionGain,
+    Armature,
+    BodyMass,
+    Effect,
+    GeomFriction,
+    JointDamping,
+    JointFrictionLoss,
+    Payload,
+)
+from torchrl_h2o.envs import BatchedMujocoEnv
+from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.returns import Evaluation
+
+World = tuple[Effect, ...]
+USUAL = 0.2  # the usual range of domain randomisation, as a share of each number of the model
+
+
+@dataclass(frozen=True)
+class Series:
+    """Machines of one kind, numbered; each has its own values of what their simulator lacks.
+
+    Args:
+        system: a name of :data:`~systems.SYSTEMS`.
+        missing: what the simulator lacks, with the mean values of the series. Only the first parameter of each effect
+            scatters; further ones say where it acts.
+        episode: control steps of an episode of the evaluation.
+        score: name and function of what is reported beside the return.
+        options: of the training, where they differ from the robot's.
+    """
+
+    system: str
+    missing: World
+    episode: int
+    score: tuple[str, Callable[[Evaluation], float]]
+    options: tuple[str, ...] = ()
+
+    def machine(self, number: int, scatter: float) -> World:
+        """Draws a machine.
+
+        Args:
+            number: of the machine in the series; the same number is the same machine.
+            scatter: standard deviation of each value, as a share of it.
+        """
+        rng = np.random.default_rng(number)
+
+        def drawn(effect: Effect) -> Effect:
+            name, size = next(iter(effect.parameters.items()))
+            return effect.with_parameters({name: size.neutral + rng.normal(1.0, scatter) * (size.value - size.neutral)})
+
+        return tuple(map(drawn, self.missing))
+
+    def logs(self, machines: int, rows: int, scatter: float, noise: float) -> TensorDict:
+        """Records a log of each of the first machines, TED ``(machines · rows,)`` with the entry ``log``.
+
+        Args:
+            machines: number of machines.
+            rows: transitions of each log.
+            scatter: see :meth:`machine`.
+            noise: standard deviation of every sensor's noise, as a share of the signal's own.
+        """
+        logs = []
+        for number in range(machines):
+            log = SYSTEMS[self.system].record(self.machine(number, scatter), rows, number, noise=noise)
+            logs.append(log.set("log", torch.full((rows,), number)))
+        return torch.cat(logs)
+
+    def simulator(self) -> EnvBase:
+        """Builds the simulator without any of what it lacks."""
+        return SYSTEMS[self.system].env(episode=self.episode)
+
+    def worlds(self, effects: Sequence[World], preprocessing: Preprocessing) -> EnvBase:
+        """Builds simulated worlds with these effects, stepped together."""
+        env = BatchedMujocoEnv(self.simulator(), len(effects), effects, num_threads=1)
+        return TransformedEnv(env, Compose(DoubleToFloat(), *preprocessing.transforms()))
+
+
+SERIES: Mapping[str, Series] = MappingProxyType(
+    {
+        "robot": Series("wheel_legged", ROBOT, 6000, ("seconds stood", lambda found: 0.005 * found.mean_length)),
+        "arm": Series(
+            "reaching arm",
+            (
+                JointFrictionLoss(0.4, joints="shoulder"),
+                JointFrictionLoss(0.15, joints="elbow"),
+                Payload(0.2, z=-0.3, bodies="lower"),
+                ActionDelay(0.01),
+            ),
+            500,
+            ("tracking error, mm", lambda found: -1000.0 * found.mean / found.mean_length),
+            ("reward_offset=0.0", "reward_scale=1.0", "gamma=0.99"),
+        ),
+    }
+)
+
+
+def usual_world(model: mujoco.MjModel, rng: np.random.Generator) -> World:
+    """Draws every mass, friction, damping, armature and actuator gain of a model within ± 20 %; zeros stay zero.
+
+    Args:
+        model: the model of the simulator.
+        rng: draws uniformly, each number by itself; inertia changes with the mass.
+    """
+    joints = [model.joint(i) for i in range(model.njnt)]
+    added = ((JointDamping, "damping"), (JointFrictionLoss, "frictionloss"), (Armature, "armature"))
+    scaled = (
+        *(BodyMass(bodies=model.body(i).name) for i in range(1, model.nbody)),
+        *(GeomFriction(geoms=model.geom(i).name) for i in range(model.ngeom) if model.geom_contype[i]),
+        *(ActionGain(actuators=i) for i in range(model.nu)),
+    )
+    return (
+        *(effect.with_parameters({"scale": 1.0 + rng.uniform(-USUAL, USUAL)}) for effect in scaled),
+        *(
+            kind(float(rng.uniform(-USUAL, USUAL) * getattr(joint, field)[0]), joint.name)
+            for joint in joints
+            for kind, field in added
+            if getattr(joint, field)[0]
+        ),
+    )

@@ -1,0 +1,148 @@
+"""Compares domain randomisation by measured ranges with ± 20 % of everything and with none, on series of machines.
+
+python recipes/benchmarks/randomization.py                                  # both series, an hour on one core
+python recipes/benchmarks/randomization.py series=[arm] seeds=[0] updates=4000
+
+The machines of a series differ in what their simulator lacks. The first ones give logs, from which close_the_loop
+measures ranges. SAC trains in worlds drawn from these ranges, in worlds of the usual ranges, and without
+randomisation; each policy is evaluated in further machines, which gave no log. Writes the reports and a record of
+each policy to outputs/benchmark/randomization, skips those that are there, and prints the means over seeds.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import islice, product
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from machine_series import SERIES, Series, World, usual_world
+from omegaconf import DictConfig, OmegaConf
+from options import read_options, run_options
+from tensordict import TensorDict
+from torch.optim.lr_scheduler import LinearLR
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
+from torchrl_h2o.commands.one_line_errors import one_line_errors
+from torchrl_h2o.comparison.interval_table import differences, interval_table
+from torchrl_h2o.comparison.records import Record, read_records
+from torchrl_h2o.envs import mujoco_model
+from torchrl_h2o.provenance import cpu_seconds
+from torchrl_h2o.residuals import Report, close_the_loop
+from torchrl_h2o.training.methods import METHODS
+from torchrl_h2o.training.populations import PopulationReplay
+from torchrl_h2o.training.populations.learner import PopulationLearner
+from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.returns import evaluate
+
+TABLE = "randomization"
+MEASURED, USUAL, MENDED, UNMENDED = "measured ranges", "± 20 %", "mended, one world", "unmended, one world"
+Run = tuple[str, int]  # the worlds of the training, and its seed
+
+
+def report_of(series: Series, logs: TensorDict, folder: Path, minutes: float) -> Report:
+    """Closes the loop on all logs together, or reads the report of an earlier call."""
+    if not (folder / "report.json").exists():
+        close_the_loop(series.simulator(), logs, source=series.system, minutes=minutes).save(folder)
+    return Report.load(folder)
+
+
+def draw_worlds(series: Series, report: Report, condition: str, number: int, seed: int) -> Sequence[World]:
+    """Draws the effects of the worlds of a training."""
+    if condition == MEASURED:
+        return report.sample(number, seed=seed)
+    if condition == USUAL:
+        model, rng = mujoco_model(series.simulator()), np.random.default_rng(seed)
+        return [usual_world(model, rng) for _ in range(number)]
+    return [report.effects if condition == MENDED else ()] * number
+
+
+def train(
+    envs: Sequence[EnvBase], seeds: Sequence[int], logs: TensorDict, preprocessing: Preprocessing, cfg: DictConfig
+) -> list[torch.nn.Module]:
+    """Trains a SAC policy in each env, all at once with stacked networks; the logs only fill a stream of no rows."""
+    real, batch_size = preprocessing.apply(logs), (0, sum(cfg.batch_size))
+    replay = PopulationReplay(real, cfg.sim_capacity_min, batch_size, len(envs), n_steps=cfg.n_steps, gamma=cfg.gamma)
+    learners, collectors = [], []
+    for env, seed, buffer in zip(envs, seeds, replay.buffers, strict=True):
+        own, sizes = OmegaConf.merge(cfg, {"seed": seed}), (real["observation"].shape[-1], env.action_spec_unbatched)
+        learners.append(METHODS["sac"].make_learner(own, *sizes, buffer))
+        collectors.append(Collector(env, learners[-1].actor, frames_per_batch=cfg.steps_per_epoch))
+        collectors[-1].set_seed(seed)
+    population, epochs = PopulationLearner(learners, replay, cfg.lr, cfg.tau), cfg.updates // cfg.updates_per_epoch
+    schedule = LinearLR(population.optimiser, 1.0, cfg.lr_end_factor, total_iters=epochs)
+    with tqdm(total=epochs * cfg.updates_per_epoch, desc=f"{len(envs)} policies", unit=" updates") as bar:
+        for rollouts in islice(zip(*collectors, strict=True), epochs):
+            for simulated, buffer in zip(rollouts, replay.buffers, strict=True):
+                simulated["next", "reward"] = preprocessing.reward(simulated["next", "reward"])
+                buffer.extend(simulated)
+            for _ in range(cfg.updates_per_epoch):
+                population.update()
+                bar.update()
+            schedule.step()
+    return [learner.actor for learner in learners]
+
+
+def train_and_evaluate(name: str, runs: Sequence[Run], cfg: DictConfig) -> Iterator[Record]:
+    """Trains policies for a series and evaluates each of them in machines that gave no log."""
+    series, start = SERIES[name], cpu_seconds()
+    logs = series.logs(cfg.logs, cfg.rows, cfg.scatter, cfg.noise)
+    report = report_of(series, logs, Path(cfg.folder) / "reports" / name, cfg.minutes)
+    run = run_options("method=sac", *series.options, f"updates={cfg.updates}", f"steps_per_epoch={cfg.steps_per_epoch}")
+    scaling = {"reward_scale": run.reward_scale, "reward_offset": run.reward_offset}
+    preprocessing = Preprocessing.fit(logs, normalise=True, **scaling)
+    effects = [draw_worlds(series, report, condition, cfg.worlds, seed) for condition, seed in runs]
+    envs = [series.worlds(own, preprocessing) for own in effects]
+    actors = train(envs, [seed for _, seed in runs], logs, preprocessing, run)
+    machines = [series.machine(cfg.logs + number, cfg.scatter) for number in range(cfg.machines)]
+    reality = series.worlds(machines, preprocessing)
+    cost = (cpu_seconds() - start) / len(runs)
+    for (condition, seed), actor in zip(runs, actors, strict=True):
+        begin, found = cpu_seconds(), evaluate(reality, actor, cfg.machines)
+        values = {"series": name, "worlds": condition, "seed": seed, "updates": cfg.updates, "return": found.mean}
+        values |= {series.score[0]: series.score[1](found), "returns": found.returns, "report": report.sentence()}
+        yield Record.of_this_process(TABLE, name_of(name, condition, seed), values, begin - cost)
+
+
+def name_of(series: str, condition: str, seed: int) -> str:
+    words = condition.replace("±", "").replace("%", "percent").replace(",", "").split()
+    return "_".join([series, *words, f"seed{seed}"])
+
+
+def main() -> None:
+    cfg = read_options(
+        series=list(SERIES),
+        worlds_of=[MEASURED, USUAL, MENDED, UNMENDED],
+        seeds=[0, 1, 2, 3, 4],
+        logs=4,  # machines that give a log
+        rows=3000,  # of a log
+        noise=0.01,  # of the sensors in the logs, as a share of each signal's standard deviation
+        scatter=0.2,  # standard deviation of a value over the series, as a share of it
+        minutes=20,  # of close_the_loop
+        worlds=20,  # of each training
+        machines=20,  # of the evaluation
+        updates=8000,
+        steps_per_epoch=2000,  # simulated steps per 1000 updates
+        threads=1,  # of torch
+        folder="outputs/benchmark/randomization",
+    )
+    torch.set_num_threads(cfg.threads)
+    records = {record.name: record for record in read_records(Path(cfg.folder), TABLE)}
+    for name in cfg.series:
+        left = [run for run in product(cfg.worlds_of, cfg.seeds) if name_of(name, *run) not in records]
+        for record in train_and_evaluate(name, left, cfg) if left else ():
+            record.save(Path(cfg.folder))
+            records[record.name] = record
+    runs = pd.DataFrame([record.values for record in records.values()])
+    scores = [score for name in runs["series"].unique() for score in (SERIES[name].score[0],)]
+    print(f"\n{interval_table(runs, ['series', 'worlds'], ['return', *scores])}\n")
+    for name, own in runs.groupby("series"):
+        print(f"{name}: {differences(own, 'worlds', MEASURED, 'return')}")
+
+
+if __name__ == "__main__":
+    with one_line_errors():
+        main()
