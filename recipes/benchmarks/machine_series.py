@@ -35,7 +35,7 @@ USUAL = 0.2  # the usual range of domain randomisation, as a share of each numbe
 
 @dataclass(frozen=True)
 class Series:
-    """Machines of one kind, numbered; each has its own values of what their simulator lacks.
+    """Machines of one kind, each with its own values of what their simulator lacks.
 
     Args:
         system: a name of :data:`~systems.SYSTEMS`.
@@ -52,35 +52,43 @@ class Series:
     score: tuple[str, Callable[[Evaluation], float]]
     options: tuple[str, ...] = ()
 
-    def machine(self, number: int, scatter: float) -> World:
-        """Draws a machine.
+    def machines(self, number: int, scatter: float, *, stream: int) -> list[World]:
+        """Draws machines.
 
         Args:
-            number: of the machine in the series; the same number is the same machine.
+            number: of machines.
             scatter: standard deviation of each value, as a share of it.
+            stream: of the random numbers; two streams share no machine.
         """
-        rng = np.random.default_rng(number)
+        rng = np.random.default_rng(stream)
 
         def drawn(effect: Effect) -> Effect:
             name, size = next(iter(effect.parameters.items()))
             return effect.with_parameters({name: size.neutral + rng.normal(1.0, scatter) * (size.value - size.neutral)})
 
-        return tuple(map(drawn, self.missing))
+        return [tuple(map(drawn, self.missing)) for _ in range(number)]
 
-    def logs(self, machines: int, rows: int, scatter: float, noise: float) -> TensorDict:
-        """Records a log of each of the first machines, TED ``(machines · rows,)`` with the entry ``log``.
+    def logs(self, machines: Sequence[World], rows: int, noise: float) -> TensorDict:
+        """Records a log of each machine, TED ``(machines · rows,)`` with the entry ``log``.
 
         Args:
-            machines: number of machines.
+            machines: what the simulator lacks for each machine.
             rows: transitions of each log.
-            scatter: see :meth:`machine`.
             noise: standard deviation of every sensor's noise, as a share of the signal's own.
         """
         logs = []
-        for number in range(machines):
-            log = SYSTEMS[self.system].record(self.machine(number, scatter), rows, number, noise=noise)
+        for number, machine in enumerate(machines):
+            log = SYSTEMS[self.system].record(machine, rows, number, noise=noise)
             logs.append(log.set("log", torch.full((rows,), number)))
         return torch.cat(logs)
+
+    def accepts(self, effects: World) -> bool:
+        """Whether the simulator's model can have these effects."""
+        try:
+            SYSTEMS[self.system].env(effects)
+        except ValueError:
+            return False
+        return True
 
     def simulator(self) -> EnvBase:
         """Builds the simulator without any of what it lacks."""

@@ -4,9 +4,10 @@ python recipes/benchmarks/randomization.py                                  # bo
 python recipes/benchmarks/randomization.py series=[arm] seeds=[0] updates=4000
 
 The machines of a series differ in what their simulator lacks. The first ones give logs, from which close_the_loop
-measures ranges. SAC trains in worlds drawn from these ranges, in worlds of the usual ranges, and without
-randomisation; each policy is evaluated in further machines, which gave no log. Writes the reports and a record of
-each policy to outputs/benchmark/randomization, skips those that are there, and prints the means over seeds.
+measures ranges. SAC trains in worlds drawn from these ranges, in worlds of the usual ranges, without randomisation,
+and in machines drawn like the series itself, the best that ranges could be. Each policy is evaluated in further
+machines, which gave no log. Writes the reports and a record of each policy to outputs/benchmark/randomization, skips
+those that are there, and prints the means over seeds.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,8 +28,8 @@ from tqdm import tqdm
 
 import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet)
 from torchrl_h2o.commands.one_line_errors import one_line_errors
-from torchrl_h2o.comparison.interval_table import differences, interval_table
 from torchrl_h2o.comparison.records import Record, read_records
+from torchrl_h2o.comparison.series_tables import series_tables
 from torchrl_h2o.envs import mujoco_model
 from torchrl_h2o.provenance import cpu_seconds
 from torchrl_h2o.residuals import Report, close_the_loop
@@ -39,7 +40,8 @@ from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import evaluate
 
 TABLE = "randomization"
-MEASURED, USUAL, MENDED, UNMENDED = "measured ranges", "± 20 %", "mended, one world", "unmended, one world"
+MEASURED, USUAL, MENDED, UNMENDED, TRUE = "measured ranges", "± 20 %", "mended", "unmended", "the series itself"
+LOGGED, EVALUATED, TRAINED = 0, 1, 2  # streams of machines, which share none
 Run = tuple[str, int]  # the worlds of the training, and its seed
 
 
@@ -50,13 +52,17 @@ def report_of(series: Series, logs: TensorDict, folder: Path, minutes: float) ->
     return Report.load(folder)
 
 
-def draw_worlds(series: Series, report: Report, condition: str, number: int, seed: int) -> Sequence[World]:
-    """Draws the effects of the worlds of a training."""
-    if condition == MEASURED:
-        return report.sample(number, seed=seed)
+def draw_worlds(
+    series: Series, report: Report, condition: str, number: int, seed: int, scatter: float
+) -> Sequence[World]:
+    """Draws the effects of the worlds of a training; without randomisation all worlds are equal."""
+    if condition == MEASURED:  # a draw that the model rejects, such as negative damping, is replaced by the best values
+        return [draw if series.accepts(draw) else report.effects for draw in report.sample(number, seed=seed)]
     if condition == USUAL:
         model, rng = mujoco_model(series.simulator()), np.random.default_rng(seed)
         return [usual_world(model, rng) for _ in range(number)]
+    if condition == TRUE:
+        return series.machines(number, scatter, stream=TRAINED + seed)
     return [report.effects if condition == MENDED else ()] * number
 
 
@@ -89,21 +95,21 @@ def train(
 def train_and_evaluate(name: str, runs: Sequence[Run], cfg: DictConfig) -> Iterator[Record]:
     """Trains policies for a series and evaluates each of them in machines that gave no log."""
     series, start = SERIES[name], cpu_seconds()
-    logs = series.logs(cfg.logs, cfg.rows, cfg.scatter, cfg.noise)
+    logs = series.logs(series.machines(cfg.logs, cfg.scatter, stream=LOGGED), cfg.rows, cfg.noise)
     report = report_of(series, logs, Path(cfg.folder) / "reports" / name, cfg.minutes)
     run = run_options("method=sac", *series.options, f"updates={cfg.updates}", f"steps_per_epoch={cfg.steps_per_epoch}")
     scaling = {"reward_scale": run.reward_scale, "reward_offset": run.reward_offset}
     preprocessing = Preprocessing.fit(logs, normalise=True, **scaling)
-    effects = [draw_worlds(series, report, condition, cfg.worlds, seed) for condition, seed in runs]
+    effects = [draw_worlds(series, report, condition, cfg.worlds, seed, cfg.scatter) for condition, seed in runs]
     envs = [series.worlds(own, preprocessing) for own in effects]
     actors = train(envs, [seed for _, seed in runs], logs, preprocessing, run)
-    machines = [series.machine(cfg.logs + number, cfg.scatter) for number in range(cfg.machines)]
-    reality = series.worlds(machines, preprocessing)
+    reality = series.worlds(series.machines(cfg.machines, cfg.scatter, stream=EVALUATED), preprocessing)
     cost = (cpu_seconds() - start) / len(runs)
-    for (condition, seed), actor in zip(runs, actors, strict=True):
+    for (condition, seed), actor, env in zip(runs, actors, envs, strict=True):
         begin, found = cpu_seconds(), evaluate(reality, actor, cfg.machines)
         values = {"series": name, "worlds": condition, "seed": seed, "updates": cfg.updates, "return": found.mean}
-        values |= {series.score[0]: series.score[1](found), "returns": found.returns, "report": report.sentence()}
+        values |= {"return in training's worlds": evaluate(env, actor, cfg.worlds).mean, "returns": found.returns}
+        values |= {series.score[0]: series.score[1](found), "report": report.sentence()}
         yield Record.of_this_process(TABLE, name_of(name, condition, seed), values, begin - cost)
 
 
@@ -115,7 +121,7 @@ def name_of(series: str, condition: str, seed: int) -> str:
 def main() -> None:
     cfg = read_options(
         series=list(SERIES),
-        worlds_of=[MEASURED, USUAL, MENDED, UNMENDED],
+        worlds_of=[MEASURED, USUAL, MENDED, UNMENDED, TRUE],
         seeds=[0, 1, 2, 3, 4],
         logs=4,  # machines that give a log
         rows=3000,  # of a log
@@ -124,23 +130,22 @@ def main() -> None:
         minutes=20,  # of close_the_loop
         worlds=20,  # of each training
         machines=20,  # of the evaluation
-        updates=8000,
+        updates=16_000,
         steps_per_epoch=2000,  # simulated steps per 1000 updates
         threads=1,  # of torch
         folder="outputs/benchmark/randomization",
     )
     torch.set_num_threads(cfg.threads)
     records = {record.name: record for record in read_records(Path(cfg.folder), TABLE)}
+    wanted = [name_of(*run) for run in product(cfg.series, cfg.worlds_of, cfg.seeds)]
     for name in cfg.series:
         left = [run for run in product(cfg.worlds_of, cfg.seeds) if name_of(name, *run) not in records]
         for record in train_and_evaluate(name, left, cfg) if left else ():
             record.save(Path(cfg.folder))
             records[record.name] = record
-    runs = pd.DataFrame([record.values for record in records.values()])
-    scores = [score for name in runs["series"].unique() for score in (SERIES[name].score[0],)]
-    print(f"\n{interval_table(runs, ['series', 'worlds'], ['return', *scores])}\n")
-    for name, own in runs.groupby("series"):
-        print(f"{name}: {differences(own, 'worlds', MEASURED, 'return')}")
+    columns = ["return", "return in training's worlds", *(series.score[0] for series in SERIES.values())]
+    runs = pd.DataFrame([records[name].values for name in wanted], columns=["series", "worlds", "seed", *columns])
+    print(f"\n{series_tables(runs, columns)}\n\nresults    {cfg.folder}/{TABLE}")
 
 
 if __name__ == "__main__":
