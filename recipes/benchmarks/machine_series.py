@@ -25,12 +25,13 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
     Payload,
 )
-from torchrl_h2o.envs import BatchedMujocoEnv
+from torchrl_h2o.envs import BatchedMujocoEnv, mujoco_model
+from torchrl_h2o.residuals import Report
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.returns import Evaluation
 
 World = tuple[Effect, ...]
-USUAL = 0.2  # the usual range of domain randomisation, as a share of each number of the model
+USUAL = 0.2  # half width of the usual range of domain randomisation, as a share of each number of the model
 
 
 @dataclass(frozen=True)
@@ -94,9 +95,9 @@ class Series:
         """Builds the simulator without any of what it lacks."""
         return SYSTEMS[self.system].env(episode=self.episode)
 
-    def worlds(self, effects: Sequence[World], preprocessing: Preprocessing) -> EnvBase:
-        """Builds simulated worlds with these effects, stepped together."""
-        env = BatchedMujocoEnv(self.simulator(), len(effects), effects, num_threads=1)
+    def env(self, worlds: Sequence[World], preprocessing: Preprocessing) -> EnvBase:
+        """Builds simulated worlds, which are stepped together."""
+        env = BatchedMujocoEnv(self.simulator(), len(worlds), worlds, num_threads=1)
         return TransformedEnv(env, Compose(DoubleToFloat(), *preprocessing.transforms()))
 
 
@@ -142,3 +143,25 @@ def usual_world(model: mujoco.MjModel, rng: np.random.Generator) -> World:
             if getattr(joint, field)[0]
         ),
     )
+
+
+def _measured(series: Series, report: Report, machines: Sequence[World], seed: int) -> Sequence[World]:
+    # a draw that the model rejects, such as negative friction, is replaced by the best values
+    return [w if series.accepts(w) else report.effects for w in report.sample(len(machines), seed=seed)]
+
+
+def _usual(series: Series, report: Report, machines: Sequence[World], seed: int) -> Sequence[World]:
+    model, rng = mujoco_model(series.simulator()), np.random.default_rng(seed)
+    return [usual_world(model, rng) for _ in machines]
+
+
+#: the worlds of a training, as many as machines are given, from a series, its report, machines of it and a seed
+WORLDS: Mapping[str, Callable[[Series, Report, Sequence[World], int], Sequence[World]]] = MappingProxyType(
+    {
+        "measured ranges": _measured,
+        "± 20 %": _usual,
+        "mended": lambda series, report, machines, seed: [report.effects] * len(machines),
+        "unmended": lambda series, report, machines, seed: [()] * len(machines),
+        "the series itself": lambda series, report, machines, seed: machines,
+    }
+)

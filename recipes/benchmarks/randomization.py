@@ -14,10 +14,9 @@ from collections.abc import Iterator, Sequence
 from itertools import islice, product
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import torch
-from machine_series import SERIES, Series, World, usual_world
+from machine_series import SERIES, WORLDS, Series
 from omegaconf import DictConfig, OmegaConf
 from options import read_options, run_options
 from tensordict import TensorDict
@@ -30,18 +29,19 @@ import torchrl_h2o.quiet  # noqa: F401  (before the packages that it keeps quiet
 from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.comparison.series_tables import series_tables
-from torchrl_h2o.envs import mujoco_model
 from torchrl_h2o.provenance import cpu_seconds
 from torchrl_h2o.residuals import Report, close_the_loop
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.populations import PopulationReplay
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.progress import Budget
 from torchrl_h2o.training.returns import evaluate
+from torchrl_h2o.whole_file import write_text
 
 TABLE = "randomization"
-MEASURED, USUAL, MENDED, UNMENDED, TRUE = "measured ranges", "± 20 %", "mended", "unmended", "the series itself"
-LOGGED, EVALUATED, TRAINED = 0, 1, 2  # streams of machines, which share none
+LOGGED, EVALUATED = 0, 1  # random streams of machines; those of trainings follow
+CHOSEN = ("series", "worlds_of", "seeds", "threads", "folder")  # options that do not change a run
 Run = tuple[str, int]  # the worlds of the training, and its seed
 
 
@@ -50,20 +50,6 @@ def report_of(series: Series, logs: TensorDict, folder: Path, minutes: float) ->
     if not (folder / "report.json").exists():
         close_the_loop(series.simulator(), logs, source=series.system, minutes=minutes).save(folder)
     return Report.load(folder)
-
-
-def draw_worlds(
-    series: Series, report: Report, condition: str, number: int, seed: int, scatter: float
-) -> Sequence[World]:
-    """Draws the effects of the worlds of a training; without randomisation all worlds are equal."""
-    if condition == MEASURED:  # a draw that the model rejects, such as negative damping, is replaced by the best values
-        return [draw if series.accepts(draw) else report.effects for draw in report.sample(number, seed=seed)]
-    if condition == USUAL:
-        model, rng = mujoco_model(series.simulator()), np.random.default_rng(seed)
-        return [usual_world(model, rng) for _ in range(number)]
-    if condition == TRUE:
-        return series.machines(number, scatter, stream=TRAINED + seed)
-    return [report.effects if condition == MENDED else ()] * number
 
 
 def train(
@@ -78,7 +64,7 @@ def train(
         learners.append(METHODS["sac"].make_learner(own, *sizes, buffer))
         collectors.append(Collector(env, learners[-1].actor, frames_per_batch=cfg.steps_per_epoch))
         collectors[-1].set_seed(seed)
-    population, epochs = PopulationLearner(learners, replay, cfg.lr, cfg.tau), cfg.updates // cfg.updates_per_epoch
+    population, epochs = PopulationLearner(learners, replay, cfg.lr, cfg.tau), Budget.from_config(cfg).epochs
     schedule = LinearLR(population.optimiser, 1.0, cfg.lr_end_factor, total_iters=epochs)
     with tqdm(total=epochs * cfg.updates_per_epoch, desc=f"{len(envs)} policies", unit=" updates") as bar:
         for rollouts in islice(zip(*collectors, strict=True), epochs):
@@ -97,31 +83,46 @@ def train_and_evaluate(name: str, runs: Sequence[Run], cfg: DictConfig) -> Itera
     series, start = SERIES[name], cpu_seconds()
     logs = series.logs(series.machines(cfg.logs, cfg.scatter, stream=LOGGED), cfg.rows, cfg.noise)
     report = report_of(series, logs, Path(cfg.folder) / "reports" / name, cfg.minutes)
-    run = run_options("method=sac", *series.options, f"updates={cfg.updates}", f"steps_per_epoch={cfg.steps_per_epoch}")
+    budget = [f"{key}={cfg[key]}" for key in ("updates", "updates_per_epoch", "steps_per_epoch")]
+    run = run_options("method=sac", *series.options, *budget)
     scaling = {"reward_scale": run.reward_scale, "reward_offset": run.reward_offset}
     preprocessing = Preprocessing.fit(logs, normalise=True, **scaling)
-    effects = [draw_worlds(series, report, condition, cfg.worlds, seed, cfg.scatter) for condition, seed in runs]
-    envs = [series.worlds(own, preprocessing) for own in effects]
+    envs = []
+    for worlds, seed in runs:
+        machines = series.machines(cfg.worlds, cfg.scatter, stream=EVALUATED + 1 + seed)
+        envs.append(series.env(WORLDS[worlds](series, report, machines, seed), preprocessing))
     actors = train(envs, [seed for _, seed in runs], logs, preprocessing, run)
-    reality = series.worlds(series.machines(cfg.machines, cfg.scatter, stream=EVALUATED), preprocessing)
+    reality = series.env(series.machines(cfg.machines, cfg.scatter, stream=EVALUATED), preprocessing)
     cost = (cpu_seconds() - start) / len(runs)
-    for (condition, seed), actor, env in zip(runs, actors, envs, strict=True):
+    for (worlds, seed), actor, env in zip(runs, actors, envs, strict=True):
         begin, found = cpu_seconds(), evaluate(reality, actor, cfg.machines)
-        values = {"series": name, "worlds": condition, "seed": seed, "updates": cfg.updates, "return": found.mean}
+        values = {"series": name, "worlds": worlds, "seed": seed, "updates": cfg.updates, "return": found.mean}
         values |= {"return in training's worlds": evaluate(env, actor, cfg.worlds).mean, "returns": found.returns}
         values |= {series.score[0]: series.score[1](found), "report": report.sentence()}
-        yield Record.of_this_process(TABLE, name_of(name, condition, seed), values, begin - cost)
+        yield Record.of_this_process(TABLE, name_of(name, worlds, seed), values, begin - cost)
 
 
-def name_of(series: str, condition: str, seed: int) -> str:
-    words = condition.replace("±", "").replace("%", "percent").replace(",", "").split()
+def name_of(series: str, worlds: str, seed: int) -> str:
+    words = worlds.replace("±", "").replace("%", "percent").split()
     return "_".join([series, *words, f"seed{seed}"])
+
+
+def claim(folder: Path, cfg: DictConfig) -> None:
+    """Stores the options of the runs in their folder.
+
+    Raises:
+        ValueError: if the folder has runs with other options.
+    """
+    path, own = folder / "options.yaml", OmegaConf.masked_copy(cfg, [key for key in cfg if key not in CHOSEN])
+    if path.exists() and OmegaConf.load(path) != own:
+        raise ValueError(f"{path} has other options: write them, or choose another folder=")
+    write_text(path, OmegaConf.to_yaml(own))
 
 
 def main() -> None:
     cfg = read_options(
         series=list(SERIES),
-        worlds_of=[MEASURED, USUAL, MENDED, UNMENDED, TRUE],
+        worlds_of=list(WORLDS),
         seeds=[0, 1, 2, 3, 4],
         logs=4,  # machines that give a log
         rows=3000,  # of a log
@@ -131,11 +132,13 @@ def main() -> None:
         worlds=20,  # of each training
         machines=20,  # of the evaluation
         updates=16_000,
-        steps_per_epoch=2000,  # simulated steps per 1000 updates
+        updates_per_epoch=1000,
+        steps_per_epoch=2000,  # simulated, of all worlds together
         threads=1,  # of torch
         folder="outputs/benchmark/randomization",
     )
     torch.set_num_threads(cfg.threads)
+    claim(Path(cfg.folder), cfg)
     records = {record.name: record for record in read_records(Path(cfg.folder), TABLE)}
     wanted = [name_of(*run) for run in product(cfg.series, cfg.worlds_of, cfg.seeds)]
     for name in cfg.series:
@@ -145,7 +148,7 @@ def main() -> None:
             records[record.name] = record
     columns = ["return", "return in training's worlds", *(series.score[0] for series in SERIES.values())]
     runs = pd.DataFrame([records[name].values for name in wanted], columns=["series", "worlds", "seed", *columns])
-    print(f"\n{series_tables(runs, columns)}\n\nresults    {cfg.folder}/{TABLE}")
+    print(f"\n{series_tables(runs, cfg.worlds_of, columns)}\n\nresults    {cfg.folder}/{TABLE}")
 
 
 if __name__ == "__main__":
