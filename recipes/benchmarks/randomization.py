@@ -131,7 +131,7 @@ def main() -> None:
         minutes=20,  # of close_the_loop
         worlds=20,  # of each training
         machines=20,  # of the evaluation
-        updates=16_000,
+        updates=8000,
         updates_per_epoch=1000,
         steps_per_epoch=2000,  # simulated, of all worlds together
         threads=1,  # of torch
