@@ -115,7 +115,7 @@ def claim(folder: Path, cfg: DictConfig) -> None:
     """
     path, own = folder / "options.yaml", OmegaConf.masked_copy(cfg, [key for key in cfg if key not in CHOSEN])
     if path.exists() and OmegaConf.load(path) != own:
-        raise ValueError(f"{path} has other options: write them, or choose another folder=")
+        raise ValueError(f"{path} has other options: give these, or choose another folder=")
     write_text(path, OmegaConf.to_yaml(own))
 
 
