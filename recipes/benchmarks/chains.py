@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -24,6 +26,13 @@ DAMPING_RATIO = (0.3, 0.6)  # of both, of critical
 DELAY = (8, 60)  # physics steps of reality: 2 to 15 ms
 SINES, FREQUENCY, SWING = 4, (0.1, 1.5), 0.25  # of each joint's reference: number, Hz, and amplitude of one in rad
 LEVEL, HOLD, SMOOTHING = 0.3, (1.0, 3.0), 0.05  # of its steps: largest in rad, seconds between them, filter in s
+
+
+class Link(Protocol):
+    """A link of a length in m and a mass in kg."""
+
+    length: float
+    mass: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +85,7 @@ class Chain:
         inertias = mujoco.MjModel.from_xml_string(cls(tuple(links), servos).xml()).dof_M0
         joints = []
         for index, (link, inertia) in enumerate(zip(links, inertias.tolist(), strict=True)):
-            weight = _weight(links[index:])
+            weight = torque_of_gravity(links[index:])
             rotor = inertia * math.exp(rng.uniform(*np.log(ROTOR)))
             moved, bandwidth = inertia + rotor, rng.uniform(*(SERVO if servos else CONTROLLER))
             drive = {"stiffness": moved * bandwidth**2, "brake": 2.0 * rng.uniform(*DAMPING_RATIO) * moved * bandwidth}
@@ -111,11 +120,11 @@ class Chain:
         """One run from rest: positions and velocities, (rows + 1, 2 n), and the commands of each row, (rows, n)."""
         model = mujoco.MjModel.from_xml_string(self.xml(complete=True))
         model.opt.timestep = STEP / SUBSTEPS
-        data, references = mujoco.MjData(model), _references(rows, model.nu, np.random.default_rng(seed))
+        data, targets = mujoco.MjData(model), references(rows, model.nu, np.random.default_rng(seed), STEP)
         stiffness, brake = np.array([(joint.stiffness, joint.brake) for joint in self.joints]).T
         waiting = deque([np.zeros(model.nu)] * round(self.delay * SUBSTEPS / STEP))
         observed, commands = [np.concatenate([data.qpos, data.qvel])], []
-        for reference in references:
+        for reference in targets:
             torque = stiffness * (reference - data.qpos) - brake * data.qvel
             commands.append(reference if self.servos else torque)
             for _ in range(SUBSTEPS):
@@ -126,7 +135,7 @@ class Chain:
         return np.array(observed), np.array(commands)
 
 
-def _weight(links: list[Joint]) -> float:
+def torque_of_gravity(links: Sequence[Link]) -> float:
     """Torque of gravity at the first of some links, in N·m, if all were stretched out horizontally."""
     torque, reach = 0.0, 0.0
     for link in links:
@@ -135,11 +144,11 @@ def _weight(links: list[Joint]) -> float:
     return torque
 
 
-def _references(rows: int, joints: int, rng: np.random.Generator) -> np.ndarray:
+def references(rows: int, joints: int, rng: np.random.Generator, step: float) -> np.ndarray:
     """Angles to move to, (rows, joints), in rad: sines, and steps behind a filter; they begin at 0."""
-    time = STEP * np.arange(rows)
+    time = step * np.arange(rows)
     moves = np.zeros((rows, joints))
-    left = math.exp(-STEP / SMOOTHING)
+    left = math.exp(-step / SMOOTHING)
     for joint in range(joints):
         frequency = np.exp(rng.uniform(*np.log(FREQUENCY), SINES))
         phase = rng.uniform(0.0, 2.0 * math.pi, SINES)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import ForceEffect, ModelEffect, Names, parameter, selection
-from torchrl_h2o.effects.effect import BatchedForce, Force
+from torchrl_h2o.effects.effect import BatchedForce, Force, States
 from torchrl_h2o.effects.model.inertial import edit_inertials
 
 _TORQUE = {"unit": "N·m", "bounds": (-1000.0, 1000.0), "neutral": 0.0}
@@ -25,15 +25,15 @@ class _TorqueOnJoint(ForceEffect):
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
         force = self.batched(model, rng)
-        return lambda data: force(data.qpos[None], data.qvel[None], data.ctrl[None], np.array([data.time]))[0]
+        return lambda data: force(States.of(data))[0]
 
     def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
         (dof,) = selection.joint_dofs(model, self.joint)
         angle = model.jnt_qposadr[model.dof_jntid[dof]]
 
-        def force(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
-            forces = np.zeros_like(qvel)
-            forces[:, dof] = self.torque_at(qpos[:, angle], qvel[:, dof], time)
+        def force(states: States) -> np.ndarray:
+            forces = np.zeros_like(states.qvel)
+            forces[:, dof] = self.torque_at(states.qpos[:, angle], states.qvel[:, dof], states.time)
             return forces
 
         return force

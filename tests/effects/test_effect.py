@@ -31,6 +31,7 @@ KINDS = {
     effects.ModelEffect,
     effects.ActionEffect,
     effects.ForceEffect,
+    effects.VaryingEffect,
     effects.ObservationEffect,
 }
 EFFECTS = [

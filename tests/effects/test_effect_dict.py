@@ -21,7 +21,13 @@ from torchrl_h2o.effects import (
     parameter,
 )
 
-KINDS = {effects.ModelEffect, effects.ActionEffect, effects.ForceEffect, effects.ObservationEffect}
+KINDS = {
+    effects.ModelEffect,
+    effects.ActionEffect,
+    effects.ForceEffect,
+    effects.VaryingEffect,
+    effects.ObservationEffect,
+}
 NEUTRAL = [
     member()
     for member in vars(effects).values()

@@ -6,6 +6,7 @@ import pytest
 from torchrl.envs import GymEnv
 
 from torchrl_h2o.effects import LinearDrag, QuadraticDrag
+from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.force.kinematics import com_jacobians
 from torchrl_h2o.envs import mujoco_model
 
@@ -59,7 +60,7 @@ def test_jacobians_are_those_of_mujoco(model):
 @pytest.mark.parametrize("model", models())
 def test_drag_of_many_states_is_that_of_each(model, effect):
     qpos, qvel = random_states(model)
-    together = effect.batched(model)(qpos, qvel, np.zeros((5, model.nu)), np.zeros(5))
+    together = effect.batched(model)(States(qpos, qvel, np.zeros((5, 0)), np.zeros((5, model.nu)), np.zeros(5)))
     force, data = effect.process(model, np.random.default_rng(0)), mujoco.MjData(model)
     for position, velocity, own in zip(qpos, qvel, together, strict=True):
         data.qpos, data.qvel = position, velocity

@@ -25,6 +25,7 @@ from torchrl_h2o.effects import (
     Pipeline,
     parameter,
 )
+from torchrl_h2o.effects.effect import States
 
 DT = 0.02
 
@@ -147,8 +148,7 @@ def test_forces_of_an_episode_are_those_of_many_states():
     data = mujoco.MjData(model)
     data.qvel[:] = rng().standard_normal(model.nv)
     mujoco.mj_forward(model, data)
-    one_state = (data.qpos[None], data.qvel[None], data.ctrl[None], np.zeros(1))
-    together = sum(force(*one_state) for force in pipeline.batched_forces(model))[0]
+    together = sum(force(States.of(data)) for force in pipeline.batched_forces(model))[0]
     episode = pipeline.begin(DT, model=model)
     assert len(episode.forces) == 2
     np.testing.assert_allclose(sum(force(data) for force in episode.forces), together, atol=1e-12)

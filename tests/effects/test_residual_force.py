@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from tests.effects.models import CART
 from torchrl_h2o.effects import ResidualForce
+from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
 from torchrl_h2o.effects.serialisation import effect_from_dict, effect_to_dict
 
@@ -36,7 +37,7 @@ def test_force_is_the_one_that_its_terms_read():
     rng = np.random.default_rng(0)
     q, v, a = rng.standard_normal((3, 50, 2))
     t = rng.uniform(0.0, 4.0, 50)
-    force = ResidualForce(TERMS).batched(model)(q, v, a, t)
+    force = ResidualForce(TERMS).batched(model)(States(q, v, np.zeros((50, 0)), a, t))
     np.testing.assert_allclose(force, [by_hand(*row) for row in zip(q, v, a, t, strict=True)])
 
 
@@ -129,8 +130,8 @@ def test_what_the_model_lacks_is_named(text, complaint):
 
 def test_free_joint_has_named_axes_and_rotations_have_no_position():
     model = mujoco.MjModel.from_xml_string(FREE)
-    q, v, t = np.arange(7.0)[None], np.arange(6.0)[None], np.zeros(1)
+    states = States(np.arange(7.0)[None], np.arange(6.0)[None], np.zeros((1, 0)), np.zeros((1, 0)), np.zeros(1))
     drag = ResidualForce(("force on root_z: 2 · q", "torque on root_pitch: -1 · v"))
-    np.testing.assert_array_equal(drag.batched(model)(q, v, np.zeros((1, 0)), t), [[0, 0, 4, 0, -4, 0]])
+    np.testing.assert_array_equal(drag.batched(model)(states), [[0, 0, 4, 0, -4, 0]])
     with pytest.raises(ValueError, match="no position"):
         ResidualForce(("torque on root_pitch: 1 · q",)).batched(model)

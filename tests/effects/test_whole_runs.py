@@ -28,6 +28,7 @@ from torchrl_h2o.effects import (
     QuadraticDrag,
     compile_model,
 )
+from torchrl_h2o.effects.effect import States
 
 DT = 0.005
 ON_ACTIONS = [
@@ -170,7 +171,7 @@ def test_nothing_is_known_of_a_sensor_that_reads_zero():
 def test_forces_on_many_states_are_those_on_each(effect):
     model, draw = compile_model(spec(CART)), rng()
     qpos, qvel = draw.normal(size=(5, model.nq)), draw.normal(size=(5, model.nv))
-    together = effect.batched(model)(qpos, qvel, np.zeros((5, 0)), np.arange(5.0))
+    together = effect.batched(model)(States(qpos, qvel, np.zeros((5, 0)), np.zeros((5, 0)), np.arange(5.0)))
     assert together.shape == (5, model.nv)
     force, data = effect.process(model, rng()), mujoco.MjData(model)
     for i in range(5):

@@ -11,8 +11,10 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionNoise,
+    GearPlay,
     Gravity,
     LinearDrag,
+    LoadFriction,
     ObservationDelay,
     ObservationGain,
     Timestep,
@@ -107,6 +109,7 @@ def test_an_episode_is_truncated_at_the_task_s_limit_and_worlds_are_reset_one_by
         (ActionDelay(0.13),),
         (Timestep(0.5), ActionDelay(0.04)),
         (LinearDrag(3.0, bodies="torso"),),
+        (LoadFriction(0.3), GearPlay(0.02, (1,))),
         (ObservationGain(1.2, (3,)),),
     ],
     ids=lambda effects: type(effects[0]).__name__,

@@ -55,7 +55,7 @@ class UnknownForce(ForceEffect):
         return lambda data: self.size * self.law(data.qpos, data.qvel, data.time)
 
     def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> Callable:
-        return lambda qpos, qvel, ctrl, time: self.size * self.law(qpos, qvel, time[:, None])
+        return lambda states: self.size * self.law(states.qpos, states.qvel, states.time[:, None])
 
 
 def three_parts(rows):

@@ -5,6 +5,7 @@ import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
+from torchrl_h2o.effects.effect import States
 from torchrl_h2o.residuals import Evidence, explain
 from torchrl_h2o.residuals.progress import OTHERS, LoopBar, OutOfTimeError
 
@@ -49,7 +50,7 @@ def test_a_force_that_nobody_declared_stands_beside_declared_effects():
     assert (gravity.declared, ripple.declared) == (True, False)
     assert gravity.effect.scale == pytest.approx(1.3, rel=0.02)
     q = np.linspace(-3.0, 3.0, 50)[:, None]
-    force = ripple.effect.batched(SIMULATION.model)(q, 0.0 * q, 0.0 * q, 0.0 * q[:, 0])
+    force = ripple.effect.batched(SIMULATION.model)(States(q, 0.0 * q, 0.0 * q, 0.0 * q, 0.0 * q[:, 0]))
     np.testing.assert_allclose(force, 0.2 * np.sin(7.0 * q), atol=0.04)
 
 

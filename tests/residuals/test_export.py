@@ -10,6 +10,7 @@ import types
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from torchrl_h2o.effects import (
     ActionDelay,
@@ -19,9 +20,14 @@ from torchrl_h2o.effects import (
     Gravity,
     JointDamping,
     JointFrictionLoss,
+    LoadFriction,
+    ObservationBias,
     Payload,
+    Pipeline,
     ServoStiffness,
+    StribeckFriction,
 )
+from torchrl_h2o.effects.effect import States
 from torchrl_h2o.options.sources import require_folder
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
@@ -89,7 +95,8 @@ def test_nothing_is_written_of_what_no_effect_changes(simulation):
 
 def test_the_files_hold_all_effects(simulation, tmp_path):
     files = {path.name: path for path in export(report(*FOUND), simulation, tmp_path / "out")}
-    assert list(files) == ["ranges.json", "playground.py", "mjlab.py", "isaaclab.py", "joints.csv"]
+    text = ["ranges.json", "playground.py", "mjlab.py", "isaaclab.py", "joints.csv", "hip.json", "knee.json"]
+    assert list(files) == [*text, "mean_000.pt", "config.pt"]
     content = json.loads(files["ranges.json"].read_text())
     outside = {one["kind"]: (one["value"], one["low"], one["high"]) for one in content["outside_the_model"]}
     assert outside == {"ActionDelay": (0.005, 0.004, 0.006), "Gravity": (0.98, 0.97, 0.99)}
@@ -191,9 +198,8 @@ def test_a_delay_of_one_motor_is_in_the_row_of_its_joint(simulation, tmp_path):
 
 
 def test_an_inertia_without_its_mass_is_named_where_it_cannot_be_written(simulation, tmp_path):
-    files = {
-        path.name: path.read_text() for path in export(report((BodyInertia(1.5, "lower"), {})), simulation, tmp_path)
-    }
+    export(report((BodyInertia(1.5, "lower"), {})), simulation, tmp_path)
+    files = {path.name: path.read_text() for path in tmp_path.glob("*.py")}
     for name in ("mjlab.py", "isaaclab.py"):
         assert "# not here: body_inertia of lower (see ranges.json)" in files[name]
     assert '"body_inertia"' in files["playground.py"]
@@ -221,3 +227,58 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_search(tmp_path):
     assert require_folder(str(tmp_path / "new" / "ranges"))
     with pytest.raises(ValueError, match=r"no folder can be made there, because .*file is a file"):
         require_folder(str(tmp_path / "file" / "ranges"))
+
+
+def exported(tmp_path, simulation, *effects):
+    export(report(*((effect, {}) for effect in effects)), simulation, tmp_path / "out")
+    return tmp_path / "out"
+
+
+@pytest.mark.parametrize(
+    ("effects", "kind"),
+    [
+        ((), "m1"),
+        ((StribeckFriction(0.03, 0.4, joints="knee"),), "m2"),
+        ((LoadFriction(0.07, joints="knee"),), "m3"),
+        ((LoadFriction(0.07, joints="knee"), StribeckFriction(0.03, 0.4, 0.05, joints="knee")), "m4"),
+        ((LoadFriction(0.07, 0.2, joints="knee"), StribeckFriction(0.03, 0.4, 0.05, joints="knee")), "m5"),
+    ],
+)
+def test_bam_has_the_friction_of_the_mended_simulator(tmp_path, simulation, effects, kind):
+    usual = (JointFrictionLoss(0.05, "knee"), Armature(0.01, "knee"))
+    folder = exported(tmp_path, simulation, *usual, *effects)
+    servo = json.loads((folder / "bam" / "knee.json").read_text())
+    assert (servo["model"], servo["armature"], servo["friction_viscous"]) == (kind, 0.01, 0.1)
+    model, velocity = simulation.with_effects(*usual, *effects).model, 0.3
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel[1], data.ctrl = (0.4, 0.7), velocity, (0.0, 0.9)
+    values = {"dof_frictionloss": model.dof_frictionloss[None].copy()}
+    for variation in Pipeline(effects).variations(model):
+        variation.apply(States.of(data), values)
+    mujoco.mj_forward(model, data)
+    motor = data.qfrc_actuator[1]
+    weight = -0.5 * 9.81 * 0.1 * np.sin(data.qpos[0] + data.qpos[1])
+    assert friction_of_bam(servo, motor, weight, velocity) == pytest.approx(values["dof_frictionloss"][0, 1])
+    assert json.loads((folder / "bam" / "hip.json").read_text())["model"] == "m1"
+
+
+def friction_of_bam(servo: dict, motor: float, external: float, velocity: float) -> float:
+    """Friction of BAM's models (``Model.compute_frictions``), written out from their paper."""
+    moving = np.exp(-(abs(velocity / servo.get("dtheta_stribeck", 1.0)) ** servo.get("alpha", 1.0)))
+
+    def load(end: str) -> float:
+        if servo["model"] == "m5":
+            shares = (servo[f"load_friction_{of}{end}"] for of in ("motor", "external"))
+            return abs(sum(share * torque for share, torque in zip(shares, (motor, -external), strict=True)))
+        return servo.get(f"load_friction{end or '_base'}", 0.0) * abs(motor - external)
+
+    rest = servo.get("friction_stribeck", 0.0) + load("_stribeck")
+    return servo["friction_base"] + load("") + (moving * rest if "friction_stribeck" in servo else 0.0)
+
+
+def test_pace_reads_the_values_of_the_driven_joints(tmp_path, simulation):
+    found = (JointDamping(0.2), JointFrictionLoss(0.05, "knee"), Armature(0.01, "hip"), ActionDelay(0.006))
+    folder = exported(tmp_path, simulation, *found, ObservationBias(0.03, (0,)))
+    mean, joints = (torch.load(folder / "pace" / name) for name in ("mean_000.pt", "config.pt"))
+    assert joints == {"joint_order": ["hip", "knee"]}
+    np.testing.assert_allclose(mean, [0.01, 0.0, 0.3, 0.3, 0.0, 0.05, 0.03, 0.0, 3.0], rtol=1e-6)  # steps of 2 ms

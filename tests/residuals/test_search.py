@@ -3,10 +3,11 @@
 import sys
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from tests.residuals.pendulum import DOUBLE, double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     ActionBias,
     ActionDelay,
@@ -18,11 +19,13 @@ from torchrl_h2o.effects import (
     JointDamping,
     JointForce,
     JointFrictionLoss,
+    JointRange,
     JointSpring,
     Payload,
     ResidualForce,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
+from torchrl_h2o.effects.model.joint import LOCKED
 from torchrl_h2o.residuals import search
 from torchrl_h2o.residuals.evidence import why_no_conclusion
 from torchrl_h2o.residuals.explanation import Tried
@@ -30,9 +33,9 @@ from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
-from torchrl_h2o.residuals.refit import flat
 from torchrl_h2o.residuals.search import disjoint, known_set, with_intervals
 from torchrl_h2o.residuals.sweep import Direction, sweep
+from torchrl_h2o.residuals.whitened import flat
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -290,9 +293,9 @@ def test_an_effect_whose_interval_holds_its_neutral_value_is_left_out_of_the_las
     entries = [entry_of(effect, CATALOGUE) for effect in effects]
     for truth in (effects[:1], (effects[0], JointDamping(0.03, "elbow"))):
         ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(*truth), 800, noise=0.01))
-        found, half_widths, _ = with_intervals(ground, ground.found(entries, effects), [])
+        found, fit, _ = with_intervals(ground, ground.found(entries, effects), [])
         assert [type(effect) for effect in found.effects] == [type(effect) for effect in truth]
-        assert len(half_widths) == len(truth)
+        assert len(fit.in_another_log) == len(truth)
 
 
 def together(parts):
@@ -312,8 +315,8 @@ def test_the_interval_of_several_logs_holds_the_values_of_each():
             for seed, damping in enumerate(dampings)
         ]
         ground = Ground.of(SIMULATION, together(logs))
-        found, half_widths, _ = with_intervals(ground, ground.found([entry_of(effect, CATALOGUE)], [effect]), [])
-        ends.append((found.effects[0].damping, half_widths[0]["damping"]))
+        found, fit, _ = with_intervals(ground, ground.found([entry_of(effect, CATALOGUE)], [effect]), [])
+        ends.append((found.effects[0].damping, fit.in_another_log[0]["damping"]))
     (value, half), (same, narrow) = ends
     assert same == pytest.approx(0.03, abs=3.0 * narrow)
     assert 0.02 < half < 0.1
@@ -395,3 +398,14 @@ def test_the_most_unusual_of_a_kind_counts_and_each_term_of_a_force():
     assert surprise_of(two) == 2 * surprise_of(one)  # joints have friction in common, but not forces
     one, two = (ResidualForce(("torque on elbow: 0.1 · t",) * n) for n in (1, 2))
     assert 0 < surprise_of([one]) < surprise_of([two])
+
+
+def test_a_joint_that_is_locked_in_reality_is_no_joint_with_a_heavy_rotor():
+    """Both keep the joint at its place, and the lock is the usual cause."""
+    free = '<joint name="elbow" type="hinge" axis="0 1 0"/>'
+    xml = DOUBLE.replace(free, free.replace("/>", ' limited="true" range="-1 1"/>'))
+    simulation = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(xml))
+    measured = recorded(simulation.with_effects(JointRange(LOCKED, "elbow")), 800, noise=0.005)
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, JointRange | Armature)]
+    explanation = search(simulation, measured, catalogue, progress=LoopBar(disable=True))
+    assert explanation.effects == (JointRange(LOCKED, "elbow"),)

@@ -28,7 +28,7 @@ from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import Audit, DataError, audit
 from torchrl_h2o.data.readers.observed import words_of_estimates
-from torchrl_h2o.effects import CatalogueEntry, paper_gap, quantity_name
+from torchrl_h2o.effects import CatalogueEntry, paper_gap
 from torchrl_h2o.envs import DynamicsGap
 from torchrl_h2o.options import CloseTheLoopOptions
 from torchrl_h2o.residuals import Report, Simulation, close_the_loop
@@ -162,14 +162,10 @@ def print_result(report: Report) -> None:
     if report.found:
         print(f"\n{'the simulator lacks':<48}{'':<14}{'value':>12}  95 % interval")
     for found in report.found:
-        for row, (name, parameter) in enumerate(found.effect.parameters.items()):
-            symbol = found.units[name]
+        for row, (name, symbol, value, (low, high)) in enumerate(found.values):
             unit = "" if symbol == "1" else f" {symbol}"
-            low, high = found.ci95.get(name, (float("nan"), float("nan")))
             label = found.name if row == 0 else ""
-            print(
-                f"{label:<47} {quantity_name(name, symbol):<14}{parameter.value:>12.4g}  {low:.4g} to {high:.4g}{unit}"
-            )
+            print(f"{label:<47} {name:<14}{value:>12.4g}  {low:.4g} to {high:.4g}{unit}")
     if report.error is not None:
         print(f"\n{report.error.metric}\n{'':<62}{'before':>12}{'after':>12}")
         for dimension in report.error.per_dimension:

@@ -6,7 +6,7 @@ once, actions and observations pass through their effects in order, and forces a
 
 from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation
 from torchrl_h2o.effects.action.signal import ActionBias, ActionGain, ActionNoise
-from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
+from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag, ActionLead
 from torchrl_h2o.effects.catalogue.catalogue import catalogue
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry
 from torchrl_h2o.effects.catalogue.plausibility import is_negligible
@@ -16,9 +16,13 @@ from torchrl_h2o.effects.effect import (
     ForceEffect,
     ModelEffect,
     ObservationEffect,
+    VaryingEffect,
 )
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.force.residual_force import ResidualForce
+from torchrl_h2o.effects.force.servo import ServoDeadBand, TorqueSpeedLine
+from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
+from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.joint_units import joint_names, quantity_name
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
 from torchrl_h2o.effects.model.compilation import compile_model
@@ -33,7 +37,7 @@ from torchrl_h2o.effects.model.joint import (
     JointStiffness,
 )
 from torchrl_h2o.effects.model.link import LinkLength
-from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness
+from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoDamping, ServoStiffness
 from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation.sensor import ObservationBias, ObservationDelay, ObservationGain, ObservationNoise
@@ -52,6 +56,7 @@ __all__ = [
     "ActionEffect",
     "ActionGain",
     "ActionLag",
+    "ActionLead",
     "ActionNoise",
     "ActionSaturation",
     "ActuatorTimeConstant",
@@ -64,6 +69,7 @@ __all__ = [
     "Effect",
     "Episode",
     "ForceEffect",
+    "GearPlay",
     "GeomFriction",
     "GeomLength",
     "GeomSize",
@@ -79,6 +85,7 @@ __all__ = [
     "JointStiffness",
     "LinearDrag",
     "LinkLength",
+    "LoadFriction",
     "ModelEffect",
     "Names",
     "ObservationBias",
@@ -93,8 +100,13 @@ __all__ = [
     "QuadraticDrag",
     "ResidualForce",
     "RollingResistance",
+    "ServoDamping",
+    "ServoDeadBand",
     "ServoStiffness",
+    "StribeckFriction",
     "Timestep",
+    "TorqueSpeedLine",
+    "VaryingEffect",
     "balanced",
     "catalogue",
     "compile_model",

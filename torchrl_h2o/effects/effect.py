@@ -1,7 +1,7 @@
 """Base classes of effects: named physical causes by which two dynamics differ.
 
-An effect is a frozen dataclass whose parameters have a unit, bounds and a neutral value. It acts on one of four
-things: the model, the actions, the forces or the observations.
+An effect is a frozen dataclass whose parameters have a unit, bounds and a neutral value. It acts on one of five
+things: the model, numbers of the model that depend on the state, the actions, the forces or the observations.
 """
 
 import dataclasses
@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -25,12 +25,50 @@ EntryNames = Mapping[str, Sequence[str]]
 NO_NAMES: EntryNames = MappingProxyType({})
 Process = Callable[[np.ndarray], np.ndarray]
 Force = Callable[[mujoco.MjData], np.ndarray]
-BatchedForce = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+class States(NamedTuple):
+    """B states of one model, with what drives it.
+
+    Args:
+        qpos: positions, (B, nq).
+        qvel: velocities, (B, nv).
+        act: activations of the actuators, (B, na).
+        ctrl: executed controls, (B, nu).
+        time: time in s, (B,).
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    ctrl: np.ndarray
+    time: np.ndarray
+
+    @classmethod
+    def of(cls, data: mujoco.MjData) -> "States":
+        """The one state of a simulation, as a batch of one."""
+        return cls(data.qpos[None], data.qvel[None], data.act[None], data.ctrl[None], np.array([data.time]))
+
+
+BatchedForce = Callable[[States], np.ndarray]
+
+
+class Variation(NamedTuple):
+    """How numbers of a model depend on its state.
+
+    Args:
+        fields: fields of ``mujoco.MjModel`` that vary.
+        apply: changes their values, (B, ...) by field, in place for the next physics step from B states, and returns
+            the generalised forces of that step, (B, nv), or 0.
+    """
+
+    fields: tuple[str, ...]
+    apply: Callable[[States, dict[str, np.ndarray]], np.ndarray | float]
 
 
 @dataclass(frozen=True)
 class Effect(ABC):
-    """Base of all effects. Subclass one of the four kinds below, not this class.
+    """Base of all effects. Subclass one of the five kinds below, not this class.
 
     A subclass is a frozen dataclass. Fields made by :func:`parameter` are its parameters; all other fields select what
     it acts on, by name patterns (``Names``) or indices (``Indices``). The class attribute ``wording`` describes the
@@ -274,18 +312,17 @@ class ForceEffect(Effect):
             rng: the random generator of a random effect.
 
         Returns:
-            A function from ``qpos`` (B, nq), ``qvel`` (B, nv), ``ctrl`` (B, nu) and ``time`` (B,) to the generalised
-            forces (B, nv). The caller must not write to the result.
+            A function from B states to the generalised forces (B, nv). The caller must not write to the result.
 
         Raises:
             ValueError: if the model has no element that the effect could act on.
         """
         force, data = self.process(model, rng or np.random.default_rng()), mujoco.MjData(model)
 
-        def forces(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
-            together = np.empty((len(qpos), model.nv))
-            for i, moment in enumerate(time):
-                data.qpos, data.qvel, data.ctrl, data.time = qpos[i], qvel[i], ctrl[i], moment
+        def forces(states: States) -> np.ndarray:
+            together = np.empty((len(states.qpos), model.nv))
+            for i, one in enumerate(zip(*states, strict=True)):
+                data.qpos, data.qvel, data.act, data.ctrl, data.time = one
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_comPos(model, data)
                 mujoco.mj_comVel(model, data)
@@ -293,6 +330,29 @@ class ForceEffect(Effect):
             return together
 
         return forces
+
+
+class VaryingEffect(Effect):
+    """An effect on numbers of the model that depend on the state, such as friction that grows with the load of a gear.
+
+    They are computed anew before every physics step, each effect after those before it in the list, and those of
+    ``acts_last`` after all others. MuJoCo's solver then lets a joint stick and slip.
+    """
+
+    acts_last: ClassVar[bool] = False
+
+    @abstractmethod
+    def vary(self, model: mujoco.MjModel) -> Variation:
+        """Returns the variation for many states at once.
+
+        It may remember what it has seen: it knows from the states' time whether they follow those of the last call.
+
+        Args:
+            model: the model in use; names are resolved once, in this call.
+
+        Raises:
+            ValueError: if the model has no element that the effect could act on.
+        """
 
 
 class ObservationEffect(Effect):

@@ -12,7 +12,7 @@ import mujoco
 
 from torchrl_h2o.effects.selection import Names, matching
 
-_ON_SLIDES = {"N·m": "N", "N·m·s/rad": "N·s/m", "N·m/rad": "N/m", "kg·m²": "kg", "rad": "m"}
+_ON_SLIDES = {"N·m": "N", "N·m·s/rad": "N·s/m", "N·m/rad": "N/m", "kg·m²": "kg", "rad/s": "m/s", "rad": "m"}
 _NAMES_ON_SLIDES = {"torque": "force", "inertia": "mass", "angle": "distance"}
 _TYPES = {
     mujoco.mjtJoint.mjJNT_HINGE: "hinge",

@@ -24,6 +24,8 @@ from torchrl_h2o.effects.effect import (
     ForceEffect,
     ObservationEffect,
     Process,
+    Variation,
+    VaryingEffect,
     checked_effects,
 )
 from torchrl_h2o.effects.model.compilation import compile_model, edit_spec
@@ -41,11 +43,13 @@ class Episode(NamedTuple):
         actions: functions from an action (..., nu) to the altered one, in order.
         observations: functions from an observation (..., n) to the altered one, in order.
         forces: functions from the simulation's state to generalised forces (nv,), which are summed.
+        variations: numbers of the model that depend on the state, in the order in which they are applied.
     """
 
     actions: Sequence[Process] = ()
     observations: Sequence[Process] = ()
     forces: Sequence[Force] = ()
+    variations: Sequence[Variation] = ()
 
     def executed(self, action: np.ndarray) -> np.ndarray:
         """Returns the action that the simulator executes, (..., nu), as a new array of floats."""
@@ -61,9 +65,9 @@ class Pipeline:
     """A list of effects and how it is applied.
 
     Effects compose in their order: model edits first to last before one compilation, action effects first to last,
-    observation effects first to last, forces summed. Neutral effects are skipped. Negative noise is subtracted from
-    the noise before it, see :func:`~torchrl_h2o.effects.balanced`. If it exceeds that noise, ValueError is raised when
-    actions are altered, not when the pipeline is made.
+    observation effects first to last, forces summed. Neutral effects are skipped. Negative noise is subtracted
+    from the noise before it, see :func:`~torchrl_h2o.effects.balanced`. If it exceeds that noise, ValueError
+    is raised when actions are altered, not when the pipeline is made.
 
     Args:
         effects: the effects, in their order.
@@ -125,6 +129,10 @@ class Pipeline:
         """Returns the forces as functions of many states; see :meth:`ForceEffect.batched`."""
         return [effect.batched(model) for effect in self.of_kind(ForceEffect)]
 
+    def variations(self, model: mujoco.MjModel) -> list[Variation]:
+        """Returns how numbers of the model depend on the state, in the order in which they are applied."""
+        return [effect.vary(model) for effect in sorted(self.of_kind(VaryingEffect), key=lambda one: one.acts_last)]
+
     # ---------------------------------------------------------------------------------------- step by step
     def begin(self, dt: float, rng: np.random.Generator | None = None, model: mujoco.MjModel | None = None) -> Episode:
         """Begins an episode.
@@ -132,11 +140,11 @@ class Pipeline:
         Args:
             dt: the control step, in s.
             rng: the generator of the random effects; not needed if there are none.
-            model: the compiled model. Without it the episode holds no forces.
+            model: the compiled model. Without it the episode holds no forces and no variations.
 
         Raises:
-            ValueError: if the model has no element that a force could act on; also during the episode, if an effect
-                draws random numbers although its class is not marked ``random``.
+            ValueError: if the model has no element that a force or a variation could act on; also during the episode,
+                if an effect draws random numbers although its class is not marked ``random``.
         """
 
         def processes(kind: type[ActionEffect | ForceEffect | ObservationEffect], on: Any) -> list:
@@ -145,7 +153,9 @@ class Pipeline:
         # effects share the generator, so this order decides which numbers they draw at the start of an episode
         observations = processes(ObservationEffect, dt)
         actions = processes(ActionEffect, dt)
-        return Episode(actions, observations, [] if model is None else processes(ForceEffect, model))
+        if model is None:
+            return Episode(actions, observations)
+        return Episode(actions, observations, processes(ForceEffect, model), self.variations(model))
 
     # ------------------------------------------------------------------------------------------ whole runs
     def executed_run(self, actions: np.ndarray, dt: float, rng: np.random.Generator | None = None) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import partial
 from os import cpu_count
 from typing import Any, cast
@@ -26,7 +27,7 @@ from torchrl_h2o.effects import (
     effect_from_dict,
     effect_to_dict,
 )
-from torchrl_h2o.effects.effect import BatchedForce, checked_effects
+from torchrl_h2o.effects.effect import BatchedForce, States, Variation, checked_effects
 from torchrl_h2o.effects.model.compilation import require_changes
 from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 from torchrl_h2o.envs.dynamics_gap import DrawEffects, DynamicsGap, GapContent, transforms_of
@@ -154,6 +155,13 @@ class BatchedMujocoEnv(EnvBase):
             for pipeline, own in worlds.items()
             for force in pipeline.batched_forces(self._models[own[0]])
         ]
+        self._variations = [
+            _variation_in_worlds(np.array(own), variation)
+            for pipeline, own in worlds.items()
+            for variation in pipeline.variations(self._models[own[0]])
+        ]
+        if self._variations and len({id(model) for model in self._models}) < self.num_worlds:
+            self._models = [copy(model) for model in self._models]  # the numbers of each world are written into it
 
     def _make_specs(self, env: EnvBase) -> None:
         n = self.num_worlds
@@ -200,12 +208,13 @@ class BatchedMujocoEnv(EnvBase):
         before = positions_and_velocities(self._models[0], self.states)[0].copy()
         reached = roll_out(
             self._pool,
-            self._models if self._differ else self._models[0],
+            self._models if self._differ or self._variations else self._models[0],
             self._data,
             self.states,
             executed[:, None].astype(float),
             self.physics_steps,
             forces=self._forces,
+            variations=self._variations,
         )
         self.states[:] = reached[:, 0]
         self._steps[:] += 1
@@ -291,12 +300,26 @@ class BatchedMujocoEnv(EnvBase):
 def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
     """Restricts a force to some worlds; it is zero in the others."""
 
-    def forces(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
-        everywhere = np.zeros(qvel.shape)
-        everywhere[worlds] = force(qpos[worlds], qvel[worlds], ctrl[worlds], time[worlds])
+    def forces(states: States) -> np.ndarray:
+        everywhere = np.zeros(states.qvel.shape)
+        everywhere[worlds] = force(States(*(part[worlds] for part in states)))
         return everywhere
 
     return forces
+
+
+def _variation_in_worlds(worlds: np.ndarray, variation: Variation) -> Variation:
+    """Restricts a variation to some worlds."""
+
+    def apply(states: States, values: dict[str, np.ndarray]) -> np.ndarray:
+        own = {field: value[worlds] for field, value in values.items()}
+        force = np.zeros(states.qvel.shape)
+        force[worlds] = variation.apply(States(*(part[worlds] for part in states)), own)
+        for field in variation.fields:
+            values[field][worlds] = own[field]
+        return force
+
+    return Variation(variation.fields, apply)
 
 
 def _of_each_world(

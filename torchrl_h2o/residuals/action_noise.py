@@ -10,8 +10,8 @@ import numpy as np
 from torchrl_h2o.effects import ActionNoise
 from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.explanation import Explanation, Part
+from torchrl_h2o.residuals.intervals import CONFIDENCE
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.refit import CONFIDENCE
 from torchrl_h2o.residuals.score import Model
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.start_states import OF_NORMAL, USUAL_FACTORS, Noise, Steps

@@ -122,6 +122,7 @@ def _found(explanation: Explanation, errors: Sequence[float], simulation: Simula
             error,
             ("" if part.declared else f"{UNDECLARED}: ") + effect_words(part.effect, simulation.names),
             effect_units(part.effect, simulation.names),
+            part.in_logs,
         )
         for part, error in zip(explanation.parts, errors, strict=True)
     )

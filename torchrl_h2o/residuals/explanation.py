@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Effect
+from torchrl_h2o.residuals.between_logs import InLogs
 from torchrl_h2o.residuals.report.contents import SearchStep
 
 Interval = tuple[float, float]
@@ -34,12 +35,14 @@ class Part:
         declared: True if it is an entry of the catalogue.
         ci95: 95 % interval (low, high) of each fitted parameter, in its unit.
         alike: alternatives that explain the data equally well in place of this effect.
+        in_logs: each fitted parameter in each of several logs.
     """
 
     effect: Effect
     declared: bool
     ci95: Mapping[str, Interval]
     alike: tuple[Alternative, ...] = ()
+    in_logs: Mapping[str, InLogs] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

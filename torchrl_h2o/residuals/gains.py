@@ -12,9 +12,10 @@ from scipy.optimize import lsq_linear
 
 from torchrl_h2o.effects import Armature, CatalogueEntry, Effect, JointDamping, JointFrictionLoss
 from torchrl_h2o.likelihood import FEWEST, Difference, log_density
-from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable, block_of, flat, weights, whitened
+from torchrl_h2o.residuals.refit import REWEIGHTED, RIDGE, Variable
 from torchrl_h2o.residuals.score import Predictions, fitted_scales
 from torchrl_h2o.residuals.sweep import Direction
+from torchrl_h2o.residuals.whitened import block_of, flat, weights, whitened
 
 #: what every driven joint has, so that a machine may lack all of it
 OF_JOINTS = (JointFrictionLoss, JointDamping, Armature)

@@ -11,8 +11,8 @@ from torchrl_h2o.data.audit.derivative import fit_derivative
 from torchrl_h2o.data.audit.log import Log
 from torchrl_h2o.effects import CatalogueEntry, ObservationDelay
 from torchrl_h2o.residuals.explanation import Part
+from torchrl_h2o.residuals.intervals import interval
 from torchrl_h2o.residuals.measured.transitions import Measured
-from torchrl_h2o.residuals.refit import interval
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 LATE = 0.5  # rows by which a velocity is late against the derivative of its position if a filter computed it

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.stats import t as student
 
-from torchrl_h2o.effects import CatalogueEntry, Effect, Parameter
-from torchrl_h2o.likelihood import TAIL, log_density
+from torchrl_h2o.effects import CatalogueEntry, Effect
+from torchrl_h2o.likelihood import log_density
+from torchrl_h2o.residuals.between_logs import InLogs
+from torchrl_h2o.residuals.intervals import spreads_of
 from torchrl_h2o.residuals.model_bounds import lowest_value
 from torchrl_h2o.residuals.score import Predictions, fitted_scales, scores
+from torchrl_h2o.residuals.whitened import Whitened, flat, weights, whitened
 
 STEP = 0.02  # step of the finite differences, in typical sizes of a parameter
 SMALLEST_GAIN = 1e-2  # gain of the score, in nats a block, below which a fit has converged
@@ -22,9 +24,7 @@ FARTHEST_FACTOR = 60.0  # largest logarithm of a factor, to base 2, beyond which
 RIDGE = 1e-6  # share of a parameter's curvature that is added, so that what the data do not show stays where it is
 LEVERAGE = 9.0  # squared derivative, in squared medians, at which a row has half its weight
 REWEIGHTED = 8  # solutions of the weighted equations in one step
-CONFIDENCE = 1.96  # standard errors from a value to the end of its 95 % interval
 
-Whitened = tuple[np.ndarray, np.ndarray, np.ndarray]
 Slopes = Sequence[np.ndarray]
 
 
@@ -86,6 +86,7 @@ class SetFit:
         effects: the effects with their fitted values.
         half_widths: half-width of the 95 % interval of each fitted parameter, by effect and name, in its unit.
         scatter: half-width, in quadrature beside these, by which the value in another log of the machine may differ.
+        in_logs: each value in each of several logs; empty for one log.
         slopes: derivatives of the errors by the values, (N, p) for each part.
         score: mean score of the blocks, in nats.
     """
@@ -93,6 +94,7 @@ class SetFit:
     effects: tuple[Effect, ...]
     half_widths: tuple[dict[str, float], ...]
     scatter: tuple[dict[str, float], ...]
+    in_logs: tuple[dict[str, InLogs], ...]
     slopes: Slopes
     score: float
 
@@ -187,13 +189,28 @@ def fit_set(
             break
     widths: tuple[dict[str, float], ...] = tuple({} for _ in effects)
     scatter: tuple[dict[str, float], ...] = tuple({} for _ in effects)
+    in_logs: tuple[dict[str, InLogs], ...] = tuple({} for _ in effects)
     if intervals and variables:
         slopes = slopes_of(parts, effects, variables, errors)
         weighted = [whitened(*each) for each in zip(parts, errors, scales, strict=True)]
-        for variable, half, between in zip(variables, *_half_widths(parts, weighted, slopes), strict=True):
-            widths[variable.effect][variable.name] = half * abs(variable.slope(0.0))
-            scatter[variable.effect][variable.name] = between * abs(variable.slope(0.0))
-    return SetFit(effects, widths, scatter, slopes, float(by_block.mean()))
+
+        def white_at(x: np.ndarray) -> np.ndarray:
+            moved = [part.errors(with_values(effects, variables, x)) for part in parts]
+            return np.concatenate([whitened(*each)[0] for each in zip(parts, moved, scales, strict=True)])
+
+        spreads = spreads_of(parts, weighted, slopes, white_at)
+        for index, variable in enumerate(variables):
+            slope = variable.slope(0.0)
+            widths[variable.effect][variable.name] = spreads.half_widths[index] * abs(slope)
+            scatter[variable.effect][variable.name] = spreads.scatter[index] * abs(slope)
+            if len(spreads.logs) > 1:
+                in_logs[variable.effect][variable.name] = InLogs(
+                    spreads.logs,
+                    tuple(map(variable.at, spreads.moves[:, index].tolist())),
+                    tuple((abs(slope) * spreads.errors[:, index]).tolist()),
+                    abs(variable.value - (variable.neutral if math.isfinite(variable.neutral) else 0.0)),
+                )
+    return SetFit(effects, widths, scatter, in_logs, slopes, float(by_block.mean()))
 
 
 def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:
@@ -201,30 +218,6 @@ def _profiled(parts: Sequence[Predictions], errors) -> tuple[list, np.ndarray]:
     scales = [fitted_scales(part, error) for part, error in zip(parts, errors, strict=True)]
     found = [scores(*each) for each in zip(parts, errors, scales, strict=True)]
     return scales, np.concatenate(found)
-
-
-def flat(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Errors of all windows in one vector."""
-    return np.concatenate([one.ravel() for one in arrays])
-
-
-def whitened(part: Predictions, errors: Sequence[np.ndarray], scales: Sequence[np.ndarray]) -> Whitened:
-    """Whitened errors, the inverse of their scale, and their shares in the score, each (N)."""
-    roots = [1.0 / np.sqrt(variance + scale) for variance, scale in zip(part.variances, scales, strict=True)]
-    shares = [np.broadcast_to(share[:, None], one.shape) for share, one in zip(part.shares, errors, strict=True)]
-    inverse = flat(roots)
-    return flat(errors) * inverse, inverse, flat(shares)
-
-
-def weights(white: np.ndarray) -> np.ndarray:
-    """Weights with which half the sum of squares of whitened errors has the gradient of the log density."""
-    return (TAIL + 1.0) / (TAIL - 2.0 + white**2)
-
-
-def block_of(part: Predictions) -> np.ndarray:
-    """Index of the block of each error of :func:`flat`, (N)."""
-    n = part.record.num_readings
-    return np.concatenate([np.repeat(w.block, len(w.horizons) * n) for w in part.blocks.windows])
 
 
 def slopes_of(
@@ -284,66 +277,3 @@ def _step(parts: Sequence[Whitened], slopes: Slopes, variables: Sequence[Variabl
         if (score := log_density(moved) @ share) > most:
             best, most = x, score
     return best
-
-
-def _half_widths(
-    parts: Sequence[Predictions], found: Sequence[Whitened], slopes: Slopes
-) -> tuple[np.ndarray, np.ndarray]:
-    """Half-widths of the variables' 95 % intervals, a sandwich estimate with each block as one observation, (p,).
-
-    Of several logs also, in quadrature, what the scatter between them adds for the value in another log; else 0.
-    """
-    count, logs, blocks, rows = 0, [], [], []
-    for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
-        block, log = block_of(part), part.record.measured.log
-        logs.append(np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first])
-        blocks.append(count + block)
-        weight = share * weights(white)
-        rows.append((slope * inverse[:, None], weight, weight * white))
-        count += len(part.blocks)
-    log_of, block = np.concatenate(logs), np.concatenate(blocks)
-    scaled, weight, pull = (np.concatenate(one) for one in zip(*rows, strict=True))
-
-    def solved(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The move to the best values of some blocks alone, if the errors are linear, and its squared errors."""
-        own = chosen[block]
-        pulls = np.zeros((count, scaled.shape[1]))
-        np.add.at(pulls, block[own], scaled[own] * pull[own, None])
-        bread = np.linalg.pinv(scaled[own].T @ (weight[own, None] * scaled[own]))
-        spare = chosen.sum() / max(1, chosen.sum() - len(bread))
-        return -bread @ pulls.sum(0), np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0)
-
-    half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool))[1])
-    every = [solved(log_of == log) for log in np.unique(log_of)]
-    if len(every) == 1:
-        return half, np.zeros(len(half))
-    between = scatter_between(*map(np.stack, zip(*every, strict=True)))
-    return half, student.ppf(0.975, len(every) - 1) * np.sqrt(between * (1.0 + 1.0 / len(every)))
-
-
-def scatter_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray:
-    """Variance between logs of values that are known with errors, (p,).
-
-    R. DerSimonian and N. Laird, *Meta-analysis in clinical trials*, Controlled Clinical Trials 7 (1986), 177-188.
-
-    Args:
-        values: the values in each log, (logs, p).
-        variances: squared standard errors of these, (logs, p).
-
-    Examples:
-        >>> import numpy as np
-        >>> errors = np.full((3, 2), 0.01)
-        >>> scatter_between(np.array([[1.0, 0.0], [2.0, 0.1], [3.0, -0.1]]), errors).round(2).tolist()
-        [0.99, 0.0]
-    """
-    weight = 1.0 / np.maximum(variances, 1e-300)
-    total = weight.sum(0)
-    mean = (weight * values).sum(0) / total
-    excess = (weight * (values - mean) ** 2).sum(0) - (len(values) - 1)
-    return np.maximum(excess / np.maximum(total - (weight**2).sum(0) / total, 1e-300), 0.0)
-
-
-def interval(parameter: Parameter, half_width: float) -> tuple[float, float]:
-    """95 % interval of a fitted parameter, within its bounds."""
-    low, high = parameter.bounds
-    return float(max(low, parameter.value - half_width)), float(min(high, parameter.value + half_width))

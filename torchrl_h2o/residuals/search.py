@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,15 +21,18 @@ from torchrl_h2o.residuals.forces.candidates import force_entry
 from torchrl_h2o.residuals.gains import summed
 from torchrl_h2o.residuals.ground import GROWN, NATS_OF_SURPRISE, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, grow, is_preferred, with_force
+from torchrl_h2o.residuals.intervals import interval
 from torchrl_h2o.residuals.measured.transitions import Measured
 from torchrl_h2o.residuals.progress import EFFECTS, FORCES, OTHERS, LoopBar, OutOfTimeError
 from torchrl_h2o.residuals.prune import prune, replaced
-from torchrl_h2o.residuals.refit import fit_set, interval
+from torchrl_h2o.residuals.refit import SetFit, fit_set
 from torchrl_h2o.residuals.report.contents import SearchStep
 from torchrl_h2o.residuals.report.words import effect_words
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.simulation.simulation import Simulation
 from torchrl_h2o.residuals.sweep import Direction, alone_on, sweep
+
+T = TypeVar("T")
 
 RESWEPT = 64  # entries of the largest estimated gain, which are simulated again in later sweeps
 NEUTRAL = 0.1  # half-widths from neutral up to which effects are left out together
@@ -218,10 +222,10 @@ def disjoint(
     for entry, effect in zip(found.entries, found.effects, strict=True):
         own = [alone.get((type(effect), index)) for index in all_elements(effect, simulation)]
         further = {one.name for one in own if one is not None} & found.names - {entry.name}
-        if len(effect.parameters) == 1 and further and None not in own and len(own) <= 1 + len(further):
+        if len(entry.fitted) == 1 and further and None not in own and len(own) <= 1 + len(further):
             present = dict(zip((one.name for one in found.entries), found.effects, strict=True))
             singles = [one for one in own if one is not None]
-            shared = {name: parameter.value for name, parameter in effect.parameters.items()}
+            shared = {name: effect.parameters[name].value for name in entry.fitted}
             values = [one.effect.with_parameters(shared) for one in singles]
             values = [
                 summed(value, present[one.name]) if one.name in further else value
@@ -238,8 +242,8 @@ def disjoint(
 
 def with_intervals(
     ground: Ground, found: Found, alike: Sequence[Sequence[Found]]
-) -> tuple[Found, Sequence[Mapping[str, float]], Sequence[Sequence[Found]]]:
-    """A set fitted to the rows for fits and for selection, with half-widths of its intervals, and its alternatives.
+) -> tuple[Found, SetFit, Sequence[Sequence[Found]]]:
+    """A set fitted to the rows for fits and for selection, the fit with its intervals, and the set's alternatives.
 
     Of several logs, an interval is that of the value in another log of the machine: it holds the scatter between logs.
 
@@ -283,7 +287,7 @@ def with_intervals(
             if entry.name not in idle
         ]
         found, fit = fewer, refit
-    return replace(found, effects=fit.effects), fit.in_another_log, alike
+    return replace(found, effects=fit.effects), fit, alike
 
 
 def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
@@ -295,29 +299,28 @@ def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
     return abs(parameter.value - parameter.neutral) / half if half > 0.0 else math.inf
 
 
-def _explanation(
-    found: Found, half_widths: Sequence[Mapping[str, float]] = (), alike: Sequence[Sequence[Found]] = ()
-) -> Explanation:
+def _explanation(found: Found, fit: SetFit | None = None, alike: Sequence[Sequence[Found]] = ()) -> Explanation:
     """The explanation by a set; the terms of forces are put together, at its end."""
     parts, forces = [], []
     for index, effect in enumerate(found.effects):
-        half = half_widths[index] if half_widths else {}
+        half, in_logs = ({}, {}) if fit is None else (fit.in_another_log[index], fit.in_logs[index])
         ci95 = {name: interval(effect.parameters[name], width) for name, width in half.items()}
         if isinstance(effect, ResidualForce):
-            forces.append((effect, ci95))
+            forces.append((effect, ci95, in_logs))
             continue
         instead = [_alternative(other, found) for other in alike[index] if _is_one(other, found)] if alike else []
-        parts.append(Part(effect, True, ci95, tuple(instead)))
+        parts.append(Part(effect, True, ci95, tuple(instead), in_logs))
     if forces:
-        terms = tuple(term for effect, _ in forces for term in effect.terms)
-        ci95 = {
-            f"{name.rsplit('_', 1)[0]}_{index}": ends
-            for index, (_, own) in enumerate(forces, start=1)
-            for name, ends in own.items()
-        }
-        parts.append(Part(ResidualForce(terms), False, ci95))
+        effects, intervals, each = zip(*forces, strict=True)
+        terms = tuple(term for effect in effects for term in effect.terms)
+        parts.append(Part(ResidualForce(terms), False, _of_terms(intervals), in_logs=_of_terms(each)))
     others = {other.names: other.effects for sets in alike for other in sets if not _is_one(other, found)}
     return Explanation(tuple(parts), others=tuple(others.values()))
+
+
+def _of_terms(each: Sequence[Mapping[str, T]]) -> dict[str, T]:
+    """What belongs to the parameters of single terms, by the parameters of the force with all these terms."""
+    return {f"{name.rsplit('_', 1)[0]}_{i}": one for i, own in enumerate(each, start=1) for name, one in own.items()}
 
 
 def _is_one(other: Found, found: Found) -> bool:

@@ -16,17 +16,23 @@ from torchrl_h2o.effects import (
     ActionSaturation,
     CatalogueEntry,
     Effect,
+    GearPlay,
     JointRange,
     ObservationDelay,
+    ServoDeadBand,
+    TorqueSpeedLine,
 )
 from torchrl_h2o.residuals.elements import elements
 from torchrl_h2o.residuals.model_bounds import lowest_value
-from torchrl_h2o.residuals.refit import flat
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.simulation.simulation import Simulation
+from torchrl_h2o.residuals.whitened import flat
 
 #: effects that act otherwise at each size, so that every trial is simulated
-NOT_LINEAR = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay)
+NOT_LINEAR = (
+    *(ActionBacklash, ActionDeadBand, ActionDelay, ActionLag, ActionSaturation, JointRange, ObservationDelay),
+    *(GearPlay, ServoDeadBand, TorqueSpeedLine),
+)
 SMOOTH = (ActionDelay, ActionLag, ObservationDelay)  # of these, those whose errors are linear in a small size
 FAR = 2.0  # factor beyond which a trial is simulated for itself, because the errors are not linear that far
 LEAST_FACTOR = 0.1  # least factor that a share of a trial stands for, if the trial is above it
@@ -204,6 +210,9 @@ def _shares(
     """Shares of a trial at which the errors are about linear and the model accepts the effect."""
     if isinstance(entry.effect, NOT_LINEAR) or _is_far(entry, trial):
         return 0.0, 1.5
+    parameter = entry.effect.parameters[entry.fitted[0]]
+    if parameter.neutral == parameter.bounds[0]:
+        return 0.0, MOST_SHARE
     least = lowest_value(entry.effect, simulation.model, beside)
     if not math.isfinite(least):
         return -MOST_SHARE, MOST_SHARE

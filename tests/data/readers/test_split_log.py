@@ -105,6 +105,7 @@ def test_runs_of_several_files_are_runs(tmp_path):
         ),
         (10.0 * np.arange(50), r"effort from 0 to 490; give files of one run whose times have the same unit"),
         (0.01 * np.arange(50)[::-1], r"effort.csv: the time goes back"),
+        (np.where(np.arange(50) == 20, np.nan, 0.01 * np.arange(50)), r"effort.csv: the time goes back or is missing"),
     ],
 )
 def test_files_that_cannot_be_joined_say_why(tmp_path, effort_times, said):

@@ -60,11 +60,11 @@ def test_a_report_without_effects_says_whether_nothing_is_missing_or_nothing_can
     ("count", "words"),
     [
         (0, ""),
-        (1, " Noise or a lack of motion would hide in these data: gravity × 1."),
+        (1, " Not identifiable in these data, because noise or a lack of motion would hide them: gravity × 1."),
         (
             9,
-            " Noise or a lack of motion would hide 9 effects in these data, such as gravity × 1, gravity × 2, "
-            "gravity × 3 and gravity × 4.",
+            " 9 effects are not identifiable in these data, because noise or a lack of motion would hide them, such as "
+            "gravity × 1, gravity × 2, gravity × 3 and gravity × 4.",
         ),
     ],
 )

@@ -111,7 +111,7 @@ def _pairs(found: list[Sensitivity]) -> list[Finding]:
             if abs(cosine) < ALIKE:
                 continue
             record = _TO_RECORD.get((one.effect, other.effect), "record other motion of this joint")
-            words = f"{one} and {other} look alike in this log (cosine {cosine:.2f})"
+            words = f"{one} and {other} look alike in this log, each weak beside the other (cosine {cosine:.2f})"
             if one.joint == other.joint != "":
                 words = f"{one.effect} and {other}{words[len(f'{one} and {other}') :]}"
             notes.append(Finding(CHECK, "note", words, None, record))
@@ -137,7 +137,8 @@ def _combinations(found: list[Sensitivity], pairs: list[Finding]) -> list[Findin
         if multiple < COMBINED:
             continue
         strongest = [others[i].effect for i in np.argsort(-np.abs(values))[:3]]
-        words = f"a weaker motor of {gain.joint} and a combination of {', '.join(strongest)} look alike in this log "
+        others_words = f"a combination of {', '.join(strongest)}"
+        words = f"motor gain of {gain.joint} is weak in this log, because {others_words} looks like a weaker motor "
         record = "record torques that do not follow the motion, such as random ones"
         notes.append(Finding(CHECK, "note", f"{words}(correlation {multiple:.2f})", None, record))
     return notes

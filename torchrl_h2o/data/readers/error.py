@@ -127,7 +127,7 @@ def require_finite(
         return
     index, position = np.argwhere(~plausible)[0]
     raise DataError(
-        f"the value is {values[index, position]}",
+        f"the value is {values[index, position]}{', a missing number' if np.isnan(values[index, position]) else ''}",
         f"every value must be finite and at most {largest:.3g}: correct it or its unit, remove the row and those that "
         "depend on it, or ignore the column",
         source=source,

@@ -13,6 +13,7 @@ import numpy as np
 from torchrl_h2o.data.readers.error import DataError, require_finite
 from torchrl_h2o.data.readers.formats import read_raw
 from torchrl_h2o.data.readers.formats.raw_table import RawTable
+from torchrl_h2o.data.readers.held_actions import hold_actions
 from torchrl_h2o.data.readers.log_columns import Column, LogColumns
 
 # the largest plausible value in SI: beyond 2³² counts of an encoder and the seconds since 1970, below what a lost
@@ -54,11 +55,12 @@ def read_table(path: str | PathLike[str], layout: LogColumns) -> LogTable:
         layout: the meaning of its columns.
 
     Returns:
-        The table, converted to SI. Ignored columns are not parsed.
+        The table, converted to SI. Ignored columns are not parsed. Empty cells of actions hold the last value, see
+        :func:`~torchrl_h2o.data.readers.held_actions.hold_actions`.
 
     Raises:
         DataError: for a missing, binary, empty or truncated file, missing or extra columns, a cell that is not a
-            number, NaN, or a value beyond :data:`LARGEST`.
+            number, a reading that is NaN, or a value beyond :data:`LARGEST`.
 
     Example:
         >>> import pathlib, tempfile
@@ -83,6 +85,8 @@ def read_table(path: str | PathLike[str], layout: LogColumns) -> LogTable:
         values, numbers = values[: len(values) - zero_rows], numbers[: len(values) - zero_rows]
     if len(values) < 2:
         raise DataError("only rows of zeros remain", "record the log again", source=raw.source)
+    values, kept = hold_actions(values, [column for _, column in chosen], str(raw.source))
+    numbers = numbers[kept]
     try:
         values = np.stack([column.in_si(values[:, index]) for index, (_, column) in enumerate(chosen)], axis=1)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Effects on the timing of actuators: delay and first-order lag."""
+"""Effects on the timing of actuators: delay, first-order lag and lead."""
 
 import math
 from dataclasses import dataclass
@@ -94,3 +94,42 @@ class ActionLag(ActionEffect):
             return 0.0, 0.0
         ratio = dt / self.time_constant
         return math.exp(-ratio), -math.expm1(-ratio) / ratio
+
+
+@dataclass(frozen=True)
+class ActionLead(ActionEffect):
+    r"""The derivative gain of servos acts on the target, too: the executed action leads the commanded one.
+
+    A servo whose torque is :math:`K_p e + K_d \dot e`, with the error e between target and position, does what one with
+    :math:`K_d` on the velocity alone does with the target :math:`u + T \dot u`, where :math:`T = K_d / K_p`. The
+    derivative is that between two control steps.
+
+    Args:
+        time: T, the derivative time, in s.
+        actuators: indices of the leading entries of the action; all by default.
+
+    Examples:
+        >>> import numpy as np
+        >>> leading = ActionLead(0.005).process(dt=0.01, rng=np.random.default_rng(0))
+        >>> [float(leading(np.array([command]))[0]) for command in (1.0, 1.0, 2.0, 2.0)]
+        [1.0, 1.0, 2.5, 2.0]
+    """
+
+    wording: ClassVar[str] = "{actuators} lead by {time} (derivative gain on the target)"
+    time: float = parameter(unit="s", bounds=(0.0, 1.0), neutral=0.0)
+    actuators: Indices = None
+
+    def process(self, dt: float, rng: np.random.Generator) -> Process:
+        before: np.ndarray | None = None
+
+        def leading(action: np.ndarray) -> np.ndarray:
+            nonlocal before
+            rise = 0.0 if before is None else action - before
+            before = action
+            return np.where(entry_mask(action, self.actuators), action + self.time / dt * rise, action)
+
+        return leading
+
+    def run(self, actions: np.ndarray, dt: float, rng: np.random.Generator) -> np.ndarray:
+        leading = actions + self.time / dt * np.diff(actions, axis=0, prepend=actions[:1])
+        return np.where(entry_mask(actions, self.actuators), leading, actions)

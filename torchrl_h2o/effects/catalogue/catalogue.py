@@ -12,7 +12,7 @@ import numpy as np
 
 from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation
 from torchrl_h2o.effects.action.signal import ActionBias, ActionGain, ActionNoise
-from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
+from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag, ActionLead
 from torchrl_h2o.effects.catalogue.choices import indexed_choices
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
 from torchrl_h2o.effects.catalogue.mechanism import Mechanism
@@ -20,12 +20,15 @@ from torchrl_h2o.effects.catalogue.model_entries import (
     FACTORS,
     body_entries,
     force_entries,
+    gear_entries,
     geom_entries,
     joint_entries,
 )
 from torchrl_h2o.effects.effect import ModelEffect
+from torchrl_h2o.effects.force.servo import ServoDeadBand, TorqueSpeedLine
+from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.model.compilation import compile_model, saved_model
-from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoStiffness, is_filter, is_servo
+from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoDamping, ServoStiffness, is_filter, is_servo
 from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.observation.sensor import (
     ObservationBias,
@@ -77,7 +80,7 @@ def catalogue(
         *joint_entries(mechanism),
         *geom_entries(mechanism, spec),
         *force_entries(mechanism),
-        *_servo_entries(mechanism, spec),
+        *_servo_entries(mechanism, spec, dt),
         *_action_entries(mechanism, dt),
         *_observation_entries(num_observations, dt, tuple(velocities)),
     ]
@@ -95,11 +98,31 @@ def _world_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     yield CatalogueEntry(Timestep(), each("scale", 0.8, 1.25))
 
 
-def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
+def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec, dt: float) -> Iterator[CatalogueEntry]:
     yield from entries_of(ServoStiffness, "actuators", _where(is_servo, spec), lambda _: each("scale", *FACTORS))
     yield from entries_of(
         ActuatorTimeConstant, "actuators", _where(is_filter, spec), lambda _: each("scale", 0.1, *FACTORS, 4.0)
     )
+    servos = _where(lambda one: is_servo(one) and mechanism.joint_of(one.id) is not None, spec)
+    yield from entries_of(ActionLead, "actuators", servos, lambda _: each("time", 0.3 * dt, dt, 3.0 * dt))
+    yield from entries_of(ServoDeadBand, "actuators", servos, lambda _: each("width", 0.005, 0.02, 0.05))
+    yield from entries_of(GearPlay, "actuators", servos, lambda _: each("width", 0.005, 0.02, 0.05))
+
+    def of_stiffness(parameter: str, *shares: float, **others: float) -> Callable[[tuple[int, ...]], Trials]:
+        """Shares of the torque that the servos make for an error of 1 rad, beside other values."""
+
+        def of(chosen: tuple[int, ...]) -> Trials:
+            torques = [abs(spec.actuators[i].gainprm[0] * spec.actuators[i].gear[0]) for i in chosen]
+            return tuple({parameter: share * float(np.median(torques)), **others} for share in shares)
+
+        return of
+
+    yield from entries_of(TorqueSpeedLine, "actuators", servos, of_stiffness("stall", 0.03, 0.1, 0.3, speed=10.0))
+    # without a limit of its torque, the damping of a servo is that of its joint
+    limited = {chosen: own for chosen, own in servos.items() if all(spec.actuators[i].forcelimited for i in own)}
+    yield from entries_of(ServoDamping, "actuators", limited, of_stiffness("damping", 0.003, 0.03))
+    driven = {mechanism.joint_of(index) for own in servos.values() for index in own}
+    yield from gear_entries(mechanism, sorted(joint for joint in driven if joint is not None))
 
 
 def _where(applies: Callable[[mujoco.MjsActuator], bool], spec: mujoco.MjSpec) -> dict[Indices, tuple[int, ...]]:

@@ -38,7 +38,7 @@ class Mechanism:
 
     def actuator_label(self, actuator: int) -> str:
         """Returns the name of an actuator, or of the joint that it drives."""
-        name, joint = self.model.actuator(actuator).name, self._joint_of_actuators()[actuator]
+        name, joint = self.model.actuator(actuator).name, self.joint_of(actuator)
         return name or (self.model.joint(joint).name if joint is not None else "")
 
     def floating(self, joint: int) -> bool:
@@ -130,6 +130,10 @@ class Mechanism:
                 if masks and one != other and not kin:
                     pairs.append((a, b))
         return pairs
+
+    def joint_of(self, actuator: int) -> int | None:
+        """The joint that an actuator acts on; None if it acts on several or on none."""
+        return self._joint_of_actuators()[actuator]
 
     def _joint_of_actuators(self) -> list[int | None]:
         return [

@@ -12,6 +12,7 @@ from torchrl_h2o.effects.catalogue.choices import named_choices
 from torchrl_h2o.effects.catalogue.entry import CatalogueEntry, Trials, each, entries_of
 from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
+from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
@@ -83,6 +84,18 @@ def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     yield from entries_of(JointFrictionLoss, "joints", chosen(bearings), frictions)
     inertias = _added(mechanism.inertia, "inertia", (0.1, 1.0), _own(model, "dof_armature"))
     yield from entries_of(Armature, "joints", chosen(bearings), inertias)
+
+
+def gear_entries(mechanism: Mechanism, joints: Sequence[int]) -> Iterator[CatalogueEntry]:
+    """Yields entries for the friction of the gears of joints that servos drive."""
+    chosen = named_choices(_joint_paths(mechanism.model), joints)
+    yield from entries_of(LoadFriction, "joints", chosen, lambda _: each("share", 0.05, 0.2))
+
+    def at_rest(own: tuple[int, ...]) -> Trials:
+        torque = 0.1 * float(np.median([mechanism.torque(joint) for joint in own]))
+        return tuple({"torque": torque, "speed": speed} for speed in (0.1, 1.0))
+
+    yield from entries_of(StribeckFriction, "joints", chosen, at_rest)
 
 
 def geom_entries(mechanism: Mechanism, spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:

@@ -10,6 +10,7 @@ import mujoco
 from torchrl_h2o.effects.action.signal import ActionBias
 from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.effect import Effect
+from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, Payload
 from torchrl_h2o.effects.model.geom import RollingResistance
 from torchrl_h2o.effects.model.joint import Armature, JointDamping, JointFrictionLoss
@@ -22,6 +23,8 @@ USUAL = (
     JointFrictionLoss,
     JointDamping,
     Armature,
+    LoadFriction,
+    StribeckFriction,
     RollingResistance,
     ActionDelay,
     ActionLag,
@@ -64,7 +67,7 @@ def surprise(effect: Effect) -> int:
         elif isinstance(effect, LATE):
             far = parameter.value > _VERY_LATE
         else:
-            far = isinstance(effect, USUAL[:4]) and parameter.value < 0.0
+            far = isinstance(effect, USUAL[:3]) and parameter.value < 0.0
         rank += far
     return rank
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect
+from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect, States
 from torchrl_h2o.effects.force.kinematics import com_jacobians
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Names
@@ -41,7 +41,7 @@ class JointForce(ForceEffect):
 
     def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
         force = self.process(model, rng)(None)
-        return lambda qpos, qvel, ctrl, time: np.broadcast_to(force, qvel.shape)
+        return lambda states: np.broadcast_to(force, states.qvel.shape)
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ def _batched_drag(model: mujoco.MjModel, names: Names, resistance: Callable[[Any
     """Returns the drag of :func:`_drag` as a function of many states."""
     jacobians_at = com_jacobians(model, selection.body_ids(model, names))
 
-    def drag(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
-        jacobians = jacobians_at(qpos)
-        velocities = (jacobians @ qvel[:, None, :, None])[..., 0]
+    def drag(states: States) -> np.ndarray:
+        jacobians = jacobians_at(states.qpos)
+        velocities = (jacobians @ states.qvel[:, None, :, None])[..., 0]
         resisting = resistance(np.linalg.norm(velocities, axis=-1, keepdims=True)) * velocities
         return -(resisting[..., None, :] @ jacobians).sum(1)[:, 0]
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import NO_NAMES, BatchedForce, EntryNames, Force, ForceEffect
+from torchrl_h2o.effects.effect import NO_NAMES, BatchedForce, EntryNames, Force, ForceEffect, States
 from torchrl_h2o.effects.force.term import ForceTerm
 from torchrl_h2o.effects.parameter import Parameter
 
@@ -95,14 +95,15 @@ class ResidualForce(ForceEffect):
 
     def process(self, model: mujoco.MjModel, rng: np.random.Generator) -> Force:
         forces = self.batched(model, rng)
-        return lambda data: forces(data.qpos[None], data.qvel[None], data.ctrl[None], np.array([data.time]))[0]
+        return lambda data: forces(States.of(data))[0]
 
     def batched(self, model: mujoco.MjModel, rng: np.random.Generator | None = None) -> BatchedForce:
         known = {freedom.name: freedom for freedom in degrees_of_freedom(model)}
         for term in self.parsed:
             _require(term, known, model)
 
-        def forces(qpos: np.ndarray, qvel: np.ndarray, ctrl: np.ndarray, time: np.ndarray) -> np.ndarray:
+        def forces(states: States) -> np.ndarray:
+            qpos, qvel, _, ctrl, time = states
             total = np.zeros_like(qvel)
             for term in self.parsed:
                 freedom = known[term.joint]

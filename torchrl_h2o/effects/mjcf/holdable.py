@@ -9,15 +9,15 @@ import mujoco
 
 from torchrl_h2o.effects.action.play import ActionBacklash, ActionDeadBand, ActionSaturation
 from torchrl_h2o.effects.action.signal import ActionBias, ActionGain
-from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
-from torchrl_h2o.effects.effect import ActionEffect, Effect, ForceEffect, ModelEffect, ObservationEffect
+from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag, ActionLead
+from torchrl_h2o.effects.effect import ActionEffect, Effect, ForceEffect, ModelEffect, ObservationEffect, VaryingEffect
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.force.residual_force import ResidualForce
 from torchrl_h2o.effects.mjcf.drive import Drive
 from torchrl_h2o.effects.model.compilation import compile_model, edit_spec
 from torchrl_h2o.effects.pipeline import Pipeline
 
-_LINEAR_IN_TIME = (ActionDelay, ActionLag)  # start from zero, so a gain before or after them is the same
+_LINEAR_IN_TIME = (ActionDelay, ActionLag, ActionLead)  # linear, so a gain before or after them is the same
 _ON_ACTUATORS = (ActionGain, ActionBias, ActionSaturation)
 # do not lead from a command within the control range out of it
 _WITHIN_RANGE = (ActionBacklash, ActionDeadBand, ActionDelay, ActionLag)
@@ -130,9 +130,11 @@ def _reason(effect: Effect, *, reads_controls: bool) -> str:
         return "MJCF has no constant force on a joint without a further actuator"
     if isinstance(effect, ForceEffect):
         return "MJCF has no such force"
+    if isinstance(effect, VaryingEffect):
+        return "it changes numbers of the model at every physics step"
     if isinstance(effect, ActionDelay):
         return "MJCF has no delay by a part of a control step"
-    if isinstance(effect, ActionLag):
+    if isinstance(effect, ActionLag | ActionLead):
         return "an actuator of MuJoCo filters its control at every physics step, this effect once per control step"
     if effect.random:
         return "MJCF has no random actuation"

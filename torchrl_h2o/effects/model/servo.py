@@ -6,7 +6,7 @@ from typing import ClassVar
 import mujoco
 
 from torchrl_h2o.effects.effect import ModelEffect
-from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.parameter import ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Indices
 
 
@@ -39,6 +39,37 @@ class ServoStiffness(ModelEffect):
         for servo in servos:
             servo.gainprm[0] *= self.scale
             servo.biasprm[1] *= self.scale
+
+
+@dataclass(frozen=True)
+class ServoDamping(ModelEffect):
+    """Derivative gain of position servos: a torque opposed to the velocity, within the limit of the servo's torque.
+
+    Args:
+        damping: addition to the servos' own damping, in MJCF ``kv``, in N·m·s/rad; a negative value reduces it.
+        actuators: indices of the actuators; all by default. Actuators that are not position servos are skipped.
+
+    Raises:
+        ValueError: when put into a model that has no such actuator, or if the damping would become negative.
+
+    Examples:
+        >>> ServoDamping(0.1).describe()
+        'damping of the servos of all actuators + 0.1 N·m·s/rad'
+    """
+
+    wording: ClassVar[str] = "damping of the servos of {actuators} + {damping}"
+    damping: float = parameter(unit="N·m·s/rad", bounds=ANY_SIZE, neutral=0.0)
+    actuators: Indices = None
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        servos = [actuator for actuator in _chosen(spec, self.actuators) if is_servo(actuator)]
+        if not servos:
+            raise ValueError("none of the actuators is a position servo, whose damping could be changed")
+        for servo in servos:
+            own = -float(servo.biasprm[2])
+            if own + self.damping < 0.0:
+                raise ValueError(f"servo '{servo.name}' has a damping of {own:g}, less than {-self.damping:g}")
+            servo.biasprm[2] = -(own + self.damping)
 
 
 @dataclass(frozen=True)

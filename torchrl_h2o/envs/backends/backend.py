@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_h2o.effects import Effect, ForceEffect, ModelEffect, Pipeline, compile_model
-from torchrl_h2o.effects.effect import Force
+from torchrl_h2o.effects import Effect, ForceEffect, ModelEffect, Pipeline, VaryingEffect, compile_model
+from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.model.compilation import saved_model
 from torchrl_h2o.envs.episode import GapEpisodes
 
@@ -70,7 +70,7 @@ class MujocoBackend(ABC):
 
     @abstractmethod
     def push(self) -> None:
-        """Makes every later physics step apply the forces of the current episodes."""
+        """Makes every later physics step apply the forces and the variations of the current episodes."""
 
     @abstractmethod
     def generator(self) -> np.random.Generator:
@@ -118,7 +118,7 @@ class MujocoBackend(ABC):
             model.vis.global_.offwidth = self.model.vis.global_.offwidth
             model.vis.global_.offheight = self.model.vis.global_.offheight
             self.load(model)
-        if pipeline.of_kind(ForceEffect):
+        if pipeline.of_kind(ForceEffect) or pipeline.of_kind(VaryingEffect):
             self.push()
         self.owner._dynamics_gaps = wanted
 
@@ -156,8 +156,11 @@ class MujocoBackend(ABC):
                 )
 
     def _pushed_steps(self, step: Callable[[], None], n_steps: int) -> None:
-        """Takes physics steps one by one; each uses the forces at the state before the step."""
-        model, data, forces = self.model, self.data, self._forces()
+        """Takes physics steps one by one; each uses the forces and the variations at the state before the step."""
+        model, data = self.model, self.data
+        forces, variations = self._of_episodes("forces"), self._of_episodes("variations")
+        places = {field: getattr(model, field) for variation in variations for field in variation.fields}
+        own = {field: place.copy() for field, place in places.items()}
         for _ in range(n_steps):
             # a step of MuJoCo leaves the body positions and velocities at their values before the step
             mujoco.mj_kinematics(model, data)
@@ -165,13 +168,20 @@ class MujocoBackend(ABC):
             mujoco.mj_comVel(model, data)
             others = data.qfrc_applied.copy()
             data.qfrc_applied += sum(force(data) for force in forces)
+            values = {field: value[None].copy() for field, value in own.items()}
+            for variation in variations:
+                data.qfrc_applied += np.ravel(variation.apply(States.of(data), values))
+            for field, place in places.items():
+                place[:] = values[field][0]
             step()
             data.qfrc_applied[:] = others
+        for field, place in places.items():
+            place[:] = own[field]
 
-    def _forces(self) -> list[Force]:
+    def _of_episodes(self, kind: str) -> list:
         # in the order of the gaps rather than of their resets, because rounding depends on the order of a sum
         episodes = self.episodes
-        return [force for gap in self.gaps if gap in episodes for force in episodes[gap].effects.forces]
+        return [one for gap in self.gaps if gap in episodes for one in getattr(episodes[gap].effects, kind)]
 
 
 def _together(gaps: Mapping[object, Sequence[Effect]]) -> Pipeline:

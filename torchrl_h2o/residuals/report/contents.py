@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torchrl_h2o.data.audit import Audit
-from torchrl_h2o.effects import Effect
+from torchrl_h2o.effects import Effect, quantity_name
+from torchrl_h2o.residuals.between_logs import InLogs
 from torchrl_h2o.residuals.progress import EFFECTS, OTHERS
 from torchrl_h2o.residuals.report.errors import ErrorSummary, PredictionTable
 from torchrl_h2o.residuals.report.mended_model import MendedModel
@@ -34,6 +35,8 @@ class FoundEffect:
         words: description with units; by default the effect's own, without the simulator's names of sensors and
             actuators; an undeclared effect is marked.
         units: unit of each parameter by name, on the joints of this simulator; by default the effect's own.
+        in_logs: each fitted parameter by name in each of several logs; empty for one log, and in files of earlier
+            versions.
     """
 
     effect: Effect
@@ -42,6 +45,7 @@ class FoundEffect:
     error_after: float
     words: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+    in_logs: Mapping[str, InLogs] = field(default_factory=dict)
 
     def __post_init__(self):
         if not self.units:
@@ -54,6 +58,17 @@ class FoundEffect:
     def name(self) -> str:
         """The effect's class and what it acts on: ``"BodyMass[torso]"``."""
         return effect_name(self.effect)
+
+    @property
+    def values(self) -> list[tuple[str, str, float, tuple[float, float]]]:
+        """Name of the quantity, unit, value and interval of each parameter that was fitted or is not neutral."""
+        rows = []
+        for name, parameter in self.effect.parameters.items():
+            if name in self.ci95 or parameter.value != parameter.neutral:
+                unit = self.units.get(name, parameter.unit)
+                ends = self.ci95.get(name, (float("nan"), float("nan")))
+                rows.append((quantity_name(name, unit), unit, parameter.value, ends))
+        return rows
 
 
 @dataclass(frozen=True)

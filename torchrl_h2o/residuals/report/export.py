@@ -15,11 +15,11 @@ import jinja2
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects import ActionDelay
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.report.ranges import EffectRange, FieldRange, effect_ranges, model_ranges
+from torchrl_h2o.residuals.report.servo_files import bam_files, delay_of, driven_joints, pace_files
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-from torchrl_h2o.whole_file import write_text
+from torchrl_h2o.whole_file import whole_file
 
 ALIKE = 0.02  # relative difference of a mass's and an inertia's factors up to which one number scales both
 #: function and argument of each field in the two projects whose events have one shape
@@ -43,7 +43,7 @@ _TEMPLATES = jinja2.Environment(
 
 
 def export(report: ReportContents, simulation: Simulation, folder: str | Path) -> list[Path]:
-    """Writes the ranges as JSON, as code for MuJoCo Playground, mjlab and Isaac Lab, and as a table of the joints.
+    """Writes ranges as JSON and as code for MuJoCo Playground, mjlab and Isaac Lab, and values for BAM and PACE.
 
     Args:
         report: the report.
@@ -52,7 +52,8 @@ def export(report: ReportContents, simulation: Simulation, folder: str | Path) -
 
     Returns:
         The files: ``ranges.json``, ``playground.py`` (``domain_randomize`` for ``randomization_fn``), ``mjlab.py`` and
-        ``isaaclab.py`` (``events``), and ``joints.csv``, a row for each hinge and slide, in SI units.
+        ``isaaclab.py`` (``events``), ``joints.csv``, a row for each hinge and slide, in SI units, ``bam``, a file for
+        each driven joint, and ``pace``.
     """
     fields, outside = model_ranges(report, simulation), effect_ranges(report, simulation)
     ranges = {"model": [asdict(one) for one in fields], "outside_the_model": [asdict(one) for one in outside]}
@@ -87,10 +88,14 @@ def export(report: ReportContents, simulation: Simulation, folder: str | Path) -
         "joints.csv": _table(report, simulation, fields),
     }
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        write_text(folder / name, text)
-    return [folder / name for name in texts]
+    texts |= {f"bam/{joint.replace('/', '_')}.json": text for joint, text in bam_files(report, simulation).items()}
+    tensors = {f"pace/{name}": saved for name, saved in pace_files(report, simulation).items()}
+    for name, content in {**texts, **tensors}.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as partial:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    return [folder / name for name in (*texts, *tensors)]
 
 
 def _filled(name: str, **values: Any) -> str:
@@ -165,8 +170,6 @@ def _table(report: ReportContents, simulation: Simulation, fields: Sequence[Fiel
             own, nominal = by_place.get((field, dof)), float(getattr(model, field)[dof])
             values = (nominal,) * 3 if own is None else (own.mended, own.low, own.high)
             cells += [f"{value:.6g}" for value in values]
-        driven = [i for i in range(model.nu) if model.actuator_trnid[i, 0] == model.dof_jntid[dof]]
-        delays = [one for one in report.effects if isinstance(one, ActionDelay)]
-        delay = sum(one.delay for one in delays if driven and (one.actuators is None or driven[0] in one.actuators))
-        writer.writerow([joint, *cells, f"{delay:.6g}"])
+        _, driven = driven_joints(model).get(joint, (dof, ()))
+        writer.writerow([joint, *cells, f"{delay_of(report.effects, driven) if driven else 0.0:.6g}"])
     return text.getvalue()

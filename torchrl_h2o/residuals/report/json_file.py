@@ -14,6 +14,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError, with_config
 from torchrl_h2o.data.audit import Audit
 from torchrl_h2o.data.readers.error import DataError
 from torchrl_h2o.effects import Effect, effect_from_dict, effect_to_dict
+from torchrl_h2o.residuals.between_logs import InLogs
 from torchrl_h2o.residuals.report.contents import (
     DataSummary,
     FoundEffect,
@@ -189,11 +190,16 @@ def entries_from_json(entries: Mapping[str, Any]) -> dict[str, Any]:
 def _effect_to_json(effect: Effect, tried: FoundEffect | RejectedEffect) -> dict[str, Any]:
     """An effect with its description, its parameters, its errors, and the entry that rebuilds it."""
     rest = {field.name: getattr(tried, field.name) for field in dataclasses.fields(tried)}
-    ci95, units = rest.pop("ci95", {}), rest.pop("units")
+    ci95, units, in_logs = rest.pop("ci95", {}), rest.pop("units"), rest.pop("in_logs", {})
     return {
         "name": effect_name(effect),
         "parameters": {
-            name: {"value": parameter.value, "unit": units.get(name, parameter.unit), "ci95": ci95.get(name)}
+            name: {
+                "value": parameter.value,
+                "unit": units.get(name, parameter.unit),
+                "ci95": ci95.get(name),
+                **({"in_logs": dataclasses.asdict(in_logs[name])} if name in in_logs else {}),
+            }
             for name, parameter in effect.parameters.items()
         },
         **rest,
@@ -254,7 +260,14 @@ def _read(cls: type, entry: Mapping[str, Any], **read: Any) -> Any:
 def _found(entry: Mapping[str, Any]) -> FoundEffect:
     effect = effect_from_dict(entry["effect"])
     ci95 = _intervals({name: parameter["ci95"] for name, parameter in entry["parameters"].items()})
-    return _read(FoundEffect, entry, effect=effect, ci95=ci95, units=_units(entry))
+    in_logs = {name: _in_logs(one["in_logs"]) for name, one in entry["parameters"].items() if "in_logs" in one}
+    return _read(FoundEffect, entry, effect=effect, ci95=ci95, units=_units(entry), in_logs=in_logs)
+
+
+def _in_logs(entry: Mapping[str, Any]) -> InLogs:
+    """A value in each log; an error of None is infinite, because the log does not contain the value."""
+    errors = tuple(math.inf if error is None else error for error in entry["errors"])
+    return _read(InLogs, entry, logs=tuple(entry["logs"]), values=tuple(map(_float, entry["values"])), errors=errors)
 
 
 def _units(entry: Mapping[str, Any]) -> dict[str, str]:

@@ -9,8 +9,9 @@ from typing import Any
 
 import jinja2
 
-from torchrl_h2o.effects import is_negligible, quantity_name
+from torchrl_h2o.effects import is_negligible
 from torchrl_h2o.residuals.report import plots
+from torchrl_h2o.residuals.report.agreement import logged_values
 from torchrl_h2o.residuals.report.contents import FoundEffect, ReportContents
 from torchrl_h2o.residuals.report.mended_model import REMEDY
 from torchrl_h2o.residuals.report.sentence import sentences
@@ -73,6 +74,7 @@ def report_page(report: ReportContents) -> str:
         parameters=_parameters,
         ranking=_ranking(report),
         shown_runs=sorted(report.runs, key=_worst_first)[:SHOWN_RUNS],
+        logged=logged_values(report),
         remedy=REMEDY,
         held=_held(report),
         pictures=_pictures(report),
@@ -82,13 +84,10 @@ def report_page(report: ReportContents) -> str:
 
 def _parameters(found: FoundEffect) -> list[tuple[str, str, str]]:
     """Name, value with unit, and interval of each parameter of an effect."""
-    rows = []
-    for name, parameter in found.effect.parameters.items():
-        low, high = found.ci95.get(name, (float("nan"), float("nan")))
-        unit = found.units.get(name, parameter.unit)
-        value = quantity(parameter.value, unit, interval_digits(low, high))
-        rows.append((quantity_name(name, unit), value, interval(low, high, unit)))
-    return rows
+    return [
+        (name, quantity(value, unit, interval_digits(*ends)), interval(*ends, unit))
+        for name, unit, value, ends in found.values
+    ]
 
 
 def _ranking(report: ReportContents) -> list[_Tried]:

@@ -9,6 +9,7 @@ from itertools import takewhile
 from torchrl_h2o.effects import Effect
 from torchrl_h2o.effects.effect import EntryNames
 from torchrl_h2o.residuals.progress import FORCES, NOISE
+from torchrl_h2o.residuals.report.agreement import agreement_words, equal_joints_words
 from torchrl_h2o.residuals.report.contents import (
     EXPLAINED_IN_PART,
     NOT_EXPLAINED,
@@ -43,9 +44,10 @@ def sentences(report: ReportContents) -> list[str]:
 
     Returns:
         The result; whether the time was up before the end of the search, or of the report; other effects that these
-        data cannot rule out; effects that may have another cause or value; what the effects found do not explain; where
-        nothing is missing, effects that the data could not have shown; and severe faults of the data, or warnings that
-        the data do not fit the model. Those that do not apply are left out.
+        data cannot rule out; which values agree between logs, and their scatter between equal joints; effects that may
+        have another cause or value; what the effects found do not explain; where nothing is missing, effects that the
+        data could not have shown; and severe faults of the data, or warnings that the data do not fit the model. Those
+        that do not apply are left out.
     """
     words = _verdict_words(report)
     if report.left_out:
@@ -84,7 +86,8 @@ def _verdict_words(report: ReportContents) -> list[str]:
         rest = [f"Something else is missing that {by_what}: {unknown}."] if unknown else []
         caveats = report.verdict.caveats if report.verdict is not None else ()
         lacks = "The best explanation so far" if report.preliminary else "Your simulator lacks"
-        return [f"{lacks}: {_joined(words, error)}.", *ended, *_alternatives_words(report), *caveats, *rest]
+        of_logs = [*agreement_words(report), *equal_joints_words(report)]
+        return [f"{lacks}: {_joined(words, error)}.", *ended, *_alternatives_words(report), *of_logs, *caveats, *rest]
     if kind == UNDECIDED:
         reasons = (report.verdict and report.verdict.reasons) or ("no test shows that something is missing",)
         return [f"{_joined(f'Nothing was found so far, and {reasons[0]}', error)}.", *ended]
@@ -110,8 +113,9 @@ def _undetectable_words(verdict: Verdict | None) -> list[str]:
         return []
     named = listed(effects[:NAMED])
     if len(effects) <= NAMED:
-        return [f"Noise or a lack of motion would hide in these data: {named}."]
-    return [f"Noise or a lack of motion would hide {len(effects)} effects in these data, such as {named}."]
+        return [f"Not identifiable in these data, because noise or a lack of motion would hide them: {named}."]
+    hidden = f"{len(effects)} effects are not identifiable in these data, because noise or a lack of motion would hide"
+    return [f"{hidden} them, such as {named}."]
 
 
 def _unknown_words(verdict: Verdict) -> str:

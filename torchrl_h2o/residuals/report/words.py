@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from torchrl_h2o.effects import Effect, Parameter, ResidualForce
+from torchrl_h2o.effects import ActionBias, ActionGain, Effect, Parameter, ResidualForce
 from torchrl_h2o.effects.effect import NO_NAMES, EntryNames
 
 UNDECLARED = "outside the catalogue"
@@ -142,19 +142,32 @@ def effect_words(effect: Effect, names: EntryNames = NO_NAMES) -> str:
         names: names of entries and actuators, as for :meth:`Effect.describe`.
 
     Examples:
-        >>> from torchrl_h2o.effects import Gravity, ObservationGain
+        >>> from torchrl_h2o.effects import ActionGain, Gravity, ObservationGain
         >>> effect_words(Gravity(0.500123))
         'gravity × 0.5'
         >>> effect_words(Gravity(1.003812))
         'gravity × 1.0038'
         >>> effect_words(ObservationGain(1.04, (0,)), {"entries": ["pitch", "rate"]})
         'entries pitch of the observation × 1.04'
+        >>> effect_words(ActionGain(0.11), {"actuator_units": ["A"]})
+        'all actuators × 0.11 (for a motor of gain 1, a torque constant of 0.11 N·m/A)'
     """
     rounded = {name: _rounded(parameter) for name, parameter in effect.parameters.items()}
     try:
-        return effect.with_parameters(rounded).describe(names)
+        shown = effect.with_parameters(rounded)
     except ValueError:  # rounding may exceed a bound with more digits
-        return effect.describe(names)
+        shown = effect
+    return shown.describe(names) + _torque_constant(shown, names)
+
+
+def _torque_constant(effect: Effect, names: EntryNames) -> str:
+    """What the gain of a current is, if all actions that it acts on are currents; the model's own gain is a factor."""
+    if not isinstance(effect, ActionGain):
+        return ""
+    bias = ActionBias(actuators=effect.actuators).parameters_on(names)["bias"]  # it has the unit of the actions
+    if bias.unit != "A":
+        return ""
+    return f" (for a motor of gain 1, a torque constant of {quantity(effect.scale, 'N·m/A')})"
 
 
 def effect_units(effect: Effect, names: EntryNames = NO_NAMES) -> dict[str, str]:

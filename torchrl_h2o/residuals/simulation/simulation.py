@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import cpu_count
@@ -18,8 +19,7 @@ from mujoco.rollout import Rollout
 from torchrl.envs import EnvBase
 
 from torchrl_h2o.data.audit.log import find_pairs
-from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, catalogue, joint_names
-from torchrl_h2o.effects.effect import BatchedForce
+from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, VaryingEffect, catalogue, joint_names
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
 from torchrl_h2o.residuals.simulation.activations import (
     activations_along,
@@ -35,6 +35,7 @@ _ROLLOUT_NUMBERS = 2**24
 # simulation and its clock, so a larger difference marks divergence.
 _CLOCK_JUMP = 0.5
 
+_COPIES = 128  # states that are stepped together if numbers of the model depend on the state
 STEPS_BETWEEN_CHECKS = 50_000  # physics steps, about a second for a robot with twelve joints
 
 
@@ -169,6 +170,13 @@ class Simulation:
         return threading.local()
 
     @property
+    def _copies(self) -> list[mujoco.MjModel]:
+        """Copies of the model, of each thread, into which numbers that depend on the state are written."""
+        if not hasattr(self._scratch, "copies"):
+            self._scratch.copies = [copy(self.model) for _ in range(_COPIES)]
+        return self._scratch.copies
+
+    @property
     def _workers(self) -> tuple[Rollout, list[mujoco.MjData]]:
         """Threads and scratch space for a rollout. Other threads than the main one step on their own."""
         pool = self._pool if threading.current_thread() is threading.main_thread() else ALONE
@@ -253,7 +261,6 @@ class Simulation:
         """
         batch, horizon, _ = actions.shape
         full = self._full(states, np.zeros(batch) if time is None else time, activations, actions[:, 0])
-        forces = self.pipeline.batched_forces(self.model)
         physics_steps = horizon * self.frame_skip
         numbers = _ROLLOUT_NUMBERS // full.shape[-1]
         chunk = max(1, min(numbers, STEPS_BETWEEN_CHECKS) // physics_steps)
@@ -261,7 +268,7 @@ class Simulation:
         with _no_warnings:
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
                 own = None if applied is None else applied[rows]
-                parts.append(self._stepped(full[rows], actions[rows], forces, own))
+                parts.append(self._stepped(full[rows], actions[rows], own))
         return np.concatenate(parts) if parts else np.zeros((0, horizon, states.shape[1]))
 
     def follow(
@@ -283,13 +290,12 @@ class Simulation:
         """
         hidden = np.asarray(self.state_map.hidden, int)
         full, places = self._full(states, time, activations, actions), 1 + hidden
-        forces = self.pipeline.batched_forces(self.model)
         reached = np.empty((*states.shape[:2], len(hidden)))
         carried = states[0][:, hidden]
         with _no_warnings:
             for step, now in enumerate(full):
                 now[:, places] = carried
-                carried = self._stepped(now, actions[step][:, None], forces)[:, 0, hidden]
+                carried = self._stepped(now, actions[step][:, None])[:, 0, hidden]
                 if not np.isfinite(carried).all():
                     carried = np.where(np.isfinite(carried), carried, states[step][:, hidden])
                 reached[step] = carried
@@ -308,17 +314,21 @@ class Simulation:
             full[..., after : after + self.model.na] = settled
         return full
 
-    def _stepped(
-        self,
-        full: np.ndarray,
-        actions: np.ndarray,
-        forces: Sequence[BatchedForce],
-        applied: np.ndarray | None = None,
-    ) -> np.ndarray:
+    def _stepped(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None = None) -> np.ndarray:
         """States (B, H, nq + nv) after each control step from full physics states (B, size); NaN where it diverges."""
         self.check()
         pool, data = self._workers
-        reached = roll_out(pool, self.model, data, full, actions, self.frame_skip, forces=forces, applied=applied)
+        varies, parts = bool(self.pipeline.of_kind(VaryingEffect)), []
+        size = _COPIES if varies else max(1, len(full))
+        for rows in (slice(i, i + size) for i in range(0, max(1, len(full)), size)):
+            models = self._copies[: len(full[rows])] if varies else self.model
+            pushes = {
+                "forces": self.pipeline.batched_forces(self.model),
+                "variations": self.pipeline.variations(self.model),
+                "applied": None if applied is None else applied[rows],
+            }
+            parts.append(roll_out(pool, models, data, full[rows], actions[rows], self.frame_skip, **pushes))
+        reached = np.concatenate(parts)
         # MuJoCo resets a simulation and its clock if the state is not finite or too large
         control_step = self.control_step
         expected = full[:, :1] + control_step * np.arange(1, actions.shape[1] + 1)

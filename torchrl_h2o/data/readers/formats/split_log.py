@@ -54,8 +54,8 @@ class SplitLog(PathLike):
                 longest one's time.
         """
         for name, time in times.items():
-            if len(time) < 2 or (np.diff(time) < 0.0).any():
-                problem = "the time goes back" if len(time) > 1 else "there are fewer than two rows"
+            if len(time) < 2 or not (np.diff(time) >= 0.0).all():
+                problem = "the time goes back or is missing" if len(time) > 1 else "there are fewer than two rows"
                 raise DataError(problem, "files of one run are joined on time: correct it", source=self.files[name])
         (first, clock), *others = times.items()
         step = {name: float(np.median(np.diff(time))) for name, time in times.items()}

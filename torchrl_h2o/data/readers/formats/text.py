@@ -22,7 +22,7 @@ _COMPARED = 1000  # rows with which the last cell of a file is compared
 
 
 def read_text(path: Path, layout: LogColumns | None) -> RawTable:
-    """Read a text file. A column of lists, such as ``"[0.1, 0.2]"``, becomes ``name[0]`` and so on.
+    """Read a text file. A column of lists, such as ``"[0.1, 0.2]"``, becomes ``name[0]`` and so on; an empty cell, NaN.
 
     Args:
         path: the file.
@@ -168,7 +168,7 @@ def _numbers(cells: list[list[str]], names: Sequence[str], rows: list[Row], deci
     for index, row in enumerate(cells):
         for position, cell in enumerate(row):
             try:
-                values[index, position] = number_of(cell, decimal)
+                values[index, position] = number_of(cell, decimal) if cell else np.nan
             except ValueError:
                 raise DataError(
                     f"{cell!r} is not a number",

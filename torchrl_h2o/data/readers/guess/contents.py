@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 
@@ -60,7 +60,11 @@ def read_contents(path: str | PathLike[str]) -> Contents:
     """
     if isinstance(path, SplitLog):
         return _joined(path, {name: read_contents(part) for name, part in path.files.items()})
-    path = Path(path).expanduser()
+    contents = _contents(Path(path).expanduser())
+    return replace(contents, values=_rows_of_readings(contents.values))
+
+
+def _contents(path: Path) -> Contents:
     if is_lerobot(path) or FORMATS.get(require_file(path).suffix.lower(), read_text) is not read_text:
         raw = read_raw(path)
         values = {name: _numbers(raw, index, name) for index, name in enumerate(raw.names or ())}
@@ -120,6 +124,21 @@ def _joined(log: SplitLog, parts: Mapping[str, Contents]) -> Contents:
     return Contents(values, next(iter(parts.values())).options)
 
 
+def _rows_of_readings(values: Mapping[str, np.ndarray | None]) -> dict[str, np.ndarray | None]:
+    """The rows that have readings; an empty cell has the last number, or the first one before that."""
+    empty = {name: np.isnan(numbers) for name, numbers in values.items() if numbers is not None}
+    if not any(one.any() for one in empty.values()):
+        return dict(values)
+    readings = [empty[guess.name] for guess in guess_columns(values) if guess.kind in ("position", "velocity")]
+    rows = ~np.all(readings, axis=0) if readings else np.ones(len(next(iter(empty.values()))), bool)
+    found: dict[str, np.ndarray | None] = dict(values)
+    for name, missing in empty.items():
+        known = np.flatnonzero(~missing)
+        last = np.searchsorted(known, np.arange(len(missing)), side="right") - 1
+        found[name] = np.asarray(values[name])[known[np.maximum(last, 0)]][rows] if len(known) else None
+    return found
+
+
 def _numbers(raw: RawTable, index: int, name: str) -> np.ndarray | None:
     try:
         return raw.numbers([index], [name])[:, 0]
@@ -174,6 +193,6 @@ def _is_number(cell: str, decimal: str) -> bool:
 
 def _column(cells: tuple[str, ...], decimal: str) -> np.ndarray | None:
     try:
-        return np.array([number_of(cell, decimal) for cell in cells])
+        return np.array([number_of(cell, decimal) if cell else np.nan for cell in cells])
     except ValueError:
         return None

@@ -1,0 +1,204 @@
+"""Cases of arms with position servos: friction and a rotor in each joint, and one further cause."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from cases import Case, Family
+from chains import torque_of_gravity
+from servos import MODEL_STEPS, STEP, Arm, Servo
+from systems import with_sensor_noise
+from tensordict import TensorDict
+
+from torchrl_h2o.data.readers.ted import to_ted
+from torchrl_h2o.effects import (
+    ActionBacklash,
+    ActionDelay,
+    ActionLag,
+    ActionLead,
+    Armature,
+    BodyInertia,
+    Effect,
+    GearPlay,
+    JointDamping,
+    JointFrictionLoss,
+    LoadFriction,
+    ObservationDelay,
+    ServoDamping,
+    ServoDeadBand,
+    StribeckFriction,
+    TorqueSpeedLine,
+)
+from torchrl_h2o.residuals import Report, Simulation, StateMap
+
+NOISE = (0.001, 0.003)  # of the encoders, shares of the signals' standard deviations
+ROWS = 3000  # 30 s
+COUNTS = (1, 1, 3)  # joints, in turn
+#: what every joint has, so that no cause is named by it
+USUAL = (JointFrictionLoss, JointDamping, ServoDamping, Armature)
+#: kinds of effects that name each cause; one of each group must be found
+KINDS: Mapping[str, tuple[tuple[type[Effect], ...], ...]] = {
+    "M1": (),
+    "M3": ((LoadFriction,),),
+    "M4": ((LoadFriction,), (StribeckFriction,)),
+    "play": ((GearPlay, ActionBacklash, ServoDeadBand),),
+    "lead": ((ActionLead,),),
+    "sag": ((TorqueSpeedLine,),),
+    "delay": ((ActionDelay, ActionLag, ObservationDelay),),
+}
+CAUSES = tuple(KINDS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoCase(Case):
+    """A case with the log of an arm.
+
+    Args:
+        arm: the arm.
+        cause: one of :data:`CAUSES`.
+        velocities: whether the log has velocities.
+    """
+
+    arm: Arm
+    cause: str
+    velocities: bool
+
+    def simulation(self) -> Simulation:
+        names, count, xml = self.arm.names, len(self.arm.servos), self.arm.xml()
+        observed, units = names, ["rad"] * count
+        if self.velocities:
+            observed, units = [*names, *(f"{name}_velocity" for name in names)], [*units, *["rad/s"] * count]
+        state_map = StateMap.of_coordinates(observed, units, range(len(observed)), 2 * count)
+        if not self.velocities:
+            state_map = replace(state_map, hidden=tuple(range(count, 2 * count)))
+        return Simulation(lambda: mujoco.MjSpec.from_string(xml), MODEL_STEPS, state_map, name="arm")
+
+    def measure(self) -> TensorDict:
+        states, targets = self.arm.record(self.transitions, self.seed)
+        seen = states if self.velocities else states[:, : len(self.arm.servos)]
+        ends = np.zeros(len(targets), bool)
+        data = to_ted(observation=seen[:-1], action=targets, next_observation=seen[1:], terminated=ends, truncated=ends)
+        return with_sensor_noise(data, self.noise, self.seed)
+
+    @property
+    def words(self) -> str:
+        first = self.arm.servos[0]
+        own = {name: getattr(first, name) for name in Servo.__annotations__}
+        told = ", ".join(f"{name} {own[name]:.3g}" for name in PARTS[self.cause])
+        return f"{self.cause} ({told})" if told else self.cause
+
+
+#: parameters of a servo that belong to each cause
+PARTS: Mapping[str, tuple[str, ...]] = {
+    "M1": (),
+    "M3": ("load",),
+    "M4": ("load", "rest", "rest_load", "speed", "exponent"),
+    "play": ("play",),
+    "lead": ("lead",),
+    "sag": ("stall", "no_load"),
+    "delay": ("delay",),
+}
+
+
+def with_cause(arm: Arm, cause: str, rng: np.random.Generator) -> Arm:
+    """Put a cause into all servos of an arm, with the same values but for scatter."""
+
+    def uniform(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    drawn = {
+        "M1": {},
+        "M3": {"load": uniform(0.05, 0.25)},
+        "M4": {
+            "load": uniform(0.03, 0.15),
+            "rest": uniform(0.02, 0.1),
+            "rest_load": uniform(0.05, 0.15),
+            "speed": math.exp(uniform(math.log(0.1), math.log(2.0))),
+            "exponent": uniform(1.0, 2.0),
+        },
+        "play": {"play": uniform(0.01, 0.04)},
+        "lead": {"lead": uniform(0.01, 0.04)},
+        "sag": {"stall": uniform(1.2, 1.8), "no_load": uniform(2.0, 5.0)},
+        "delay": {"delay": uniform(0.005, 0.02)},
+    }[cause]
+    servos = []
+    for index, servo in enumerate(arm.servos):
+        weight = torque_of_gravity(arm.servos[index:])
+        own = {name: value * uniform(0.9, 1.1) for name, value in drawn.items()}
+        if cause == "delay":  # one bus
+            own = dict(drawn)
+        own |= {name: weight * own[name] for name in ("rest", "stall") if name in own}
+        servos.append(replace(servo, **own))
+    return Arm(tuple(servos))
+
+
+def servo(number: int, rng: np.random.Generator) -> ServoCase:
+    """Each cause in turn; every other log has positions alone."""
+    cause = CAUSES[number % len(CAUSES)]
+    arm = Arm.draw(rng, COUNTS[number % len(COUNTS)])
+    arm = with_cause(arm, cause, rng)
+    return ServoCase(
+        name=f"{cause} {len(arm.servos)} {number}",
+        system="arm",
+        judge=judge_servo,
+        noise=float(rng.uniform(*NOISE)),
+        seed=int(rng.integers(2**31)),
+        transitions=ROWS,
+        arm=arm,
+        cause=cause,
+        velocities=number % 2 == 0,
+    )
+
+
+def control(number: int, rng: np.random.Generator) -> ServoCase:
+    """The arm of a drawn servo without its cause."""
+    drawn = servo(number, rng)
+    plain = {name: Servo.__dict__[name] for parts in PARTS.values() for name in parts}
+    arm = Arm(tuple(replace(one, **plain) for one in drawn.arm.servos))
+    return replace(drawn, arm=arm, cause="M1", name=f"without {drawn.name}")
+
+
+def named_causes(report: Report) -> set[str]:
+    """Causes that a report names, beside friction, damping and rotors."""
+    found = {type(effect) for effect in report.effects}
+    for group in report.indistinguishable:
+        if any(effect in report.effects for effect in group.effects):
+            found |= {type(effect) for effect in group.effects}
+    return {
+        cause
+        for cause, groups in KINDS.items()
+        if groups and all(any(kind in found for kind in group) for group in groups)
+    }
+
+
+def judge_servo(report: Report, case: Case) -> dict:
+    """Passed if the cause is named, and no effect that belongs to another cause is put in.
+
+    Lateness of less than a physics step of the model counts as none.
+    """
+    assert isinstance(case, ServoCase)
+    own = {*(kind for group in KINDS[case.cause] for kind in group), *USUAL}
+    if len(case.arm.servos) == 1:
+        own.add(BodyInertia)  # of the only link: the same as a rotor
+    others = [effect for effect in report.effects if type(effect) not in own and not _is_of_a_step(effect)]
+    named = named_causes(report)
+    is_right = (case.cause in named or case.cause == "M1") and not others
+    return {
+        "ok": is_right,
+        "wrong_and_recommended": bool(report.recommended and not is_right),
+        "others": ", ".join(effect.describe() for effect in others),
+    }
+
+
+def _is_of_a_step(effect: Effect) -> bool:
+    """Whether an effect makes up for the model's physics steps, which are ten times as long as those of reality."""
+    late = isinstance(effect, KINDS["delay"][0])
+    return late and all(parameter.value <= STEP / MODEL_STEPS for parameter in effect.parameters.values())
+
+
+SERVOS = Family(servo, 20, 17, "the cause named beside friction and rotors, and no other", stream=12)
+SERVO_CONTROLS = Family(control, 20, 20, "friction and rotors alone", stream=12)

@@ -1,0 +1,1 @@
+"""Effects of gears: friction that depends on load and speed, and play."""

@@ -1,0 +1,115 @@
+"""Play (backlash) in the gear between a motor and its link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from torchrl_h2o.effects.effect import States, Variation, VaryingEffect
+from torchrl_h2o.effects.gear.loads import JointActuators, Weight
+from torchrl_h2o.effects.parameter import parameter
+from torchrl_h2o.effects.selection import Indices
+
+_CREEP = 1e-3  # rad/s, below which the rotor's dry friction fades
+_ROTOR = 0.05  # inertia of the rotor of a model without armature, over the inertia that the joint moves
+_OF_JOINT = ("dof_armature", "dof_frictionloss", "dof_damping")
+_OF_ACTUATOR = ("actuator_gainprm", "actuator_biasprm")
+
+
+@dataclass(frozen=True)
+class GearPlay(VaryingEffect):
+    """Play (backlash) in the gear between a motor and its link, behind which the servo measures the position.
+
+    When the torque on the teeth would change its sign, they part: the link moves without motor, rotor and friction, and
+    the rotor crosses the play before it pushes the link again. Armature, friction and damping of the joint belong to
+    the rotor. A model without armature gets a rotor of a twentieth of the inertia that the joint moves, for the time of
+    the crossing. A simulation starts with the teeth in contact, on the side on which motor,
+    weight and inertia press them.
+
+    Args:
+        width: the angle that the link can turn while the motor rests, in rad.
+        actuators: indices of the actuators; all by default.
+
+    Raises:
+        ValueError: when put into a model in which one of them is no motor or servo on a single joint.
+
+    Examples:
+        >>> GearPlay(0.02).describe()
+        'play of 0.02 rad in the gears of all actuators'
+
+    Source: M. Nordin, P.-O. Gutman, *Controlling mechanical systems with backlash - a survey*, Automatica 38 (2002):
+    dead zone with a stiff shaft.
+    """
+
+    wording: ClassVar[str] = "play of {width} in the gears of {actuators}"
+    acts_last: ClassVar[bool] = True
+    width: float = parameter(unit="rad", bounds=(0.0, 1.0), neutral=0.0)
+    actuators: Indices = None
+
+    def vary(self, model: mujoco.MjModel) -> Variation:
+        motors, step, half = JointActuators(model, self.actuators), model.opt.timestep, 0.5 * self.width
+        dofs, weight = motors.dofs, Weight(model)
+        crossing = np.where(model.dof_armature[dofs] > 0.0, model.dof_armature[dofs], _ROTOR * model.dof_M0[dofs])
+        teeth: _Teeth | None = None
+
+        def apply(states: States, values: dict[str, np.ndarray]) -> np.ndarray:
+            nonlocal teeth
+            armature, dry, viscous = (values[field][:, dofs] for field in _OF_JOINT)
+
+            def losses(velocity: np.ndarray) -> np.ndarray:
+                return dry * np.tanh(velocity / _CREEP) + viscous * velocity
+
+            velocity = states.qvel[:, dofs]
+            torque = motors.gear * motors.forces(motors.inputs(states), states)
+            if teeth is None:
+                teeth = _Teeth.unknown(velocity)
+            begins = ~np.isclose(states.time - teeth.time, step)
+            pushing = torque - losses(velocity)
+            if begins.any():
+                acceleration = (pushing + weight.torques(states)[:, dofs]) / model.dof_M0[dofs]
+                teeth.side[begins] = np.where(pushing >= armature * acceleration, 1.0, -1.0)[begins]
+                teeth.link[begins] = velocity[begins]
+            on_teeth = pushing - armature * np.nan_to_num(velocity - teeth.link) / step
+            touch = teeth.side * on_teeth >= 0.0
+            leave = (teeth.side != 0.0) & ~touch
+            free = leave | (teeth.side == 0.0)
+            rotor = np.where(leave, velocity, teeth.rotor)
+            rotor = np.where(free, rotor + (torque - losses(rotor)) / crossing * step, velocity)
+            offset = np.where(leave, half * teeth.side, teeth.offset) + (rotor - velocity) * step
+            meet = free & (np.abs(offset) >= half)
+            free &= ~meet
+            teeth = _Teeth(
+                np.where(meet, np.sign(offset), np.where(free, 0.0, teeth.side)),
+                offset,
+                rotor,
+                np.where(meet, np.nan, velocity),  # the impact is no acceleration that parts the teeth
+                states.time.copy(),
+            )
+            world, own = np.nonzero(free)
+            for field in _OF_JOINT:
+                values[field][world, dofs[own]] = 0.0
+            for field in _OF_ACTUATOR:
+                values[field][world, motors.indices[own]] = 0.0
+            return motors.on_joints(np.where(meet, armature * (rotor - velocity) / step, 0.0) / motors.gear)
+
+        return Variation((*_OF_JOINT, *_OF_ACTUATOR), apply)
+
+
+@dataclass
+class _Teeth:
+    """Where rotors were relative to their links at the last call, (B, k)."""
+
+    side: np.ndarray  # -1 or 1 where the teeth touch, 0 where they are apart
+    offset: np.ndarray  # rotor minus link, in rad
+    rotor: np.ndarray  # velocity of the rotor, in rad/s
+    link: np.ndarray  # velocity of the link, in rad/s; NaN before an impact
+    time: np.ndarray  # (B,), in s
+
+    @classmethod
+    def unknown(cls, velocity: np.ndarray) -> _Teeth:
+        """Before the first call, with velocities of the links, (B, k)."""
+        nothing = np.zeros_like(velocity)
+        return cls(nothing, nothing, nothing, nothing.copy(), np.full(len(velocity), np.nan))

@@ -1,0 +1,111 @@
+"""How uncertain fitted values are: their intervals, their values in each log, and the scatter of these."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from torchrl_h2o.effects import Parameter
+from torchrl_h2o.residuals.between_logs import LEVEL, p_values, scatter_between
+from torchrl_h2o.residuals.score import Predictions
+from torchrl_h2o.residuals.whitened import Whitened, block_of, weights
+
+CONFIDENCE = 1.96  # standard errors from a value to the end of its 95 % interval
+SINGULAR = 1e-10  # share of the largest curvature below which the data do not show a combination of values
+KNOWN = 0.99  # share of a value that lies outside such combinations, from which on the data show it
+
+
+@dataclass(frozen=True, eq=False)
+class Spreads:
+    """How uncertain the variables of a fit are.
+
+    Args:
+        half_widths: half-widths of the 95 % intervals, (p,).
+        scatter: in quadrature, what the scatter between logs adds for the value in another log, (p,); 0 for one log.
+        logs: indices of the logs.
+        moves: the moves to the best values of each log alone, (logs, p).
+        errors: standard errors of these, (logs, p); infinite where a log does not contain the value.
+    """
+
+    half_widths: np.ndarray
+    scatter: np.ndarray
+    logs: tuple[int, ...]
+    moves: np.ndarray
+    errors: np.ndarray
+
+
+def spreads_of(
+    parts: Sequence[Predictions],
+    found: Sequence[Whitened],
+    slopes: Sequence[np.ndarray],
+    white_at: Callable[[np.ndarray], np.ndarray],
+) -> Spreads:
+    """Sandwich estimates with each block as one observation, of all logs and of each log alone.
+
+    Args:
+        parts: predictions of the rows of the fit.
+        found: errors of each part, see :func:`~torchrl_h2o.residuals.whitened.whitened`.
+        slopes: derivatives of the errors by the variables, (N, p) for each part.
+        white_at: simulates the whitened errors of all parts, (N,), at other values of the variables, (p,). It is called
+            for each log if they differ, because what is not linear in one value then shows in the others.
+    """
+    count, logs, blocks, rows = 0, [], [], []
+    for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
+        block, log = block_of(part), part.record.measured.log
+        logs.append(np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first])
+        blocks.append(count + block)
+        weight = share * weights(white)
+        rows.append((slope * inverse[:, None], weight, white))
+        count += len(part.blocks)
+    log_of, block = np.concatenate(logs), np.concatenate(blocks)
+    scaled, weight, white = (np.concatenate(one) for one in zip(*rows, strict=True))
+
+    def solved(chosen: np.ndarray, begin: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For some blocks alone, if the errors are linear about a move to begin with: the move to the best values, its
+        squared errors, and which values these blocks contain."""
+        own = chosen[block]
+        curvature = scaled[own].T @ (weight[own, None] * scaled[own])
+        size = np.sqrt(np.diag(curvature))
+        size[size == 0.0] = 1.0
+        curvature = curvature / np.outer(size, size)
+        bread = np.linalg.pinv(curvature, rcond=SINGULAR, hermitian=True)
+        is_known = (np.diag(bread @ curvature) > KNOWN) & (chosen.sum() > len(size))
+        bread = bread / np.outer(size, size)
+        move = -bread @ (scaled[own].T @ (weight[own] * white[own]))
+        pulls = np.zeros((count, len(size)))
+        np.add.at(pulls, block[own], scaled[own] * (weight[own] * (white[own] + scaled[own] @ move))[:, None])
+        spare = chosen.sum() / max(1, chosen.sum() - len(size))
+        return begin + move, np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0), is_known
+
+    here = np.zeros(scaled.shape[1])
+    half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool), here, white)[1])
+    names = np.unique(log_of)
+    solutions = [solved(log_of == log, here, white) for log in names]
+    moves, variances = _each(solutions)
+    if (p_values(moves, variances) < LEVEL).any():
+        for index, begin in enumerate(np.where(moves**2 > variances, moves, 0.0)):
+            chosen = log_of == names[index]
+            with suppress(ValueError):  # the model does not take these values
+                nearer = white_at(begin)
+                if (weight * (nearer**2 - white**2)) @ chosen[block] < 0.0:
+                    solutions[index] = solved(chosen, begin, nearer)
+        moves, variances = _each(solutions)
+    known = np.maximum(2, np.isfinite(variances).sum(0))
+    between = student.ppf(0.975, known - 1) * np.sqrt(scatter_between(moves, variances) * (1.0 + 1.0 / known))
+    return Spreads(half, between, tuple(names.tolist()), moves, np.sqrt(variances))
+
+
+def _each(solutions: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """The moves of each log, and their squared errors, infinite where the log does not contain the value, (logs, p)."""
+    moves, variances, is_known = map(np.stack, zip(*solutions, strict=True))
+    return moves, np.where(is_known, variances, np.inf)
+
+
+def interval(parameter: Parameter, half_width: float) -> tuple[float, float]:
+    """95 % interval of a fitted parameter, within its bounds."""
+    low, high = parameter.bounds
+    return float(max(low, parameter.value - half_width)), float(min(high, parameter.value + half_width))
