@@ -99,12 +99,12 @@ def train_and_evaluate(name: str, runs: Sequence[Run], cfg: DictConfig) -> Itera
         values = {"series": name, "worlds": worlds, "seed": seed, "updates": cfg.updates, "return": found.mean}
         values |= {"return in training's worlds": evaluate(env, actor, cfg.worlds).mean, "returns": found.returns}
         values |= {series.score[0]: series.score[1](found), "report": report.sentence()}
-        yield Record.of_this_process(TABLE, name_of(name, worlds, seed), values, begin - cost)
+        yield Record.of_this_process(TABLE, name_of(name, worlds, seed, cfg.updates), values, begin - cost)
 
 
-def name_of(series: str, worlds: str, seed: int) -> str:
+def name_of(series: str, worlds: str, seed: int, updates: int) -> str:
     words = worlds.replace("±", "").replace("%", "percent").split()
-    return "_".join([series, *words, f"seed{seed}"])
+    return "_".join([series, *words, f"{updates}_updates", f"seed{seed}"])
 
 
 def claim(folder: Path, cfg: DictConfig) -> None:
@@ -140,14 +140,16 @@ def main() -> None:
     torch.set_num_threads(cfg.threads)
     claim(Path(cfg.folder), cfg)
     records = {record.name: record for record in read_records(Path(cfg.folder), TABLE)}
-    wanted = [name_of(*run) for run in product(cfg.series, cfg.worlds_of, cfg.seeds)]
+    wanted = [name_of(*run, cfg.updates) for run in product(cfg.series, cfg.worlds_of, cfg.seeds)]
     for name in cfg.series:
-        left = [run for run in product(cfg.worlds_of, cfg.seeds) if name_of(name, *run) not in records]
+        left = [run for run in product(cfg.worlds_of, cfg.seeds) if name_of(name, *run, cfg.updates) not in records]
         for record in train_and_evaluate(name, left, cfg) if left else ():
             record.save(Path(cfg.folder))
             records[record.name] = record
     columns = ["return", "return in training's worlds", *(series.score[0] for series in SERIES.values())]
-    runs = pd.DataFrame([records[name].values for name in wanted], columns=["series", "worlds", "seed", *columns])
+    runs = pd.DataFrame(
+        [records[name].values for name in wanted], columns=["series", "updates", "worlds", "seed", *columns]
+    )
     print(f"\n{series_tables(runs, cfg.worlds_of, columns)}\n\nresults    {cfg.folder}/{TABLE}")
 
 

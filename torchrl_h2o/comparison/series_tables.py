@@ -11,17 +11,18 @@ REPS = 2000  # bootstrap samples
 
 
 def series_tables(runs: pd.DataFrame, worlds: Sequence[str], columns: Sequence[str]) -> str:
-    """Format means over seeds with 95 % bootstrap intervals: a table and a sentence for each series.
+    """Format means over seeds with 95 % bootstrap intervals: a table and a sentence for each series and budget.
 
     Args:
-        runs: a row per policy, with the columns ``series``, ``worlds``, ``seed`` and ``return``.
+        runs: a row per policy, with the columns ``series``, ``updates``, ``worlds``, ``seed`` and ``return``.
         worlds: the lines of a table in their order. The sentence compares the first with each other one, seed by seed.
         columns: the columns to show; those without values in a series are left out there.
 
     Example:
-        >>> told = {"series": ["arm"] * 4, "worlds": list("aabb"), "seed": [0, 1, 0, 1], "return": [3.0, 5.0, 1.0, 2.0]}
-        >>> print(series_tables(pd.DataFrame(told), ["b", "a"], ["return"]))
-        **arm**
+        >>> told = {"series": "arm", "updates": 8000, "worlds": list("aabb"), "seed": [0, 1, 0, 1]}
+        >>> runs = pd.DataFrame(told | {"return": [3.0, 5.0, 1.0, 2.0]})
+        >>> print(series_tables(runs, ["b", "a"], ["return"]))
+        **arm, 8,000 updates**
         <BLANKLINE>
         | worlds | return | seeds |
         | --- | --- | --- |
@@ -31,12 +32,16 @@ def series_tables(runs: pd.DataFrame, worlds: Sequence[str], columns: Sequence[s
         The return with b is lower than with a (by -2.5 [-3, -2]).
     """
     parts = []
-    for name, of_series in runs.groupby("series"):
+    for (name, updates), of_series in runs.groupby(["series", "updates"]):
         shown = [column for column in columns if column in of_series and of_series[column].notna().any()]
         by_worlds = {one: own for one in worlds if len(own := of_series[of_series["worlds"] == one])}
         rows = [[one, *(_mean(own[column]) for column in shown), str(len(own))] for one, own in by_worlds.items()]
         returns = {one: own.set_index("seed")["return"] for one, own in by_worlds.items()}
-        parts += [f"**{name}**", markdown_table(["worlds", *shown, "seeds"], rows), _sentence(returns)]
+        parts += [
+            f"**{name}, {updates:,} updates**",
+            markdown_table(["worlds", *shown, "seeds"], rows),
+            _sentence(returns),
+        ]
     return "\n\n".join(parts)
 
 

@@ -180,7 +180,7 @@ def test_a_policy_is_trained_once_and_what_is_missing_is_trained_again(run, tmp_
     assert printed.count("\n| ") == 2 + 2
     assert "The return with measured ranges is " in printed
     assert run(two) == [2]
-    (tmp_path / "randomization" / "arm_unmended_seed0.json").unlink()
+    (tmp_path / "randomization" / "arm_unmended_2_updates_seed0.json").unlink()
     assert run(two, "seeds=[0,1]") == [2, 3]
     assert len(list(read_records(tmp_path))) == 4
 
@@ -195,7 +195,7 @@ def test_the_page_shows_the_lines_and_scores_that_the_benchmark_records():
     assert tuple(WORLDS) == pages.WORLDS
     assert {series.score[0] for series in SERIES.values()} <= set(pages.SCORES)
     made_by = {"commit": "abc1234", "instruction_set": "AVX2", "cpu_s": 60.0}
-    told = {"series": ["arm"] * 4, "worlds": ["unmended"] * 2 + ["measured ranges"] * 2, "seed": [0, 1] * 2}
+    told = {"series": "arm", "updates": 8000, "worlds": ["unmended"] * 2 + ["measured ranges"] * 2, "seed": [0, 1] * 2}
     returns = {"return": [1.0, 2.0, 3.0, 5.0]}
     rows = pd.DataFrame(told | returns).to_dict("records")
     runs = [Record("randomization", "", made_by, row) for row in rows]
@@ -216,5 +216,12 @@ def test_the_page_shows_the_lines_and_scores_that_the_benchmark_records():
     ],
 )
 def test_a_difference_that_chance_explains_is_not_called_one(returns, said):
-    told = {"series": "arm", "worlds": list("aaabbb"), "seed": [0, 1, 2] * 2, "return": [*returns, 2.0, 2.0, 2.0]}
-    assert said in series_tables(pd.DataFrame(told), ["a", "b"], ["return"])
+    told = {"series": "arm", "updates": 8000, "worlds": list("aaabbb"), "seed": [0, 1, 2] * 2}
+    runs = pd.DataFrame(told | {"return": [*returns, 2.0, 2.0, 2.0]})
+    assert said in series_tables(runs, ["a", "b"], ["return"])
+
+
+def test_policies_of_another_budget_have_a_table_of_their_own():
+    told = {"series": "arm", "updates": [8000, 16_000], "worlds": "a", "seed": 0, "return": [1.0, 3.0]}
+    tables = series_tables(pd.DataFrame(told), ["a"], ["return"])
+    assert tables.index("8,000 updates") < tables.index("| 1 [1, 1] |") < tables.index("16,000 updates")
