@@ -146,6 +146,7 @@ def servo(number: int, rng: np.random.Generator) -> ServoCase:
         system="arm",
         judge=judge_servo,
         noise=float(rng.uniform(*NOISE)),
+        truth=effects_of(arm),
         seed=int(rng.integers(2**31)),
         transitions=ROWS,
         arm=arm,
@@ -154,12 +155,35 @@ def servo(number: int, rng: np.random.Generator) -> ServoCase:
     )
 
 
+def effects_of(arm: Arm) -> tuple[Effect, ...]:
+    """The effects of the library that stand for what an arm's model lacks."""
+    found: list[Effect] = []
+    for index, (name, one) in enumerate(zip(arm.names, arm.servos, strict=True)):
+        drawn = (
+            JointFrictionLoss(one.friction, name),
+            JointDamping(one.damping, name),
+            Armature(one.rotor, name),
+            LoadFriction(one.load, joints=name),
+            StribeckFriction(one.rest, one.speed, one.rest_load, exponent=one.exponent, joints=name)
+            if one.rest
+            else StribeckFriction(),
+            GearPlay(one.play, (index,)),
+            ActionLead(one.lead, (index,)),
+            TorqueSpeedLine(one.stall, one.no_load, (index,)),
+            ActionDelay(one.delay, (index,)),
+        )
+        found += [
+            effect for effect in drawn if not effect.is_neutral and (one.rest or type(effect) is not StribeckFriction)
+        ]
+    return tuple(found)
+
+
 def control(number: int, rng: np.random.Generator) -> ServoCase:
     """The arm of a drawn servo without its cause."""
     drawn = servo(number, rng)
     plain = {name: Servo.__dict__[name] for parts in PARTS.values() for name in parts}
     arm = Arm(tuple(replace(one, **plain) for one in drawn.arm.servos))
-    return replace(drawn, arm=arm, cause="M1", name=f"without {drawn.name}")
+    return replace(drawn, arm=arm, truth=effects_of(arm), cause="M1", name=f"without {drawn.name}")
 
 
 def named_causes(report: Report) -> set[str]:

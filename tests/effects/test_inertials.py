@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.effects.models import CART, as_bytes, spec
-from torchrl_h2o.effects import BodyCentreOfMass, BodyInertia, BodyMass, GeomSize, Payload, compile_model
+from torchrl_h2o.effects import BodyCentreOfMass, BodyInertia, BodyMass, GeomSize, Payload, PseudoInertia, compile_model
 
 INERTIAL = ("body_mass", "body_ipos", "body_inertia")
 # with inertiafromgeom="true" the compiler ignores the inertial of "derived", which has a geom, and uses that of "given"
@@ -131,3 +131,36 @@ def test_a_payload_slows_a_pendulum_by_what_the_formula_says():
     expected = 2 * np.pi / np.sqrt(9.81 * (1.0 + 3.0 * 2.0) / (1.0 + 3.0 * 4.0))
     assert period(Payload(3.0, z=-2.0)) == pytest.approx(expected, rel=1e-3)
     assert period(BodyCentreOfMass(z=-1.0)) == pytest.approx(2 * np.pi / np.sqrt(9.81 / 2.0), rel=1e-3)
+
+
+CLOUD = """
+<mujoco><worldbody><body name="cloud"><joint axis="0 1 0"/>{points}</body></worldbody></mujoco>"""
+POINT = '<geom type="sphere" size="1e-4" mass="{mass}" pos="{x} {y} {z}"/>'
+
+
+def cloud(masses: np.ndarray, points: np.ndarray) -> str:
+    """A body of point masses, (n), at points, (n, 3)."""
+    given = [POINT.format(mass=m, x=x, y=y, z=z) for m, (x, y, z) in zip(masses, points, strict=True)]
+    return CLOUD.format(points="".join(given))
+
+
+def test_a_pseudo_inertia_is_that_of_the_deformed_body():
+    rng = np.random.default_rng(0)
+    masses, points = rng.uniform(0.1, 1.0, 20), 0.3 * rng.standard_normal((20, 3))
+    effect = PseudoInertia(0.2, 0.1, -0.2, 0.3, 0.4, -0.3, 0.2, 0.05, -0.02, 0.01)
+    centre = masses @ points / masses.sum()
+    stretch = np.array([[np.exp(0.1), 0.4, -0.3], [0.0, np.exp(-0.2), 0.2], [0.0, 0.0, np.exp(0.3)]])
+    moved = (points - centre) @ stretch.T + centre + np.array([0.05, -0.02, 0.01])
+    expected = compile_model(spec(cloud(np.exp(0.4) * masses, moved)))
+    found = compile_model(spec(cloud(masses, points)), [effect])
+    np.testing.assert_allclose(found.body_mass, expected.body_mass)
+    np.testing.assert_allclose(found.body_ipos, expected.body_ipos, atol=1e-9)
+    np.testing.assert_allclose(inertia_of(found, "cloud"), inertia_of(expected, "cloud"), rtol=1e-5)
+
+
+def test_any_pseudo_inertia_is_possible():
+    rng, xml = np.random.default_rng(0), CLOUD.format(points='<geom type="box" size=".1 .2 .3" mass="2"/>')
+    for values in rng.uniform(-1.0, 1.0, (50, 10)):
+        model = compile_model(spec(xml), [PseudoInertia(*values)])  # MuJoCo refuses impossible inertias
+        a, b, c = np.sort(model.body("cloud").inertia)
+        assert 0.0 < a <= b <= c <= (a + b) * (1.0 + 1e-9)

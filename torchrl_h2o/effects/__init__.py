@@ -24,7 +24,7 @@ from torchrl_h2o.effects.force.servo import ServoDeadBand, TorqueSpeedLine
 from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
 from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.joint_units import joint_names, quantity_name
-from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
+from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload, PseudoInertia
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
 from torchrl_h2o.effects.model.joint import (
@@ -97,6 +97,7 @@ __all__ = [
     "Parameter",
     "Payload",
     "Pipeline",
+    "PseudoInertia",
     "QuadraticDrag",
     "ResidualForce",
     "RollingResistance",

@@ -10,11 +10,13 @@ import numpy as np
 from scipy.stats import t as student
 
 from torchrl_h2o.effects import Parameter
+from torchrl_h2o.likelihood import log_density
 from torchrl_h2o.residuals.between_logs import LEVEL, p_values, scatter_between
 from torchrl_h2o.residuals.score import Predictions
-from torchrl_h2o.residuals.whitened import Whitened, block_of, weights
+from torchrl_h2o.residuals.whitened import Whitened, block_of, excess_of_weights, weights
 
 CONFIDENCE = 1.96  # standard errors from a value to the end of its 95 % interval
+REWEIGHTED = 8  # steps to the best values of a log, if the errors are linear
 SINGULAR = 1e-10  # share of the largest curvature below which the data do not show a combination of values
 KNOWN = 0.99  # share of a value that lies outside such combinations, from which on the data show it
 
@@ -58,26 +60,30 @@ def spreads_of(
         block, log = block_of(part), part.record.measured.log
         logs.append(np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first])
         blocks.append(count + block)
-        weight = share * weights(white)
-        rows.append((slope * inverse[:, None], weight, white))
+        rows.append((slope * inverse[:, None], white, share))
         count += len(part.blocks)
     log_of, block = np.concatenate(logs), np.concatenate(blocks)
-    scaled, weight, white = (np.concatenate(one) for one in zip(*rows, strict=True))
+    scaled, white, shares = (np.concatenate(one) for one in zip(*rows, strict=True))
 
     def solved(chosen: np.ndarray, begin: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For some blocks alone, if the errors are linear about a move to begin with: the move to the best values, its
         squared errors, and which values these blocks contain."""
         own = chosen[block]
-        curvature = scaled[own].T @ (weight[own, None] * scaled[own])
-        size = np.sqrt(np.diag(curvature))
-        size[size == 0.0] = 1.0
-        curvature = curvature / np.outer(size, size)
-        bread = np.linalg.pinv(curvature, rcond=SINGULAR, hermitian=True)
-        is_known = (np.diag(bread @ curvature) > KNOWN) & (chosen.sum() > len(size))
-        bread = bread / np.outer(size, size)
-        move = -bread @ (scaled[own].T @ (weight[own] * white[own]))
+        slope, error, share, move = scaled[own], white[own], shares[own], np.zeros(scaled.shape[1])
+        for _ in range(REWEIGHTED):
+            weight = share * weights(error + slope @ move)
+            curvature = slope.T @ (weight[:, None] * slope)
+            size = np.sqrt(np.diag(curvature))
+            size[size == 0.0] = 1.0
+            curvature = curvature / np.outer(size, size)
+            bread = np.linalg.pinv(curvature, rcond=SINGULAR, hermitian=True)
+            is_known = (np.diag(bread @ curvature) > KNOWN) & (chosen.sum() > len(size))
+            bread = bread / np.outer(size, size)
+            move = move - bread @ (slope.T @ (weight * (error + slope @ move)))
+        left = error + slope @ move
+        bread = bread * excess_of_weights(left, share)
         pulls = np.zeros((count, len(size)))
-        np.add.at(pulls, block[own], scaled[own] * (weight[own] * (white[own] + scaled[own] @ move))[:, None])
+        np.add.at(pulls, block[own], slope * (share * weights(left) * left)[:, None])
         spare = chosen.sum() / max(1, chosen.sum() - len(size))
         return begin + move, np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0), is_known
 
@@ -91,7 +97,7 @@ def spreads_of(
             chosen = log_of == names[index]
             with suppress(ValueError):  # the model does not take these values
                 nearer = white_at(begin)
-                if (weight * (nearer**2 - white**2)) @ chosen[block] < 0.0:
+                if (shares * (log_density(nearer) - log_density(white))) @ chosen[block] > 0.0:
                     solutions[index] = solved(chosen, begin, nearer)
         moves, variances = _each(solutions)
     known = np.maximum(2, np.isfinite(variances).sum(0))

@@ -9,6 +9,8 @@ import numpy as np
 from torchrl_h2o.likelihood import TAIL
 from torchrl_h2o.residuals.score import Predictions
 
+LEAST_CURVATURE = 0.1  # of the log density over the weights, where most errors are outliers
+
 Whitened = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -28,6 +30,23 @@ def whitened(part: Predictions, errors: Sequence[np.ndarray], scales: Sequence[n
 def weights(white: np.ndarray) -> np.ndarray:
     """Weights with which half the sum of squares of whitened errors has the gradient of the log density."""
     return (TAIL + 1.0) / (TAIL - 2.0 + white**2)
+
+
+def excess_of_weights(white: np.ndarray, share: np.ndarray) -> float:
+    """Factor by which the weights exceed minus the second derivative of the log density, for errors with shares, (N,).
+
+    The weights make each step of a fit safe. How far the maximum is, and how uncertain, follows from the second
+    derivative (P. J. Huber, *Robust Statistics*, 1981, section 7.6).
+
+    Examples:
+        >>> import numpy as np
+        >>> normal = np.random.default_rng(0).standard_normal(100_000)
+        >>> round(excess_of_weights(normal, np.ones(100_000)), 2)
+        1.57
+    """
+    second = (TAIL + 1.0) * (TAIL - 2.0 - white**2) / (TAIL - 2.0 + white**2) ** 2
+    weight = float(share @ weights(white))
+    return weight / max(float(share @ second), LEAST_CURVATURE * weight)
 
 
 def block_of(part: Predictions) -> np.ndarray:

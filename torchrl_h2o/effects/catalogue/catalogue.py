@@ -108,18 +108,23 @@ def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec, dt: float) -> Iter
     yield from entries_of(ServoDeadBand, "actuators", servos, lambda _: each("width", 0.005, 0.02, 0.05))
     yield from entries_of(GearPlay, "actuators", servos, lambda _: each("width", 0.005, 0.02, 0.05))
 
-    def of_stiffness(parameter: str, *shares: float, **others: float) -> Callable[[tuple[int, ...]], Trials]:
-        """Shares of the torque that the servos make for an error of 1 rad, beside other values."""
+    def of_stiffness(parameter: str, *shares: float) -> Callable[[tuple[int, ...]], Trials]:
+        """Shares of the torque that the servos make for an error of 1 rad."""
 
         def of(chosen: tuple[int, ...]) -> Trials:
             torques = [abs(spec.actuators[i].gainprm[0] * spec.actuators[i].gear[0]) for i in chosen]
-            return tuple({parameter: share * float(np.median(torques)), **others} for share in shares)
+            return each(parameter, *(share * float(np.median(torques)) for share in shares))
 
         return of
 
-    yield from entries_of(TorqueSpeedLine, "actuators", servos, of_stiffness("stall", 0.03, 0.1, 0.3, speed=10.0))
+    stalls = of_stiffness("stall", 0.03, 0.1, 0.3)
+
+    def lines(chosen: tuple[int, ...]) -> Trials:
+        return tuple({**stall, "speed": speed} for stall in stalls(chosen) for speed in (3.0, 10.0))
+
+    yield from entries_of(TorqueSpeedLine, "actuators", servos, lines)
     # without a limit of its torque, the damping of a servo is that of its joint
-    limited = {chosen: own for chosen, own in servos.items() if all(spec.actuators[i].forcelimited for i in own)}
+    limited = {chosen: own for chosen, own in servos.items() if mechanism.model.actuator_forcelimited[list(own)].all()}
     yield from entries_of(ServoDamping, "actuators", limited, of_stiffness("damping", 0.003, 0.03))
     driven = {mechanism.joint_of(index) for own in servos.values() for index in own}
     yield from gear_entries(mechanism, sorted(joint for joint in driven if joint is not None))

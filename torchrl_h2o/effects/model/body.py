@@ -147,3 +147,67 @@ class Payload(ModelEffect):
 
     def _loaded(self, body: Inertial) -> Inertial:
         return body.with_point_mass(self.mass, np.array([self.x, self.y, self.z]))
+
+
+@dataclass(frozen=True)
+class PseudoInertia(ModelEffect):
+    r"""Changes the ten inertial parameters of bodies in a way that stays physically possible.
+
+    The mass distribution is deformed: a point at :math:`p` from the centre of mass moves to :math:`A p + t`, with
+    :math:`A = \begin{pmatrix} e^{d_1} & s_{12} & s_{13} \\ 0 & e^{d_2} & s_{23} \\ 0 & 0 & e^{d_3} \end{pmatrix}`, and
+    every mass is multiplied by :math:`e^{2 \alpha}`. Any values give a mass and an inertia that a body can have.
+
+    Afterwards the bodies' masses and inertias no longer follow from their geoms, so effects on geoms must come first.
+
+    Args:
+        alpha: half the logarithm of the factor on the mass.
+        d1: logarithm of the stretch along the x axis of the body's frame.
+        d2: the same along the y axis.
+        d3: the same along the z axis.
+        s12: shear of x with y.
+        s13: shear of x with z.
+        s23: shear of y with z.
+        t1: shift of the centre of mass along the x axis, in m.
+        t2: the same along the y axis.
+        t3: the same along the z axis.
+        bodies: name patterns of the bodies.
+
+    Raises:
+        ValueError: when put into a model that has no such body.
+
+    Examples:
+        >>> PseudoInertia(alpha=0.1, t1=0.01, bodies="torso").describe()
+        'pseudo-inertia of bodies torso: alpha 0.1, d 0, 0, 0, s 0, 0, 0, t 0.01 m, 0 m, 0 m'
+
+    Source: C. Rucker, P. M. Wensing, *Smooth Parameterization of Rigid-Body Inertia*, IEEE Robotics and Automation
+    Letters 7 (2022), the log-Cholesky parameters of :math:`U` in :math:`J' = U J U^T`.
+    """
+
+    wording: ClassVar[str] = (
+        "pseudo-inertia of {bodies}: alpha {alpha}, d {d1}, {d2}, {d3}, s {s12}, {s13}, {s23}, t {t1}, {t2}, {t3}"
+    )
+    alpha: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    d1: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    d2: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    d3: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    s12: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    s13: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    s23: float = parameter(unit="1", bounds=(-2.0, 2.0), neutral=0.0)
+    t1: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    t2: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    t3: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
+    bodies: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        bodies = selection.bodies(spec, self.bodies)
+        if not self.is_neutral:
+            edit_inertials(spec, bodies, self._deformed)
+
+    def _deformed(self, body: Inertial) -> Inertial:
+        stretch = np.diag(np.exp([self.d1, self.d2, self.d3]))
+        stretch[np.triu_indices(3, 1)] = self.s12, self.s13, self.s23
+        density = np.exp(2.0 * self.alpha)
+        moments = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia  # second moments of the mass
+        moments = density * stretch @ moments @ stretch.T
+        centre = body.centre + np.array([self.t1, self.t2, self.t3])
+        return Inertial(density * body.mass, centre, np.trace(moments) * np.eye(3) - moments)

@@ -1,0 +1,65 @@
+"""Arms with position servos: the truth explains their logs, and what a report must name."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import draw_case
+from running import FAMILIES
+from servo_cases import CAUSES, USUAL
+
+from tests.recipes.benchmarks.made_up import report
+from torchrl_h2o.effects import ActionDelay, Armature, JointFrictionLoss, LoadFriction, StribeckFriction
+
+SEED, ROWS, AHEAD = 5, 600, 20
+NUMBERS = [1, 3, 4, *(pytest.param(number, marks=pytest.mark.slow) for number in (2, 5, 6, 8, 9, 10, 11, 13))]
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_the_further_cause_explains_what_friction_and_rotors_leave(number):
+    """The library did not simulate the log; its physics steps are ten times as long."""
+    case = draw_case(FAMILIES, "servos", number, SEED)
+    simulation, (states, targets) = case.simulation(), case.arm.record(ROWS, case.seed)
+    starts = np.arange(30, ROWS - AHEAD, 3)
+
+    def error(effects):
+        machine = simulation.with_effects(*effects)
+        commands = machine.executed(targets)[starts[:, None] + np.arange(AHEAD)]
+        ahead = machine.rollout(states[starts], commands)[:, -1] - states[starts + AHEAD]
+        return np.sqrt((ahead[:, : len(case.arm.servos)] ** 2).mean())
+
+    usual = [effect for effect in case.truth if isinstance(effect, USUAL)]
+    assert len(usual) < len(case.truth)
+    assert error(case.truth) < 0.9 * error(usual)
+
+
+def test_every_cause_is_drawn_and_a_control_has_none():
+    assert {draw_case(FAMILIES, "servos", number, SEED).cause for number in range(len(CAUSES))} == set(CAUSES)
+    for number in range(len(CAUSES)):
+        case, plain = (draw_case(FAMILIES, family, number, SEED) for family in ("servos", "servo_controls"))
+        assert plain.seed == case.seed
+        assert all(isinstance(effect, USUAL) for effect in plain.truth)
+        assert [one.friction for one in plain.arm.servos] == [one.friction for one in case.arm.servos]
+
+
+@pytest.mark.parametrize(
+    ("found", "is_right"),
+    [
+        ((LoadFriction(0.1, joints="joint0"), JointFrictionLoss(0.1), Armature(0.1)), True),
+        ((LoadFriction(0.1), ActionDelay(0.001)), True),  # less than a physics step of the model
+        ((LoadFriction(0.1), ActionDelay(0.02)), False),
+        ((JointFrictionLoss(0.1), Armature(0.1)), False),
+        ((LoadFriction(0.1), StribeckFriction(0.1)), False),
+    ],
+)
+def test_a_report_must_name_the_cause_and_no_other(found, is_right):
+    case = replace(draw_case(FAMILIES, "servos", 1, SEED))
+    assert case.cause == "M3"
+    assert case.judge(report(*found), case)["ok"] == is_right
+
+
+def test_friction_at_rest_belongs_to_m4_beside_that_of_the_load():
+    case = draw_case(FAMILIES, "servos", 2, SEED)
+    both = LoadFriction(0.1), StribeckFriction(0.1)
+    assert case.judge(report(*both), case)["ok"]
+    assert not any(case.judge(report(one), case)["ok"] for one in both)
