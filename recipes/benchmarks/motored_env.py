@@ -9,7 +9,9 @@ import numpy as np
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.spaces import Box
 
-NO_REWARD = 0.0  # the benchmark trains no policy
+from torchrl_h2o.envs.task_rules import RULES, TaskRules
+
+NO_REWARD = 0.0  # of mechanisms in which no policy is trained
 LEG_JOINTS = ("abduction", "flexion", "knee")
 PENDULUM_STEP = 0.01  # s
 
@@ -83,3 +85,46 @@ class TwoLinksEnv(MotoredEnv):
 
     def __init__(self) -> None:
         super().__init__("machines/two_links.xml", 4, 0.005, start_angle=0.3)
+
+
+class ReachingEnv(TwoLinksEnv):
+    """The two links as an arm that moves its tip to a point and holds it there against its weight."""
+
+    lengths = 0.35, 0.3  # m, of the two links
+    target = np.array([-0.42, -0.47])  # m, x and z of the point
+    strongest = np.array([6.0, 2.0], np.float32)  # N·m
+
+    def _set_action_space(self) -> Box:
+        self.action_space = Box(-self.strongest, self.strongest)  # the model's motors have no bounds
+        return self.action_space
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        observation, _, *others = super().step(action)
+        return observation, -float(self.distance(self.data.qpos)), *others
+
+    def distance(self, qpos: np.ndarray) -> np.ndarray:
+        """Distance of the tip from the point in m, (...), at joint angles (..., 2)."""
+        upper, lower = qpos[..., 0], qpos[..., 0] + qpos[..., 1]
+        turned = np.stack([[np.sin(angle), np.cos(angle)] for angle in (upper, lower)])  # (2 links, x and z, ...)
+        tip = -np.tensordot(self.lengths, turned, 1)
+        return np.hypot(tip[0] - self.target[0], tip[1] - self.target[1])
+
+
+class Reaching(TaskRules):
+    """The arm's rules for many worlds at once: the reward is the negative distance of the tip from its point, in m."""
+
+    task: ReachingEnv
+
+    def observe(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        return np.concatenate([qpos, qvel], axis=1)
+
+    def reward(
+        self, before: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray, control_step: np.ndarray
+    ) -> np.ndarray:
+        return -self.task.distance(qpos)
+
+    def is_terminated(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        return np.zeros(len(qpos), dtype=bool)
+
+
+RULES[ReachingEnv] = Reaching

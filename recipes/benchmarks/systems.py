@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import torch
 from gymnasium.wrappers import TimeLimit
-from motored_env import CartPoleEnv, LegEnv, PendulumEnv, TwoLinksEnv
+from motored_env import CartPoleEnv, LegEnv, PendulumEnv, ReachingEnv, TwoLinksEnv
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
 
@@ -193,6 +193,10 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
         ),
         "two links": System(
             lambda episode: GymWrapper(TimeLimit(TwoLinksEnv(), episode)),
+            lambda: Excitation(torch.tensor([6.0, 2.0]), strongest=0.5),
+        ),
+        "reaching arm": System(
+            lambda episode: GymWrapper(TimeLimit(ReachingEnv(), episode)),
             lambda: Excitation(torch.tensor([6.0, 2.0]), strongest=0.5),
         ),
         "wheel_legged": System(

@@ -15,6 +15,7 @@ from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.comparison.results_file import IDENTITY
 from torchrl_h2o.comparison.seed_table import EPISODE, seed_tables
+from torchrl_h2o.comparison.series_tables import series_tables
 
 HERE = Path(__file__).parent
 NOT_RUN = "not run on this code"
@@ -286,6 +287,19 @@ def ratio_table(runs: Runs) -> str:
     return markdown_table([*head, "seeds", "commit"], rows or [["", "", "", "", NOT_RUN, *[""] * 7]])
 
 
+# Domain randomisation
+WORLDS = ("measured ranges", "± 20 %", "mended", "unmended", "the series itself")
+SCORES = ("return", "return in training's worlds", "seconds stood", "tracking error, mm")
+
+
+def randomization_table(runs: Runs) -> str:
+    """For each series of machines, a line for the worlds in which policies were trained, and a sentence."""
+    if "randomization" not in runs:
+        return NOT_RUN
+    told = runs["randomization"]
+    return f"{series_tables(told, WORLDS, SCORES)}\n\nCommit {told['commit'].iloc[0]}."
+
+
 # The overview
 def overview_table(runs: Runs) -> str:
     draws, trainings = _draws(runs), _trainings(runs)
@@ -300,6 +314,11 @@ def overview_table(runs: Runs) -> str:
             "training",
             "training",
             f"robot stands in {share(stands.sum(), len(stands))} runs" if len(stands) else NOT_RUN,
+        ],
+        [
+            "randomization",
+            "whether measured ranges help a policy",
+            f"{len(runs['randomization'])} policies" if "randomization" in runs else NOT_RUN,
         ],
     ]
     return markdown_table(
@@ -326,4 +345,5 @@ TABLES: dict[str, Callable[[Runs], str]] = {
     "by_seed": by_seed_table,
     "speed": speed_table,
     "ratio": ratio_table,
+    "randomization": randomization_table,
 }
