@@ -1,6 +1,6 @@
 """Measures how often the value of a log lies in the 95 % interval that the other logs of its machine gave for it.
 
-python recipes/benchmarks/interval_coverage.py                     # simulated arms, 20 minutes
+python recipes/benchmarks/interval_coverage.py                     # simulated arms, 10 minutes
 python recipes/benchmarks/interval_coverage.py logs=path/to/logs   # also the real double pendulum, logs/double_pendulum
 
 Each log of a series is left out in turn. A known set of effects is fitted to the other logs, with intervals of the
