@@ -90,7 +90,7 @@ def half_widths_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray
     Each variance counts as often as its confidence distribution says, by which Cochran's Q with this variance added is
     chi-squared. 0 for a value that fewer than two logs contain.
 
-    K. Nagashima, H. Noma and T. A. Furukawa, *Prediction intervals for random-effects meta-analysis: a confidence
+    K. Nagashima, H. Noma and T. A. Furukawa, *Prediction interval for random-effects meta-analysis: a confidence
     distribution approach*, Statistical Methods in Medical Research 28 (2019), 1689-1702; W. Viechtbauer, *Confidence
     intervals for the amount of heterogeneity in meta-analysis*, Statistics in Medicine 26 (2007), 37-52.
 
