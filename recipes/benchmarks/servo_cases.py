@@ -224,5 +224,5 @@ def _is_of_a_step(effect: Effect) -> bool:
     return late and all(parameter.value <= STEP / MODEL_STEPS for parameter in effect.parameters.values())
 
 
-SERVOS = Family(servo, 20, 17, "the cause named beside friction and rotors, and no other", stream=12)
-SERVO_CONTROLS = Family(control, 20, 20, "friction and rotors alone", stream=12)
+SERVOS = Family(servo, 20, 17, "the cause named beside friction and rotors, and no other", stream=13)
+SERVO_CONTROLS = Family(control, 20, 20, "friction and rotors alone", stream=SERVOS.stream)

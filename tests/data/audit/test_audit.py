@@ -290,7 +290,7 @@ def test_real_log_that_cannot_tell_friction_from_gain_says_so(shared_data):
     real = Simulation.from_mjcf(folder / "double_pendulum.xml", NAMES, 0.002)
     found = audit(measured(table[:, 1:5], table[:-1, 7:9], table[:-1, 0]), real)
     assert found.severe == ()
-    (note,) = [finding for finding in found.findings if finding.words.startswith("a weaker motor of shoulder")]
+    (note,) = [finding for finding in found.findings if finding.words.startswith("motor gain of shoulder is weak")]
     assert "friction" in note.words
 
 
