@@ -9,7 +9,6 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -17,7 +16,6 @@ import numpy as np
 STEP = 0.005  # s, control step
 MODEL_STEPS, SUBSTEPS = 4, 20  # physics steps per control step, of the model and of reality
 GRAVITY = 9.81
-AXES = ("0 1 0", "1 0 0")  # of every other joint, so that the chain moves in three dimensions
 SIZES = (6, 12)  # fewest and most joints
 ROTOR = (0.5, 3.0)  # in inertias of the straight chain about the joint
 FRICTION, DAMPING = (0.03, 0.12), (0.02, 0.08)  # in largest torques of gravity, and in these times s/rad
@@ -26,13 +24,6 @@ DAMPING_RATIO = (0.3, 0.6)  # of both, of critical
 DELAY = (8, 60)  # physics steps of reality: 2 to 15 ms
 SINES, FREQUENCY, SWING = 4, (0.1, 1.5), 0.25  # of each joint's reference: number, Hz, and amplitude of one in rad
 LEVEL, HOLD, SMOOTHING = 0.3, (1.0, 3.0), 0.05  # of its steps: largest in rad, seconds between them, filter in s
-
-
-class Link(Protocol):
-    """A link of a length in m and a mass in kg."""
-
-    length: float
-    mass: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,23 +89,15 @@ class Chain:
         """The joints' names."""
         return [f"joint{index}" for index in range(len(self.joints))]
 
-    def xml(self, complete: bool = False) -> str:
+    def xml(self, complete: bool = False, step: float = STEP) -> str:
         """The MJCF model, without friction, damping and rotors unless it is to be complete."""
-        body, drives = "", ""
-        for index, joint in reversed(list(enumerate(self.joints))):
-            before = self.joints[index - 1].length if index else 0.0
+        hinges, drives = [], []
+        for index, joint in enumerate(self.joints):
             lacks = f'frictionloss="{joint.friction}" damping="{joint.damping}" armature="{joint.rotor}"'
-            link = f'<geom fromto="0 0 0 0 0 {-joint.length}" size="{0.12 * joint.length}" mass="{joint.mass}"/>'
-            hinge = f'<joint name="joint{index}" axis="{AXES[index % 2]}" {lacks if complete else ""}/>'
-            body = f'<body name="link{index}" pos="0 0 {-before}">{hinge}{link}{body}</body>'
-            servo = f'<position name="drive{index}" joint="joint{index}" kp="{joint.stiffness}" kv="{joint.brake}"/>'
-            drives = (servo if self.servos else f'<motor name="drive{index}" joint="joint{index}"/>') + drives
-        return (
-            '<mujoco model="chain"><compiler angle="radian" autolimits="false"/>'
-            f'<option timestep="{STEP / MODEL_STEPS}" gravity="0 0 {-GRAVITY}" integrator="implicitfast"/>'
-            '<default><geom type="capsule" contype="0" conaffinity="0"/></default>'
-            f"<worldbody>{body}</worldbody><actuator>{drives}</actuator></mujoco>"
-        )
+            hinges.append(f'<joint name="joint{index}" axis="{axis(index)}" {lacks if complete else ""}/>')
+            kind = f'position kp="{joint.stiffness}" kv="{joint.brake}"' if self.servos else "motor"
+            drives.append(f'<{kind} name="drive{index}" joint="joint{index}"/>')
+        return mjcf(self.joints, hinges, drives, step / MODEL_STEPS)
 
     def record(self, rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """One run from rest: positions and velocities, (rows + 1, 2 n), and the commands of each row, (rows, n)."""
@@ -135,7 +118,27 @@ class Chain:
         return np.array(observed), np.array(commands)
 
 
-def torque_of_gravity(links: Sequence[Link]) -> float:
+def axis(index: int) -> str:
+    """Axis of a joint: those of neighbours are perpendicular, so that a chain moves in three dimensions."""
+    return ("0 1 0", "1 0 0")[index % 2]
+
+
+def mjcf(joints: Sequence[Joint], hinges: Sequence[str], drives: Sequence[str], step: float) -> str:
+    """The MJCF model of a chain with physics steps in s, from the elements of its hinges and actuators."""
+    body = ""
+    for index, joint in reversed(list(enumerate(joints))):
+        before = joints[index - 1].length if index else 0.0
+        link = f'<geom fromto="0 0 0 0 0 {-joint.length}" size="{0.12 * joint.length}" mass="{joint.mass}"/>'
+        body = f'<body name="link{index}" pos="0 0 {-before}">{hinges[index]}{link}{body}</body>'
+    return (
+        '<mujoco model="chain"><compiler angle="radian" autolimits="false"/>'
+        f'<option timestep="{step}" gravity="0 0 {-GRAVITY}" integrator="implicitfast"/>'
+        '<default><geom type="capsule" contype="0" conaffinity="0"/></default>'
+        f"<worldbody>{body}</worldbody><actuator>{''.join(drives)}</actuator></mujoco>"
+    )
+
+
+def torque_of_gravity(links: Sequence[Joint]) -> float:
     """Torque of gravity at the first of some links, in N·m, if all were stretched out horizontally."""
     torque, reach = 0.0, 0.0
     for link in links:

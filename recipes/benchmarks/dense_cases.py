@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from cases import Case, Family
-from chains import MODEL_STEPS, Chain
-from systems import with_sensor_noise
-from tensordict import TensorDict
+from chains import Chain
+from joint_case import JointCase
 
-from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionLag,
@@ -22,7 +19,7 @@ from torchrl_h2o.effects import (
     ObservationDelay,
     selection,
 )
-from torchrl_h2o.residuals import Report, Simulation, StateMap
+from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.report.contents import FoundEffect
 
 NOISE = (0.001, 0.003)  # of the encoders, shares of the signals' standard deviations
@@ -30,39 +27,7 @@ KINDS = {JointFrictionLoss: "torque", JointDamping: "damping", Armature: "inerti
 WITHIN, WITHIN_DELAY = 0.25, 0.001  # relative error of a joint's values; error of the delay in s
 
 
-@dataclass(frozen=True, kw_only=True)
-class DenseCase(Case):
-    """A case with the log of a chain.
-
-    Args:
-        chain: the chain.
-        velocities: whether the log has velocities.
-    """
-
-    chain: Chain
-    velocities: bool
-
-    def simulation(self) -> Simulation:
-        names, count, xml = self.chain.names, len(self.chain.joints), self.chain.xml()
-        observed, units = names, ["rad"] * count
-        if self.velocities:
-            observed, units = [*names, *(f"{name}_velocity" for name in names)], [*units, *["rad/s"] * count]
-        state_map = StateMap.of_coordinates(observed, units, range(len(observed)), 2 * count)
-        if not self.velocities:
-            state_map = replace(state_map, hidden=tuple(range(count, 2 * count)))
-        return Simulation(lambda: mujoco.MjSpec.from_string(xml), MODEL_STEPS, state_map, name="chain")
-
-    def measure(self) -> TensorDict:
-        states, commands = self.chain.record(self.transitions, self.seed)
-        seen = states if self.velocities else states[:, : len(self.chain.joints)]
-        ends = np.zeros(len(commands), bool)
-        data = to_ted(
-            observation=seen[:-1], action=commands, next_observation=seen[1:], terminated=ends, truncated=ends
-        )
-        return with_sensor_noise(data, self.noise, self.seed)
-
-
-def dense(number: int, rng: np.random.Generator) -> DenseCase:
+def dense(number: int, rng: np.random.Generator) -> JointCase:
     """Torque motors and position servos in turn; every other log of servos has positions alone."""
     chain = Chain.draw(rng, servos=number % 2 == 1)
     truth = tuple(
@@ -74,14 +39,14 @@ def dense(number: int, rng: np.random.Generator) -> DenseCase:
             Armature(joint.rotor, name),
         )
     )
-    return DenseCase(
+    return JointCase(
         name=f"{len(chain.joints)} {'servos' if chain.servos else 'motors'} {number}",
         system="chain",
         judge=judge_dense,
         truth=(*truth, ActionDelay(chain.delay)),
         noise=float(rng.uniform(*NOISE)),
         seed=int(rng.integers(2**31)),
-        chain=chain,
+        machine=chain,
         velocities=number % 4 != 1,
     )
 

@@ -18,16 +18,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from chains import MODEL_STEPS
 from corruption_logs import pendulum_simulation
 from options import read_options
-from servo_cases import NOISE, ServoCase, judge_servo, with_cause
-from servos import MODEL_STEPS, STEP, SUBSTEPS, Arm, Servo
+from servo_cases import NOISE, ServoCase, effects_of, judge_servo, with_cause
+from servos import STEP, SUBSTEPS, Arm, Servo
 from tensordict import TensorDict
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.data import load
-from torchrl_h2o.effects import Armature, Effect, JointDamping, JointFrictionLoss, LoadFriction
+from torchrl_h2o.effects import Armature, Effect, JointDamping, JointFrictionLoss
 from torchrl_h2o.provenance import cpu_seconds
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.ground import Ground
@@ -117,7 +118,7 @@ def arms(number: int, seed: int) -> Series:
             noise=noise,
             seed=int(rng.integers(2**31)),
             transitions=ROWS,
-            arm=Arm(tuple(_scattered(servo, scatter, rng) for servo in mean.servos)),
+            machine=Arm(tuple(_scattered(servo, scatter, rng) for servo in mean.servos)),
             cause=cause,
             velocities=has_velocities,
         )
@@ -126,7 +127,7 @@ def arms(number: int, seed: int) -> Series:
     logs = [case.measure() for case in cases]
     for index, log in enumerate(logs):
         log["log"] = torch.full((len(log),), index)
-    truths = tuple(_effects(case.arm) for case in cases)
+    truths = tuple(_effects(case.machine) for case in cases)
     machine = f"simulated arms of {count} joint{'s' * (count > 1)}{', friction by load' * (cause == 'M3')}"
     return Series(machine, cases[0].simulation(), TensorDict.cat(logs), _effects(mean), truths)
 
@@ -138,16 +139,8 @@ def _scattered(servo: Servo, scatter: float, rng: np.random.Generator) -> Servo:
 
 def _effects(arm: Arm) -> tuple[Effect, ...]:
     """What the model of an arm lacks; its longer steps take as much damping as makes up for later servos."""
-    return tuple(
-        effect
-        for name, servo in zip(arm.names, arm.servos, strict=True)
-        for effect in (
-            JointFrictionLoss(servo.friction, name),
-            JointDamping(servo.damping + LATER * servo.stiffness, name),
-            Armature(servo.rotor, name),
-            *([LoadFriction(servo.load, joints=name)] if servo.load else []),
-        )
-    )
+    servos = (replace(servo, damping=servo.damping + LATER * servo.stiffness) for servo in arm.servos)
+    return effects_of(Arm(tuple(servos)))
 
 
 def double_pendulum(folder: Path) -> Series:

@@ -6,17 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 from cases import Case, Family
-from chains import torque_of_gravity
-from servos import MODEL_STEPS, STEP, Arm, Servo
-from systems import with_sensor_noise
-from tensordict import TensorDict
+from chains import MODEL_STEPS, torque_of_gravity
+from joint_case import JointCase
+from servos import STEP, Arm, Servo
 
-from torchrl_h2o.data.readers.ted import to_ted
 from torchrl_h2o.effects import (
-    ActionBacklash,
     ActionDelay,
     ActionLag,
     ActionLead,
@@ -33,7 +29,7 @@ from torchrl_h2o.effects import (
     StribeckFriction,
     TorqueSpeedLine,
 )
-from torchrl_h2o.residuals import Report, Simulation, StateMap
+from torchrl_h2o.residuals import Report
 
 NOISE = (0.001, 0.003)  # of the encoders, shares of the signals' standard deviations
 ROWS = 3000  # 30 s
@@ -45,7 +41,7 @@ KINDS: Mapping[str, tuple[tuple[type[Effect], ...], ...]] = {
     "M1": (),
     "M3": ((LoadFriction,),),
     "M4": ((LoadFriction,), (StribeckFriction,)),
-    "play": ((GearPlay, ActionBacklash, ServoDeadBand),),
+    "play": ((GearPlay, ServoDeadBand),),
     "lead": ((ActionLead,),),
     "sag": ((TorqueSpeedLine,),),
     "delay": ((ActionDelay, ActionLag, ObservationDelay),),
@@ -54,41 +50,20 @@ CAUSES = tuple(KINDS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServoCase(Case):
+class ServoCase(JointCase):
     """A case with the log of an arm.
 
     Args:
-        arm: the arm.
         cause: one of :data:`CAUSES`.
-        velocities: whether the log has velocities.
     """
 
-    arm: Arm
+    machine: Arm
     cause: str
-    velocities: bool
-
-    def simulation(self) -> Simulation:
-        names, count, xml = self.arm.names, len(self.arm.servos), self.arm.xml()
-        observed, units = names, ["rad"] * count
-        if self.velocities:
-            observed, units = [*names, *(f"{name}_velocity" for name in names)], [*units, *["rad/s"] * count]
-        state_map = StateMap.of_coordinates(observed, units, range(len(observed)), 2 * count)
-        if not self.velocities:
-            state_map = replace(state_map, hidden=tuple(range(count, 2 * count)))
-        return Simulation(lambda: mujoco.MjSpec.from_string(xml), MODEL_STEPS, state_map, name="arm")
-
-    def measure(self) -> TensorDict:
-        states, targets = self.arm.record(self.transitions, self.seed)
-        seen = states if self.velocities else states[:, : len(self.arm.servos)]
-        ends = np.zeros(len(targets), bool)
-        data = to_ted(observation=seen[:-1], action=targets, next_observation=seen[1:], terminated=ends, truncated=ends)
-        return with_sensor_noise(data, self.noise, self.seed)
 
     @property
     def words(self) -> str:
-        first = self.arm.servos[0]
-        own = {name: getattr(first, name) for name in Servo.__annotations__}
-        told = ", ".join(f"{name} {own[name]:.3g}" for name in PARTS[self.cause])
+        first = self.machine.servos[0]
+        told = ", ".join(f"{name} {getattr(first, name):.3g}" for name in PARTS[self.cause])
         return f"{self.cause} ({told})" if told else self.cause
 
 
@@ -149,7 +124,7 @@ def servo(number: int, rng: np.random.Generator) -> ServoCase:
         truth=effects_of(arm),
         seed=int(rng.integers(2**31)),
         transitions=ROWS,
-        arm=arm,
+        machine=arm,
         cause=cause,
         velocities=number % 2 == 0,
     )
@@ -164,17 +139,14 @@ def effects_of(arm: Arm) -> tuple[Effect, ...]:
             JointDamping(one.damping, name),
             Armature(one.rotor, name),
             LoadFriction(one.load, joints=name),
-            StribeckFriction(one.rest, one.speed, one.rest_load, exponent=one.exponent, joints=name)
-            if one.rest
-            else StribeckFriction(),
             GearPlay(one.play, (index,)),
             ActionLead(one.lead, (index,)),
             TorqueSpeedLine(one.stall, one.no_load, (index,)),
             ActionDelay(one.delay, (index,)),
         )
-        found += [
-            effect for effect in drawn if not effect.is_neutral and (one.rest or type(effect) is not StribeckFriction)
-        ]
+        found += [effect for effect in drawn if not effect.is_neutral]
+        if one.rest:
+            found.append(StribeckFriction(one.rest, one.speed, one.rest_load, exponent=one.exponent, joints=name))
     return tuple(found)
 
 
@@ -182,16 +154,14 @@ def control(number: int, rng: np.random.Generator) -> ServoCase:
     """The arm of a drawn servo without its cause."""
     drawn = servo(number, rng)
     plain = {name: Servo.__dict__[name] for parts in PARTS.values() for name in parts}
-    arm = Arm(tuple(replace(one, **plain) for one in drawn.arm.servos))
-    return replace(drawn, arm=arm, truth=effects_of(arm), cause="M1", name=f"without {drawn.name}")
+    arm = Arm(tuple(replace(one, **plain) for one in drawn.machine.servos))
+    return replace(drawn, machine=arm, truth=effects_of(arm), cause="M1", name=f"without {drawn.name}")
 
 
 def named_causes(report: Report) -> set[str]:
     """Causes that a report names, beside friction, damping and rotors."""
-    found = {type(effect) for effect in report.effects}
-    for group in report.indistinguishable:
-        if any(effect in report.effects for effect in group.effects):
-            found |= {type(effect) for effect in group.effects}
+    alike = [group.effects for group in report.indistinguishable if set(group.effects) & set(report.effects)]
+    found = {type(effect) for effects in (report.effects, *alike) for effect in effects}
     return {
         cause
         for cause, groups in KINDS.items()
@@ -206,7 +176,7 @@ def judge_servo(report: Report, case: Case) -> dict:
     """
     assert isinstance(case, ServoCase)
     own = {*(kind for group in KINDS[case.cause] for kind in group), *USUAL}
-    if len(case.arm.servos) == 1:
+    if len(case.machine.servos) == 1:
         own.add(BodyInertia)  # of the only link: the same as a rotor
     others = [effect for effect in report.effects if type(effect) not in own and not _is_of_a_step(effect)]
     named = named_causes(report)

@@ -8,31 +8,24 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import mujoco
 import numpy as np
-from chains import AXES, GRAVITY, references, torque_of_gravity
+from chains import Chain, Joint, axis, mjcf, references, torque_of_gravity
 
 STEP = 0.01  # s, control step
-MODEL_STEPS, SUBSTEPS = 4, 40  # physics steps per control step, of the model and of reality
+SUBSTEPS = 40  # physics steps of reality per control step
 BANDWIDTH, DAMPING_RATIO = (8.0, 20.0), (0.3, 0.6)  # of the servos, in rad/s and of critical
 ROTOR = (0.2, 1.0)  # in inertias of the hanging arm about the joint
 FRICTION, DAMPING = (0.02, 0.08), (0.01, 0.04)  # in largest torques of gravity, and in these times s/rad
 
 
 @dataclass(frozen=True, kw_only=True)
-class Servo:
-    """A joint with its link and its servo; the model has length, mass, stiffness and brake alone.
+class Servo(Joint):
+    """A joint with a position servo, and what gears and motors do beside friction, damping and a rotor.
 
     Args:
-        length: length of the link, in m.
-        mass: mass of the link, in kg.
-        stiffness: torque per error of the position, in N·m/rad.
-        brake: torque per velocity, in N·m·s/rad.
-        friction: dry friction, in N·m.
-        damping: viscous friction, in N·m·s/rad.
-        rotor: inertia of the motor at the joint, in kg·m².
         load: friction per load of the gear (M3 of Duclusaud et al., ICRA 2025).
         rest: further friction at rest, in N·m (M2).
         rest_load: the same per load (M4).
@@ -45,13 +38,6 @@ class Servo:
         delay: time by which commands act late, in s.
     """
 
-    length: float
-    mass: float
-    stiffness: float = 1.0
-    brake: float = 0.0
-    friction: float = 0.0
-    damping: float = 0.0
-    rotor: float = 0.0
     load: float = 0.0
     rest: float = 0.0
     rest_load: float = 0.0
@@ -99,45 +85,28 @@ class Arm:
     @property
     def names(self) -> list[str]:
         """The joints' names."""
-        return [f"joint{index}" for index in range(len(self.servos))]
+        return Chain(self.servos, servos=True).names
 
     def xml(self, complete: bool = False) -> str:
         """The MJCF model: servos without friction and rotors; or complete, with motors and with play."""
-        body, drives = "", ""
-        for index, servo in reversed(list(enumerate(self.servos))):
-            before = self.servos[index - 1].length if index else 0.0
-            axis = AXES[index % 2]
-            hinge = f'<joint name="joint{index}" axis="{axis}"/>'
-            if complete:
-                range_of_play = max(servo.play, 1e-6) / 2.0
-                hinge = (
-                    f'<joint name="joint{index}" axis="{axis}" damping="{servo.damping}" armature="{servo.rotor}" '
-                    f'frictionloss="{max(servo.friction, 1e-9)}"/>'
-                )
-                if servo.play:
-                    hinge += (
-                        f'<joint name="play{index}" axis="{axis}" limited="true" solreflimit="0.001 1" '
-                        f'range="{-range_of_play} {range_of_play}"/>'
-                    )
-            link = f'<geom fromto="0 0 0 0 0 {-servo.length}" size="{0.12 * servo.length}" mass="{servo.mass}"/>'
-            body = f'<body name="link{index}" pos="0 0 {-before}">{hinge}{link}{body}</body>'
-            gains = f'kp="{servo.stiffness}" kv="{servo.brake}"'
-            kind = "motor" if complete else f"position {gains}"
-            drives = f'<{kind} name="servo{index}" joint="joint{index}"/>{drives}'
-        step = STEP / (SUBSTEPS if complete else MODEL_STEPS)
-        return (
-            '<mujoco model="arm"><compiler angle="radian" autolimits="false"/>'
-            f'<option timestep="{step}" gravity="0 0 {-GRAVITY}" integrator="implicitfast"/>'
-            '<default><geom type="capsule" contype="0" conaffinity="0"/></default>'
-            f"<worldbody>{body}</worldbody><actuator>{drives}</actuator></mujoco>"
-        )
+        if not complete:
+            return Chain(self.servos, servos=True).xml(step=STEP)
+        hinges = []
+        for index, servo in enumerate(self.servos):
+            losses = f'damping="{servo.damping}" frictionloss="{servo.friction}" armature="{servo.rotor}"'
+            hinges.append(f'<joint name="joint{index}" axis="{axis(index)}" {losses}/>')
+            if servo.play:
+                stop = f'limited="true" range="{-servo.play / 2.0} {servo.play / 2.0}" solreflimit="0.001 1"'
+                hinges[-1] += f'<joint name="play{index}" axis="{axis(index)}" {stop}/>'
+        drives = [f'<motor joint="{name}"/>' for name in self.names]
+        return mjcf(self.servos, hinges, drives, STEP / SUBSTEPS)
 
     def record(self, rows: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """One run from rest: positions and velocities, (rows + 1, 2 n), and the targets of each row, (rows, n)."""
         model = mujoco.MjModel.from_xml_string(self.xml(complete=True))
         data, targets = mujoco.MjData(model), references(rows, model.nu, np.random.default_rng(seed), STEP)
         motors, plays = _dofs(model, "joint", len(self.servos)), _dofs(model, "play", len(self.servos))
-        values = {name: np.array([getattr(servo, name) for servo in self.servos]) for name in Servo.__annotations__}
+        values = {one.name: np.array([getattr(servo, one.name) for servo in self.servos]) for one in fields(Servo)}
         waiting = [deque([0.0] * round(servo.delay * SUBSTEPS / STEP)) for servo in self.servos]
         before = targets[0]
 

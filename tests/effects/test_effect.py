@@ -11,14 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_h2o import effects
+from tests.effects.every_effect import EFFECTS, KINDS
 from torchrl_h2o.effects import (
     ActionBias,
     ActionGain,
     ActionNoise,
     ActionSaturation,
     BodyMass,
-    Effect,
     GeomSize,
     Gravity,
     JointDamping,
@@ -26,19 +25,6 @@ from torchrl_h2o.effects import (
     ObservationNoise,
     paper_gap,
 )
-
-KINDS = {
-    effects.ModelEffect,
-    effects.ActionEffect,
-    effects.ForceEffect,
-    effects.VaryingEffect,
-    effects.ObservationEffect,
-}
-EFFECTS = [
-    member
-    for member in vars(effects).values()
-    if isinstance(member, type) and issubclass(member, Effect) and member not in KINDS | {Effect}
-]
 
 
 @pytest.mark.parametrize("effect", EFFECTS)

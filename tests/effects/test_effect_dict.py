@@ -7,11 +7,10 @@ from typing import ClassVar
 import mujoco
 import pytest
 
-from torchrl_h2o import effects
+from tests.effects.every_effect import EFFECTS
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionSaturation,
-    Effect,
     GravityTilt,
     ModelEffect,
     ObservationBias,
@@ -21,18 +20,7 @@ from torchrl_h2o.effects import (
     parameter,
 )
 
-KINDS = {
-    effects.ModelEffect,
-    effects.ActionEffect,
-    effects.ForceEffect,
-    effects.VaryingEffect,
-    effects.ObservationEffect,
-}
-NEUTRAL = [
-    member()
-    for member in vars(effects).values()
-    if isinstance(member, type) and issubclass(member, Effect) and member not in KINDS | {Effect}
-]
+NEUTRAL = [effect() for effect in EFFECTS]
 OTHERS = [
     ActionSaturation(),
     ActionSaturation(0.3, actuators=(0, 2)),

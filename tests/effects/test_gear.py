@@ -6,6 +6,7 @@ import pytest
 
 from torchrl_h2o.effects import GearPlay, LoadFriction, Pipeline, StribeckFriction
 from torchrl_h2o.effects.effect import States
+from torchrl_h2o.effects.gear import loads
 from torchrl_h2o.effects.gear.loads import JointActuators, Weight
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
 
@@ -61,7 +62,7 @@ def test_an_actuator_without_a_linear_torque_is_named():
     muscle = '<muscle name="biceps" joint="elbow" lengthrange="0 1"/>'
     model = mujoco.MjModel.from_xml_string(ARM.replace('<position joint="elbow" kp="5" kv=".1" gear="2"/>', muscle))
     with pytest.raises(ValueError, match="the torque of actuator 'biceps' is no linear function"):
-        LoadFriction(0.1).vary(model)
+        Pipeline([LoadFriction(0.1)]).variations(model)
 
 
 def test_friction_of_the_load_is_that_of_a_model_whose_friction_is_written_at_each_step():
@@ -78,6 +79,21 @@ def test_friction_of_the_load_is_that_of_a_model_whose_friction_is_written_at_ea
     along = moved([effect], xml, TARGETS)
     np.testing.assert_allclose(along, by_hand, atol=1e-9)
     assert np.abs(along - moved([], xml, TARGETS)).max() > 0.05
+
+
+def test_the_weight_is_computed_once_for_all_gears_in_a_step(monkeypatch):
+    calls, jacobians = [], loads.com_jacobians
+
+    def counted(*args):
+        at = jacobians(*args)
+        return lambda qpos: calls.append(len(qpos)) or at(qpos)
+
+    monkeypatch.setattr(loads, "com_jacobians", counted)
+    model = mujoco.MjModel.from_xml_string(ARM)
+    state = np.zeros((1, mujoco.mj_stateSize(model, FULL_PHYSICS)))
+    variations = Pipeline([LoadFriction(0.1, joints=joint) for joint in ("shoulder", "elbow")]).variations(model)
+    roll_out(ALONE, [model], [mujoco.MjData(model)], state, np.zeros((1, 3, 2)), 1, variations=variations)
+    assert calls == [1, 1, 1]
 
 
 def test_the_model_has_its_own_friction_again_after_a_rollout():
@@ -126,7 +142,7 @@ def test_play_moves_the_link_as_a_second_hinge_does():
 
 def test_play_begins_anew_where_time_does_not_go_on():
     model = mujoco.MjModel.from_xml_string(SERVO.format(play="", actuator=POSITION))
-    used, new = GearPlay(0.05).vary(model), GearPlay(0.05).vary(model)
+    (used,), (new,) = (Pipeline([GearPlay(0.05)]).variations(model) for _ in range(2))
 
     def after(variation, qvel, ctrl, time):
         states = States(np.zeros((1, 1)), np.array([[qvel]]), np.zeros((1, 0)), np.array([[ctrl]]), np.array([time]))

@@ -146,6 +146,24 @@ def test_every_world_can_have_effects_of_its_own():
         BatchedMujocoEnv(TASKS["HalfCheetah"](), WORLDS, [[Gravity(2.0)], []])
 
 
+def test_numbers_that_depend_on_the_state_are_those_of_each_world():
+    effects = [[LoadFriction(0.5)], [], [LoadFriction(0.1), GearPlay(0.02, (1,))]]
+    env = BatchedMujocoEnv(TASKS["HalfCheetah"](), len(effects), effects)
+    together, start = env.reset(), env.states.copy()
+    torch.manual_seed(0)
+    actions = 2.0 * torch.rand(6, 6) - 1.0
+    for action in actions:
+        together = env.step(together.set("action", action.expand(3, 6).clone()))["next"]
+    for world, own in enumerate(effects):
+        alone = BatchedMujocoEnv(TASKS["HalfCheetah"](), 1, own)
+        single = alone.reset()
+        alone.states[:] = start[world]
+        for action in actions:
+            single = alone.step(single.set("action", action[None].clone()))["next"]
+        torch.testing.assert_close(together["observation"][world], single["observation"][0], rtol=0.0, atol=1e-9)
+    assert not torch.equal(together["observation"][0], together["observation"][1])
+
+
 def test_noise_of_the_action_differs_from_world_to_world_and_is_seeded_by_torch():
     env = BatchedMujocoEnv(TransformedEnv(TASKS["HalfCheetah"](), dynamics_gap("joint_noise")), WORLDS)
 

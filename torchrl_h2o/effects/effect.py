@@ -342,13 +342,14 @@ class VaryingEffect(Effect):
     acts_last: ClassVar[bool] = False
 
     @abstractmethod
-    def vary(self, model: mujoco.MjModel) -> Variation:
+    def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         """Returns the variation for many states at once.
 
         It may remember what it has seen: it knows from the states' time whether they follow those of the last call.
 
         Args:
             model: the model in use; names are resolved once, in this call.
+            weight: torques of the weight on the degrees of freedom, which all effects on a model share.
 
         Raises:
             ValueError: if the model has no element that the effect could act on.

@@ -28,6 +28,7 @@ from torchrl_h2o.effects.effect import (
     VaryingEffect,
     checked_effects,
 )
+from torchrl_h2o.effects.gear.loads import Weight
 from torchrl_h2o.effects.model.compilation import compile_model, edit_spec
 from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation.sensor import ObservationDelay
@@ -131,7 +132,11 @@ class Pipeline:
 
     def variations(self, model: mujoco.MjModel) -> list[Variation]:
         """Returns how numbers of the model depend on the state, in the order in which they are applied."""
-        return [effect.vary(model) for effect in sorted(self.of_kind(VaryingEffect), key=lambda one: one.acts_last)]
+        effects = sorted(self.of_kind(VaryingEffect), key=lambda one: one.acts_last)
+        if not effects:
+            return []
+        weight = Weight(model).torques
+        return [effect.vary(model, weight) for effect in effects]
 
     # ---------------------------------------------------------------------------------------- step by step
     def begin(self, dt: float, rng: np.random.Generator | None = None, model: mujoco.MjModel | None = None) -> Episode:

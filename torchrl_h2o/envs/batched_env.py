@@ -156,9 +156,9 @@ class BatchedMujocoEnv(EnvBase):
             for force in pipeline.batched_forces(self._models[own[0]])
         ]
         self._variations = [
-            _variation_in_worlds(np.array(own), variation)
+            _variation_in_worlds(np.array(own), variations)
             for pipeline, own in worlds.items()
-            for variation in pipeline.variations(self._models[own[0]])
+            if (variations := pipeline.variations(self._models[own[0]]))
         ]
         if self._variations and len({id(model) for model in self._models}) < self.num_worlds:
             self._models = [copy(model) for model in self._models]  # the numbers of each world are written into it
@@ -308,18 +308,20 @@ def _in_worlds(worlds: np.ndarray, force: BatchedForce) -> BatchedForce:
     return forces
 
 
-def _variation_in_worlds(worlds: np.ndarray, variation: Variation) -> Variation:
-    """Restricts a variation to some worlds."""
+def _variation_in_worlds(worlds: np.ndarray, variations: Sequence[Variation]) -> Variation:
+    """The variations of some worlds as one of all worlds."""
+    fields = tuple(dict.fromkeys(field for variation in variations for field in variation.fields))
 
     def apply(states: States, values: dict[str, np.ndarray]) -> np.ndarray:
-        own = {field: value[worlds] for field, value in values.items()}
+        own, now = {field: values[field][worlds] for field in fields}, States(*(part[worlds] for part in states))
         force = np.zeros(states.qvel.shape)
-        force[worlds] = variation.apply(States(*(part[worlds] for part in states)), own)
-        for field in variation.fields:
+        for variation in variations:
+            force[worlds] += variation.apply(now, own)
+        for field in fields:
             values[field][worlds] = own[field]
         return force
 
-    return Variation(variation.fields, apply)
+    return Variation(fields, apply)
 
 
 def _of_each_world(

@@ -52,23 +52,66 @@ def spreads_of(
         found: errors of each part, see :func:`~torchrl_h2o.residuals.whitened.whitened`.
         slopes: derivatives of the errors by the variables, (N, p) for each part.
         white_at: simulates the whitened errors of all parts, (N,), at other values of the variables, (p,). It is called
-            for each log if they differ, because what is not linear in one value then shows in the others.
+            once for each log if the logs differ: far from the common values, the errors are not linear in the values.
     """
     count, logs, blocks, rows = 0, [], [], []
     for part, (white, inverse, share), slope in zip(parts, found, slopes, strict=True):
         block, log = block_of(part), part.record.measured.log
         logs.append(np.zeros(len(part.blocks), int) if log is None else log[part.blocks.first])
         blocks.append(count + block)
-        rows.append((slope * inverse[:, None], white, share))
+        rows.append((slope * inverse[:, None], share, white))
         count += len(part.blocks)
     log_of, block = np.concatenate(logs), np.concatenate(blocks)
-    scaled, white, shares = (np.concatenate(one) for one in zip(*rows, strict=True))
+    slope, share, white = (np.concatenate(one) for one in zip(*rows, strict=True))
+    errors, here = _Linear(slope, share, block, count), np.zeros(slope.shape[1])
+    half = CONFIDENCE * np.sqrt(errors.solved(np.ones(count, bool), here, white)[1])
+    names = np.unique(log_of)
+    solutions = [errors.solved(log_of == log, here, white) for log in names]
+    moves, variances = _each(solutions)
+    if (p_values(moves, variances) < LEVEL).any():
+        for index, begin in enumerate(np.where(moves**2 > variances, moves, 0.0)):
+            chosen = log_of == names[index]
+            with suppress(ValueError):  # the model does not take these values
+                nearer = white_at(begin)
+                if (share * (log_density(nearer) - log_density(white))) @ chosen[block] > 0.0:
+                    solutions[index] = errors.solved(chosen, begin, nearer)
+        moves, variances = _each(solutions)
+    between = half_widths_between(moves, variances)
+    return Spreads(half, between, tuple(names.tolist()), moves, np.sqrt(variances))
 
-    def solved(chosen: np.ndarray, begin: np.ndarray, white: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For some blocks alone, if the errors are linear about a move to begin with: the move to the best values, its
-        squared errors, and which values these blocks contain."""
-        own = chosen[block]
-        slope, error, share, move = scaled[own], white[own], shares[own], np.zeros(scaled.shape[1])
+
+_Solution = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """Whitened errors that are linear in the variables.
+
+    Args:
+        slope: their derivatives, (N, p).
+        share: shares of the errors in the score, (N).
+        block: index of the block of each error, (N).
+        count: number of blocks.
+    """
+
+    slope: np.ndarray
+    share: np.ndarray
+    block: np.ndarray
+    count: int
+
+    def solved(self, chosen: np.ndarray, begin: np.ndarray, white: np.ndarray) -> _Solution:
+        """The best values for some blocks alone.
+
+        Args:
+            chosen: which blocks count, (B).
+            begin: a move of the variables, (p,).
+            white: the errors there, (N).
+
+        Returns:
+            The move to the best values, its squared errors, and which values these blocks contain, each (p,).
+        """
+        own = chosen[self.block]
+        slope, error, share, move = self.slope[own], white[own], self.share[own], np.zeros(self.slope.shape[1])
         for _ in range(REWEIGHTED):
             weight = share * weights(error + slope @ move)
             curvature = slope.T @ (weight[:, None] * slope)
@@ -81,29 +124,13 @@ def spreads_of(
             move = move - bread @ (slope.T @ (weight * (error + slope @ move)))
         left = error + slope @ move
         bread = bread * excess_of_weights(left, share)
-        pulls = np.zeros((count, len(size)))
-        np.add.at(pulls, block[own], slope * (share * weights(left) * left)[:, None])
+        pulls = np.zeros((self.count, len(size)))
+        np.add.at(pulls, self.block[own], slope * (share * weights(left) * left)[:, None])
         spare = chosen.sum() / max(1, chosen.sum() - len(size))
         return begin + move, np.maximum(np.diag(bread @ pulls.T @ pulls @ bread) * spare, 0.0), is_known
 
-    here = np.zeros(scaled.shape[1])
-    half = CONFIDENCE * np.sqrt(solved(np.ones(count, bool), here, white)[1])
-    names = np.unique(log_of)
-    solutions = [solved(log_of == log, here, white) for log in names]
-    moves, variances = _each(solutions)
-    if (p_values(moves, variances) < LEVEL).any():
-        for index, begin in enumerate(np.where(moves**2 > variances, moves, 0.0)):
-            chosen = log_of == names[index]
-            with suppress(ValueError):  # the model does not take these values
-                nearer = white_at(begin)
-                if (shares * (log_density(nearer) - log_density(white))) @ chosen[block] > 0.0:
-                    solutions[index] = solved(chosen, begin, nearer)
-        moves, variances = _each(solutions)
-    between = half_widths_between(moves, variances)
-    return Spreads(half, between, tuple(names.tolist()), moves, np.sqrt(variances))
 
-
-def _each(solutions: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _each(solutions: Sequence[_Solution]) -> tuple[np.ndarray, np.ndarray]:
     """The moves of each log, and their squared errors, infinite where the log does not contain the value, (logs, p)."""
     moves, variances, is_known = map(np.stack, zip(*solutions, strict=True))
     return moves, np.where(is_known, variances, np.inf)

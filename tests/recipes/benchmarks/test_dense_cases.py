@@ -28,7 +28,7 @@ def rms(values):
 def test_the_truth_explains_the_log_of_a_chain_to_within_its_noise(number):
     """The library did not simulate the log; its physics steps are five times as long."""
     case = short(number)
-    simulation, (states, _) = case.simulation(), case.chain.record(ROWS, case.seed)
+    simulation, (states, _) = case.simulation(), case.machine.record(ROWS, case.seed)
     measured = Measured.from_ted(case.measure(), simulation)
     nothing, truth = (
         rms(residuals(simulation.with_effects(*effects), measured, np.arange(ROWS), states=states[:-1])[:, 0])
@@ -43,7 +43,7 @@ def test_the_truth_explains_the_log_of_a_chain_to_within_its_noise(number):
 @pytest.mark.parametrize("number", NUMBERS)
 def test_a_chain_moves_within_its_range_and_its_log_has_what_it_should(number):
     case = short(number)
-    count = len(case.chain.joints)
+    count = len(case.machine.joints)
     data = case.measure()
     assert 6 <= count <= 12
     assert data["observation"].shape == (ROWS, count if number == 1 else 2 * count)

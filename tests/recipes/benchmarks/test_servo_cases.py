@@ -19,14 +19,14 @@ NUMBERS = [1, 3, 4, *(pytest.param(number, marks=pytest.mark.slow) for number in
 def test_the_further_cause_explains_what_friction_and_rotors_leave(number):
     """The library did not simulate the log; its physics steps are ten times as long."""
     case = draw_case(FAMILIES, "servos", number, SEED)
-    simulation, (states, targets) = case.simulation(), case.arm.record(ROWS, case.seed)
+    simulation, (states, targets) = case.simulation(), case.machine.record(ROWS, case.seed)
     starts = np.arange(30, ROWS - AHEAD, 3)
 
     def error(effects):
         machine = simulation.with_effects(*effects)
         commands = machine.executed(targets)[starts[:, None] + np.arange(AHEAD)]
         ahead = machine.rollout(states[starts], commands)[:, -1] - states[starts + AHEAD]
-        return np.sqrt((ahead[:, : len(case.arm.servos)] ** 2).mean())
+        return np.sqrt((ahead[:, : len(case.machine.servos)] ** 2).mean())
 
     usual = [effect for effect in case.truth if isinstance(effect, USUAL)]
     assert len(usual) < len(case.truth)
@@ -39,7 +39,7 @@ def test_every_cause_is_drawn_and_a_control_has_none():
         case, plain = (draw_case(FAMILIES, family, number, SEED) for family in ("servos", "servo_controls"))
         assert plain.seed == case.seed
         assert all(isinstance(effect, USUAL) for effect in plain.truth)
-        assert [one.friction for one in plain.arm.servos] == [one.friction for one in case.arm.servos]
+        assert [one.friction for one in plain.machine.servos] == [one.friction for one in case.machine.servos]
 
 
 @pytest.mark.parametrize(

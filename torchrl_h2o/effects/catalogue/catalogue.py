@@ -81,7 +81,7 @@ def catalogue(
         *geom_entries(mechanism, spec),
         *force_entries(mechanism),
         *_servo_entries(mechanism, spec, dt),
-        *_action_entries(mechanism, dt),
+        *_action_entries(mechanism, spec, dt),
         *_observation_entries(num_observations, dt, tuple(velocities)),
     ]
     unchanged = saved_model(model)
@@ -137,7 +137,7 @@ def _where(applies: Callable[[mujoco.MjsActuator], bool], spec: mujoco.MjSpec) -
     return choices | ({None: chosen} if chosen else {})
 
 
-def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]:
+def _action_entries(mechanism: Mechanism, spec: mujoco.MjSpec, dt: float) -> Iterator[CatalogueEntry]:
     labels = [mechanism.actuator_label(i) for i in range(mechanism.model.nu)]
 
     def shares(parameter: str, *values: float) -> Callable[[tuple[int, ...]], Trials]:
@@ -159,9 +159,12 @@ def _action_entries(mechanism: Mechanism, dt: float) -> Iterator[CatalogueEntry]
         lambda _: each("scale", *FACTORS),
     )
     yield from entries_of(ActionBias, "actuators", singles, shares("bias", 0.1, -0.1))
-    yield from entries_of(ActionDeadBand, "actuators", single_and_all, shares("width", 0.03, 0.15))
+    # of a position servo, these are ServoDeadBand and GearPlay
+    servos = {index for index, actuator in enumerate(spec.actuators) if is_servo(actuator)}
+    of_motors = {chosen: own for chosen, own in single_and_all.items() if not servos & set(own)}
+    yield from entries_of(ActionDeadBand, "actuators", of_motors, shares("width", 0.03, 0.15))
     yield from entries_of(ActionSaturation, "actuators", single_and_all, shares("limit", 0.4, 0.8))
-    yield from entries_of(ActionBacklash, "actuators", single_and_all, shares("width", 0.1, 0.4))
+    yield from entries_of(ActionBacklash, "actuators", of_motors, shares("width", 0.1, 0.4))
     yield from entries_of(ActionLag, "actuators", single_and_all, times("time_constant", 0.3, 1.0, 2.0))
     yield from entries_of(ActionDelay, "actuators", single_and_all, times("delay", 0.3, 1.0, 2.0, 3.0))
     yield from entries_of(ActionNoise, "actuators", indexed_choices(labels, singles=False), shares("std", 0.1, 0.5))

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchrl_h2o.effects import selection
 from torchrl_h2o.effects.effect import NO_NAMES, BatchedForce, EntryNames, States, Variation, VaryingEffect
-from torchrl_h2o.effects.gear.loads import JointActuators, Weight
+from torchrl_h2o.effects.gear.loads import JointActuators
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, parameter
 from torchrl_h2o.effects.selection import Names
 
@@ -49,8 +49,8 @@ class LoadFriction(VaryingEffect):
     def describe(self, names: EntryNames = NO_NAMES) -> str:
         return super().describe(names) + _details(self)
 
-    def vary(self, model: mujoco.MjModel) -> Variation:
-        load = _load(model, self.joints, self.weight)
+    def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
+        load = _load(model, self.joints, self.weight, weight)
         return _added(lambda states: self.share * load(states))
 
 
@@ -93,9 +93,9 @@ class StribeckFriction(VaryingEffect):
     def describe(self, names: EntryNames = NO_NAMES) -> str:
         return super().describe(names) + _details(self)
 
-    def vary(self, model: mujoco.MjModel) -> Variation:
+    def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         chosen = _mask(model, self.joints)
-        load = _load(model, self.joints, self.weight) if self.share else None
+        load = _load(model, self.joints, self.weight, weight) if self.share else None
 
         def friction(states: States) -> np.ndarray:
             at_rest = np.exp(-(np.abs(states.qvel / self.speed) ** self.exponent))
@@ -127,14 +127,14 @@ def _mask(model: mujoco.MjModel, joints: Names) -> np.ndarray:
     return mask
 
 
-def _load(model: mujoco.MjModel, joints: Names, share_of_weight: float) -> BatchedForce:
+def _load(model: mujoco.MjModel, joints: Names, share_of_weight: float, weight: BatchedForce) -> BatchedForce:
     """The load on the gears of joints as a function of states, (B, nv); 0 for other joints."""
-    chosen, actuators, weight = _mask(model, joints), JointActuators.on(model, joints), Weight(model)
+    chosen, actuators = _mask(model, joints), JointActuators.on(model, joints)
 
     def load(states: States) -> np.ndarray:
         torque = actuators.torques(states)
         if share_of_weight:
-            torque = torque - share_of_weight * weight.torques(states)
+            torque = torque - share_of_weight * weight(states)
         return chosen * np.abs(torque)
 
     return load

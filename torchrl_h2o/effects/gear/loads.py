@@ -99,7 +99,7 @@ def _limits(limited: np.ndarray, ends: np.ndarray) -> np.ndarray:
 
 
 class Weight:
-    """Torques of the weight of all bodies on the degrees of freedom.
+    """Torques of the weight of all bodies on the degrees of freedom, computed once for the same states.
 
     Args:
         model: the model.
@@ -110,7 +110,12 @@ class Weight:
         self._jacobians = com_jacobians(model, heavy)
         carried = model.body_mass[heavy] * (1.0 - model.body_gravcomp[heavy])
         self._forces = carried[:, None] * model.opt.gravity
+        self._last: tuple[States | None, np.ndarray] = None, np.empty(0)
 
     def torques(self, states: States) -> np.ndarray:
         """The torques, (B, nv): at rest, minus ``mjData.qfrc_bias``."""
-        return np.einsum("bicv,ic->bv", self._jacobians(states.qpos), self._forces)
+        seen, torques = self._last
+        if seen is not states:
+            torques = np.einsum("bicv,ic->bv", self._jacobians(states.qpos), self._forces)
+            self._last = states, torques
+        return torques

@@ -8,8 +8,8 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import States, Variation, VaryingEffect
-from torchrl_h2o.effects.gear.loads import JointActuators, Weight
+from torchrl_h2o.effects.effect import BatchedForce, States, Variation, VaryingEffect
+from torchrl_h2o.effects.gear.loads import JointActuators
 from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Indices
 
@@ -26,8 +26,8 @@ class GearPlay(VaryingEffect):
     When the torque on the teeth would change its sign, they part: the link moves without motor, rotor and friction, and
     the rotor crosses the play before it pushes the link again. Armature, friction and damping of the joint belong to
     the rotor. A model without armature gets a rotor of a twentieth of the inertia that the joint moves, for the time of
-    the crossing. A simulation starts with the teeth in contact, on the side on which motor,
-    weight and inertia press them.
+    the crossing. A simulation starts with the teeth in contact, on the side on which motor, weight and inertia press
+    them.
 
     Args:
         width: the angle that the link can turn while the motor rests, in rad.
@@ -49,9 +49,9 @@ class GearPlay(VaryingEffect):
     width: float = parameter(unit="rad", bounds=(0.0, 1.0), neutral=0.0)
     actuators: Indices = None
 
-    def vary(self, model: mujoco.MjModel) -> Variation:
+    def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         motors, step, half = JointActuators(model, self.actuators), model.opt.timestep, 0.5 * self.width
-        dofs, weight = motors.dofs, Weight(model)
+        dofs = motors.dofs
         crossing = np.where(model.dof_armature[dofs] > 0.0, model.dof_armature[dofs], _ROTOR * model.dof_M0[dofs])
         teeth: _Teeth | None = None
 
@@ -69,7 +69,7 @@ class GearPlay(VaryingEffect):
             begins = ~np.isclose(states.time - teeth.time, step)
             pushing = torque - losses(velocity)
             if begins.any():
-                acceleration = (pushing + weight.torques(states)[:, dofs]) / model.dof_M0[dofs]
+                acceleration = (pushing + weight(states)[:, dofs]) / model.dof_M0[dofs]
                 teeth.side[begins] = np.where(pushing >= armature * acceleration, 1.0, -1.0)[begins]
                 teeth.link[begins] = velocity[begins]
             on_teeth = pushing - armature * np.nan_to_num(velocity - teeth.link) / step

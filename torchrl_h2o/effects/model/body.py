@@ -1,5 +1,6 @@
 """Effects on bodies: mass, inertia, centre of mass and payload."""
 
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -50,8 +51,23 @@ class BodyMass(ModelEffect):
             spec.compiler.settotalmass *= compile_unscaled(spec).body_mass.sum() / before
 
 
+class _OnInertials(ModelEffect):
+    """An effect on the inertials of bodies, which afterwards no longer follow from their geoms."""
+
+    bodies: Names
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        bodies = selection.bodies(spec, self.bodies)
+        if not self.is_neutral:
+            edit_inertials(spec, bodies, self._changed)
+
+    @abstractmethod
+    def _changed(self, body: Inertial) -> Inertial:
+        """The inertial with the effect."""
+
+
 @dataclass(frozen=True)
-class BodyInertia(ModelEffect):
+class BodyInertia(_OnInertials):
     """Scales the rotational inertia of bodies at constant mass.
 
     Afterwards the bodies' masses and inertias no longer follow from their geoms, so effects on geoms must come first.
@@ -72,14 +88,12 @@ class BodyInertia(ModelEffect):
     scale: float = parameter(unit="1", bounds=(0.01, 100.0), neutral=1.0)
     bodies: Names = "*"
 
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        bodies = selection.bodies(spec, self.bodies)
-        if not self.is_neutral:
-            edit_inertials(spec, bodies, lambda old: replace(old, inertia=self.scale * old.inertia))
+    def _changed(self, body: Inertial) -> Inertial:
+        return replace(body, inertia=self.scale * body.inertia)
 
 
 @dataclass(frozen=True)
-class BodyCentreOfMass(ModelEffect):
+class BodyCentreOfMass(_OnInertials):
     """Shifts the centre of mass of bodies; mass and inertia about the centre stay the same.
 
     Afterwards the bodies' masses and inertias no longer follow from their geoms, so effects on geoms must come first.
@@ -104,11 +118,8 @@ class BodyCentreOfMass(ModelEffect):
     y: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
     bodies: Names = "*"
 
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        bodies = selection.bodies(spec, self.bodies)
-        if not self.is_neutral:
-            shift = np.array([self.x, self.y, self.z])
-            edit_inertials(spec, bodies, lambda old: replace(old, centre=old.centre + shift))
+    def _changed(self, body: Inertial) -> Inertial:
+        return replace(body, centre=body.centre + np.array([self.x, self.y, self.z]))
 
 
 @dataclass(frozen=True)
@@ -150,7 +161,7 @@ class Payload(ModelEffect):
 
 
 @dataclass(frozen=True)
-class PseudoInertia(ModelEffect):
+class PseudoInertia(_OnInertials):
     r"""Changes the ten inertial parameters of bodies in a way that stays physically possible.
 
     The mass distribution is deformed: a point at :math:`p` from the centre of mass moves to :math:`A p + t`, with
@@ -198,12 +209,7 @@ class PseudoInertia(ModelEffect):
     t3: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)
     bodies: Names = "*"
 
-    def edit(self, spec: mujoco.MjSpec) -> None:
-        bodies = selection.bodies(spec, self.bodies)
-        if not self.is_neutral:
-            edit_inertials(spec, bodies, self._deformed)
-
-    def _deformed(self, body: Inertial) -> Inertial:
+    def _changed(self, body: Inertial) -> Inertial:
         stretch = np.diag(np.exp([self.d1, self.d2, self.d3]))
         stretch[np.triu_indices(3, 1)] = self.s12, self.s13, self.s23
         density = np.exp(2.0 * self.alpha)

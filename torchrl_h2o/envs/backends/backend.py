@@ -168,9 +168,9 @@ class MujocoBackend(ABC):
             mujoco.mj_comVel(model, data)
             others = data.qfrc_applied.copy()
             data.qfrc_applied += sum(force(data) for force in forces)
-            values = {field: value[None].copy() for field, value in own.items()}
+            values, now = {field: value[None].copy() for field, value in own.items()}, States.of(data)
             for variation in variations:
-                data.qfrc_applied += np.ravel(variation.apply(States.of(data), values))
+                data.qfrc_applied += np.ravel(variation.apply(now, values))
             for field, place in places.items():
                 place[:] = values[field][0]
             step()

@@ -15,6 +15,7 @@ import jinja2
 import mujoco
 import numpy as np
 
+from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.report.ranges import EffectRange, FieldRange, effect_ranges, model_ranges
 from torchrl_h2o.residuals.report.servo_files import bam_files, delay_of, driven_joints, pace_files
@@ -140,12 +141,7 @@ def _masses(fields: Sequence[FieldRange]) -> dict[str, FieldRange]:
 
 def _joints(model: mujoco.MjModel) -> dict[str, int]:
     """The degree of freedom of each hinge and slide, by its name."""
-    kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    return {
-        model.joint(i).name or f"joint {i}": int(model.jnt_dofadr[i])
-        for i in range(model.njnt)
-        if mujoco.mjtJoint(model.jnt_type[i]) in kinds
-    }
+    return {model.joint(i).name or f"joint {i}": int(model.jnt_dofadr[i]) for i in Mechanism(model).single_joints}
 
 
 def _rest(fields: Sequence[FieldRange], outside: Sequence[EffectRange]) -> list[str]:

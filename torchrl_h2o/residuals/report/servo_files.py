@@ -19,22 +19,23 @@ from torchrl_h2o.effects import (
     StribeckFriction,
     selection,
 )
+from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.residuals.report.contents import ReportContents
 from torchrl_h2o.residuals.simulation.simulation import Simulation
-
-_SINGLE = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def driven_joints(model: mujoco.MjModel) -> dict[str, tuple[int, tuple[int, ...]]]:
     """The degree of freedom and the actuators of each hinge and slide that actuators drive, by the joint's name."""
-    found: dict[str, tuple[int, tuple[int, ...]]] = {}
-    on_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-    for dof in range(model.nv):
-        joint = int(model.dof_jntid[dof])
-        own = tuple(np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint)).tolist())
-        if own and model.jnt_type[joint] in _SINGLE:
-            found[model.joint(joint).name or f"joint {joint}"] = (dof, own)
-    return found
+    mechanism = Mechanism(model)
+    driven = [mechanism.joint_of(actuator) for actuator in range(model.nu)]
+    return {
+        model.joint(joint).name or f"joint {joint}": (
+            int(model.jnt_dofadr[joint]),
+            tuple(actuator for actuator, own in enumerate(driven) if own == joint),
+        )
+        for joint in mechanism.single_joints
+        if joint in driven
+    }
 
 
 def delay_of(effects: Sequence[Effect], actuators: Sequence[int]) -> float:
@@ -69,7 +70,6 @@ def _bam(effects: Sequence[Effect], model: mujoco.MjModel, dof: int) -> dict[str
     load = [one for one in gears if isinstance(one, LoadFriction)]
     rest = [one for one in gears if isinstance(one, StribeckFriction)]
     values: dict[str, float | str] = {
-        "model": "m1",
         "actuator": "",
         "armature": float(model.dof_armature[dof]),
         "friction_base": float(model.dof_frictionloss[dof]),

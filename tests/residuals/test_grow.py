@@ -1,0 +1,184 @@
+"""How a search chooses: what a candidate is estimated to gain, which sets are tried, and which of them is better."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from torchrl_h2o.effects import (
+    ActionBias,
+    ActionDelay,
+    ActionGain,
+    Armature,
+    BodyMass,
+    Gravity,
+    JointDamping,
+    JointForce,
+    JointFrictionLoss,
+    Payload,
+    ResidualForce,
+)
+from torchrl_h2o.effects.catalogue.entry import entry_of
+from torchrl_h2o.residuals.gains import Gains
+from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
+from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
+from torchrl_h2o.residuals.sweep import Direction, sweep
+from torchrl_h2o.residuals.whitened import flat
+
+SIMULATION = double_pendulum()
+KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
+CATALOGUE = [entry for entry in SIMULATION.catalogue() if isinstance(entry.effect, KINDS)]
+EACH_JOINT = (
+    *(JointFrictionLoss(0.03, "shoulder"), JointFrictionLoss(0.01, "elbow")),
+    *(JointDamping(0.02, "shoulder"), JointDamping(0.006, "elbow")),
+    *(Armature(0.01, "shoulder"), Armature(0.002, "elbow")),
+)
+
+
+def test_with_noisy_commands_an_effect_must_predict_the_next_row_with_the_expected_and_the_logged_ones():
+    ground = Ground.of(SIMULATION, recorded(SIMULATION, 800, noise=1e-4))
+    blocks = np.arange(ground.num_fit + len(ground.base.selection.blocks)) % 7
+    row = blocks[ground.num_fit :]
+    friction, worse, better = entry_of(JointFrictionLoss(0.1), CATALOGUE), row - 1.0, 5.0 + 1.1 * row
+    less = Found((), (), 0.01 * blocks, (row, row), is_noise=True)
+    more = Found((friction,), (JointFrictionLoss(0.1),), 5.0 + 0.1 * blocks, (better, better))
+    assert ground.adds(more, less)
+    assert not ground.adds(replace(more, one_step=(better, worse)), less)
+    assert not ground.adds(replace(more, one_step=(worse, better)), less)
+    assert ground.adds(replace(more, one_step=(worse, worse)), replace(less, is_noise=False))
+
+
+def test_rows_for_selection_must_agree_with_the_evidence_of_all_rows_but_need_not_suffice_alone():
+    ground = Ground.of(SIMULATION, recorded(SIMULATION, 800, noise=1e-4))
+    less = ground.found((), ())
+    friction = JointFrictionLoss(0.1, "elbow")
+    scatter = 2.0 * np.random.default_rng(0).standard_normal(len(less.scores))
+
+    def adds(in_fit, in_selection):
+        gain = scatter + np.where(np.arange(len(scatter)) < ground.num_fit, in_fit, in_selection)
+        more = replace(less, entries=(entry_of(friction, CATALOGUE),), effects=(friction,), scores=less.scores + gain)
+        return ground.adds(more, replace(less, is_noise=False))
+
+    assert adds(2.0, 1.0)
+    assert not adds(2.0, -1.0)
+    assert not adds(0.2, 0.2)
+
+
+def test_a_far_factor_is_simulated_for_itself():
+    entries = [one for one in SIMULATION.catalogue() if one.name in ("LinkLength upper", "BodyMass upper")]
+    directions = sweep(Ground.of(SIMULATION, recorded(SIMULATION, 400)).rough(()), entries)
+    trials = {(one.entry.name, one.trial["scale"]): one.shares for one in directions}
+    assert trials.keys() == {("BodyMass upper", 0.8), *(("LinkLength upper", scale) for scale in (0.05, 0.4, 0.8))}
+    assert min(trials["LinkLength upper", 0.8]) < 0.0 == min(trials["LinkLength upper", 0.05])
+
+
+def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_them():
+    ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(*EACH_JOINT), 1200, noise=0.01))
+    friction = JointFrictionLoss(EACH_JOINT[0].torque, "shoulder")
+    less = ground.found((entry_of(friction, CATALOGUE),), (friction,))
+    entries = [entry for entry in CATALOGUE if getattr(entry.effect, "joints", None) in ("shoulder", "elbow")]
+    candidates = Candidates.of(ground, less, sweep(ground.rough(less.effects), entries, less.effects))
+    together = max(with_one_more(ground, candidates), key=lambda one: len(one.entries))
+    refused = together.names - less.names
+    assert len(refused) > 2
+    assert refused not in [one.names - less.names for one in with_one_more(ground, candidates, [refused])]
+
+
+def test_of_sets_that_explain_equally_well_the_one_of_all_joints_is_taken():
+    of_all, of_one = (
+        Found((entry_of(effect, CATALOGUE),), (effect,), scores)
+        for effect, scores in (
+            (JointFrictionLoss(0.1), np.array([1.0, 2.0, 3.0, 4.0, 5.0])),
+            (JointFrictionLoss(0.1, "elbow"), np.array([1.2, 2.3, 2.9, 4.1, 5.0])),
+        )
+    )
+    assert most_usual([of_one, of_all]) is of_all
+    assert is_preferred(of_all, of_one)
+
+
+def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():
+    simulation = SIMULATION.quick
+    measured = recorded(simulation.with_effects(Gravity(0.5), ActionGain(1.4, (1,))), 800)
+    ground = Ground.of(simulation, measured)
+    rough = ground.rough(())
+    (direction,) = sweep(rough, [entry for entry in CATALOGUE if isinstance(entry.effect, Gravity)])
+    (lead,) = gains_beside(rough, ground.found((), ())).leads([direction])
+    gravity = direction.effect(lead.shares[0])
+    assert gravity.scale == pytest.approx(0.5, abs=0.01)
+    assert lead.gain == pytest.approx(rough.score([gravity]) - rough.score(), rel=0.1)
+
+
+def test_a_lead_that_acts_in_few_blocks_counts_though_its_estimate_is_inexact():
+    """The other blocks have hardly any error, and lose by the variance that the errors of the estimate ask for."""
+    size, rng = 400, np.random.default_rng(0)
+    block, change = np.repeat(np.arange(20), size // 20), np.where(np.arange(size) < 100, 1e4, 0.0)
+    change *= rng.standard_normal(size)
+    ones, none = np.ones(size), np.zeros((size, 0))
+    entry = SIMULATION.catalogue()[0]
+    white = -change * (1.0 + 0.01 * rng.standard_normal(size)) + 1e-3 * rng.standard_normal(size)
+    (lead,) = Gains(white, ones, ones, none, block, np.zeros(size, int), ones).leads(
+        [Direction(entry, entry.trials[-1], change)]
+    )
+    assert lead.evidence > 3.0
+
+
+def test_two_candidates_are_tried_together_that_explain_little_one_by_one():
+    size, rng = 400, np.random.default_rng(0)
+    common, apart, other = rng.standard_normal((3, size))
+    pair = [common + 0.1 * apart, common - 0.1 * apart]
+    alike = [other + 0.5 * rng.standard_normal(size) for _ in range(12)]  # 66 pairs, more than are looked at closely
+    entries = SIMULATION.catalogue()
+    directions = [Direction(one, one.trials[-1], change) for one, change in zip(entries, pair + alike, strict=False)]
+    block, group = np.repeat(np.arange(20), size // 20), np.zeros(size, int)
+    ones, none = np.ones(size), np.zeros((size, 0))
+    gains = Gains(5.0 * (pair[1] - pair[0]) + 0.4 * other, ones, ones, none, block, group, ones)
+    leads = gains.leads(directions)
+    best, *_ = gains.pairs(leads)
+    assert not leads[0].names & best.names
+    assert best.names == {one.name for one in entries[:2]}
+    assert best.gain > 2.0 * leads[0].gain
+
+
+def test_the_present_values_are_readjusted_to_a_candidate_before_it_is_simulated():
+    """Damping that was fitted in the place of a gravity is too large beside this gravity."""
+    measured = recorded(SIMULATION.with_effects(Gravity(0.7), JointDamping(0.02, "elbow")), 1200, noise=0.001)
+    ground, entry = Ground.of(SIMULATION, measured), entry_of(JointDamping(0.02, "elbow"), CATALOGUE)
+    less = ground.fitted([entry], [JointDamping(0.02, "elbow")])
+    directions = sweep(ground.rough(less.effects), [e for e in CATALOGUE if e.name == "Gravity"], less.effects)
+    candidates = Candidates.of(ground, less, directions)
+    (lead,) = candidates.leads
+    moved, *_, alone = (effects for _, effects in candidates.sizes(lead))
+    assert moved[0] != alone[0] == less.effects[0]
+    assert candidates.rough.score(moved) > candidates.rough.score(alone)
+
+
+def test_derivatives_are_those_of_euler_steps_where_the_model_has_four_evaluations_a_step():
+    measured = recorded(SIMULATION.with_effects(Gravity(0.9)), 800)
+    rough = Ground.of(SIMULATION, measured).rough(())
+    (direction,) = sweep(rough, [entry for entry in CATALOGUE if isinstance(entry.effect, Gravity)])
+    exact = flat(rough.errors([direction.effect(1.0)])) - flat(rough.errors())
+    assert 0.001 < np.median(np.abs(direction.change - exact)) / np.median(np.abs(exact)) < 0.1
+    one = pendulum()
+    assert one.quick is one
+
+
+def test_of_sets_that_explain_the_data_equally_the_one_with_fewer_values_is_taken():
+    """A payload with its place has two values more than a mass, and takes up what other missing effects cause."""
+    catalogue, scores = double_pendulum().catalogue(), np.random.default_rng(0).normal(size=20)
+    mass, payload = (
+        next(entry for entry in catalogue if type(entry.effect) is kind and len(entry.fitted) == values)
+        for kind, values in ((BodyMass, 1), (Payload, 3))
+    )
+    sets = [Found((entry,), (entry.starts[0],), scores + better) for entry, better in ((mass, 0.0), (payload, 1e-3))]
+    assert sets[1].surprise == sets[0].surprise + 2
+    assert most_usual(sets) is sets[0]
+
+
+def test_the_most_unusual_of_a_kind_counts_and_each_term_of_a_force():
+    assert surprise_of([JointFrictionLoss(0.1, "shoulder"), ActionBias(0.1)]) == 0
+    assert surprise_of([BodyMass(1.1, "upper"), BodyMass(1.2, "lower")]) == surprise_of([BodyMass(1.1, "upper")]) == 1
+    one, two = (JointForce(0.1, "shoulder"),), (JointForce(0.1, "shoulder"), JointForce(0.2, "elbow"))
+    assert surprise_of(two) == 2 * surprise_of(one)  # joints have friction in common, but not forces
+    one, two = (ResidualForce(("torque on elbow: 0.1 · t",) * n) for n in (1, 2))
+    assert 0 < surprise_of([one]) < surprise_of([two])
