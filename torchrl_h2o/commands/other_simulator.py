@@ -112,9 +112,10 @@ def matched(own: Sequence[Actuator], other: Sequence[Actuator], path: Path, like
             f"{', '.join(wanted) or 'none'}; give them the same names"
         )
     order = [labels.index(name) for name in wanted]
-    for mine, its in zip([own[index] for index in order], other, strict=True):
-        if mine.kind != its.kind:
-            raise ValueError(f"{mine.name} is a {mine.kind} in {path} and a {its.kind} in {like}; make them alike")
+    for index, wanted_one in zip(order, other, strict=True):
+        if own[index].kind != wanted_one.kind:
+            kinds = f"a {own[index].kind} in {path} and a {wanted_one.kind} in {like}"
+            raise ValueError(f"{own[index].name} is {kinds}; make them alike")
     return order
 
 
