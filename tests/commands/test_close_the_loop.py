@@ -29,7 +29,7 @@ from torchrl_h2o.commands.close_the_loop import (
 from torchrl_h2o.commands.recording import Recording, read_recording
 from torchrl_h2o.data import LogColumns, write_ted
 from torchrl_h2o.data.readers.ted import to_ted
-from torchrl_h2o.effects import Gravity, JointDamping, JointForce
+from torchrl_h2o.effects import Gravity, JointDamping, JointForce, LoadFriction
 from torchrl_h2o.envs import WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
@@ -261,6 +261,14 @@ def test_what_is_printed_is_short_and_has_units(capsys, tmp_path):
         assert part in printed
     assert "gap_fix=" in printed
     assert len(printed.splitlines()) < 20
+
+
+def test_values_that_no_fit_changed_are_not_printed(capsys):
+    found = FoundEffect(LoadFriction(0.31, joints="knee"), True, {"share": (0.28, 0.34)}, 0.1)
+    print_result(dataclasses.replace(report(Gravity(0.5)), found=(found,)))
+    printed = capsys.readouterr().out
+    assert "0.28 to 0.34" in printed
+    assert "nan" not in printed
 
 
 def test_units_and_effects_that_the_model_s_file_lacks_are_printed(capsys, tmp_path):

@@ -10,21 +10,30 @@ import pytest
 from tests.effects.models import ASSETS, as_bytes, spec
 from torchrl_h2o import envs
 from torchrl_h2o.effects import (
+    ActionBacklash,
+    ActionDeadBand,
     ActionGain,
+    ActionLead,
     ActuatorTimeConstant,
     BodyMass,
     CatalogueEntry,
     ForceEffect,
+    GearPlay,
     GeomFriction,
     GeomSize,
     Gravity,
     JointRange,
     JointStiffness,
+    LoadFriction,
     ModelEffect,
     ObservationDelay,
     ObservationGain,
     Payload,
+    ServoDamping,
+    ServoDeadBand,
     ServoStiffness,
+    StribeckFriction,
+    TorqueSpeedLine,
     catalogue,
     compile_model,
     paper_gap,
@@ -235,6 +244,29 @@ def test_servos_may_be_stiffer_or_weaker():
     assert stiffness('<motor joint="a"/>') == []
     assert offered(servos, ActuatorTimeConstant) == []
     assert offered(servos.replace('kp="9"', 'kp="9" timeconst="0.1"'), ActuatorTimeConstant) == [(0,), (1,), None]
+
+
+def test_position_servos_have_gears_and_no_dead_band_of_their_commands():
+    arm = """<mujoco><worldbody><body><joint name="a"/><geom size=".1" pos=".1 0 0"/><body><joint name="b"/>
+      <geom size=".1"/></body></body></worldbody><actuator>{}</actuator></mujoco>"""
+    servo, motor = '<position joint="a" kp="9"/>', '<motor joint="b"/>'
+
+    def offered(actuators):
+        found = {}
+        for entry in catalogue(mujoco.MjSpec.from_string(arm.format(actuators)), num_observations=0, dt=0.01):
+            effect = entry.effect
+            found.setdefault(type(effect), []).append(getattr(effect, "actuators", None))
+        return found
+
+    of_servo = (ActionLead, ServoDeadBand, GearPlay, TorqueSpeedLine)
+    alone, both, motors = offered(servo), offered(servo + motor), offered(motor)
+    assert all(alone[kind] == [None] and both[kind] == [(0,)] and kind not in motors for kind in of_servo)
+    assert ActionDeadBand not in alone
+    assert both[ActionDeadBand] == both[ActionBacklash] == [(1,)]
+    assert motors[ActionDeadBand] == [None]
+    assert {LoadFriction, StribeckFriction} <= both.keys() - motors.keys()
+    assert ServoDamping not in alone
+    assert offered(servo.replace("/>", ' forcerange="-1 1"/>'))[ServoDamping] == [None]
 
 
 def test_velocities_may_be_late_together():

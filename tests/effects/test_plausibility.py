@@ -9,7 +9,9 @@ from torchrl_h2o.effects import (
     Armature,
     BodyMass,
     JointFrictionLoss,
+    LoadFriction,
     ObservationDelay,
+    StribeckFriction,
 )
 from torchrl_h2o.effects.catalogue.plausibility import surprise
 
@@ -18,6 +20,8 @@ from torchrl_h2o.effects.catalogue.plausibility import surprise
     ("usual", "unusual"),
     [
         (JointFrictionLoss(0.1), BodyMass(1.2)),
+        (LoadFriction(0.1), BodyMass(1.2)),
+        (StribeckFriction(0.1), BodyMass(1.2)),
         (JointFrictionLoss(0.1), JointFrictionLoss(-0.1)),
         (ActionGain(0.8), ActionGain(0.3)),
         (Armature(0.01), ActionGain(0.8)),

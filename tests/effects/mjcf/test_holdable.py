@@ -14,6 +14,7 @@ from torchrl_h2o.effects import (
     ActionSaturation,
     JointDamping,
     JointForce,
+    LoadFriction,
     ObservationNoise,
     Pipeline,
     ResidualForce,
@@ -127,6 +128,7 @@ def test_a_force_that_reads_the_controls_keeps_the_gain_out():
 
 def test_every_effect_that_is_left_out_has_a_reason_and_neutral_ones_are_none():
     effects = [JointDamping(0.1), ActionDelay(), JointForce(0.2), ObservationNoise(0.1), ActionNoise(0.2), ActionLag(1)]
+    effects += [LoadFriction(0.1), LoadFriction(0.0)]
     left = put_into_spec(spec(LIMITED), effects)
-    assert [one.effect for one in left] == [effects[i] for i in (2, 3, 4, 5)]
-    assert len({one.reason for one in left}) == 4
+    assert [one.effect for one in left] == [effects[i] for i in (2, 3, 4, 5, 6)]
+    assert len({one.reason for one in left}) == 5

@@ -103,7 +103,11 @@ def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec, dt: float) -> Iter
     yield from entries_of(
         ActuatorTimeConstant, "actuators", _where(is_filter, spec), lambda _: each("scale", 0.1, *FACTORS, 4.0)
     )
-    servos = _where(lambda one: is_servo(one) and mechanism.joint_of(one.id) is not None, spec)
+    servos = {
+        # unlike a stiffness, what follows would act on motors, too
+        own if chosen is None and len(own) < len(spec.actuators) else chosen: own
+        for chosen, own in _where(lambda one: is_servo(one) and mechanism.joint_of(one.id) is not None, spec).items()
+    }
     yield from entries_of(ActionLead, "actuators", servos, lambda _: each("time", 0.3 * dt, dt, 3.0 * dt))
     yield from entries_of(ServoDeadBand, "actuators", servos, lambda _: each("width", 0.005, 0.02, 0.05))
     yield from entries_of(GearPlay, "actuators", servos, lambda _: each("width", 0.005, 0.02, 0.05))
