@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from torchrl.envs import GymEnv, TransformedEnv
 
-from tests.residuals.pendulum import UnknownForce, pendulum
+from tests.residuals.pendulum import UnknownForce, double_pendulum, pendulum
 from torchrl_h2o.effects import (
     ActionDelay,
     ActionNoise,
@@ -16,6 +16,7 @@ from torchrl_h2o.effects import (
     Gravity,
     JointDamping,
     LinearDrag,
+    LoadFriction,
     ObservationBias,
     ObservationDelay,
     ObservationGain,
@@ -196,3 +197,13 @@ def test_the_catalogue_is_that_of_the_model_with_its_effects():
 
 def mended(*effects):
     return pendulum().with_effects(*effects)
+
+
+def test_friction_that_depends_on_the_state_is_that_of_each_of_many_states():
+    simulation, rng = double_pendulum().with_effects(LoadFriction(0.3, joints="elbow")), np.random.default_rng(0)
+    states, actions = rng.normal(size=(300, 4)), 0.2 * rng.normal(size=(300, 2, 2))
+    together = simulation.rollout(states, actions)
+    for index in (0, 127, 128, 299):
+        alone = simulation.rollout(states[index : index + 1], actions[index : index + 1])
+        np.testing.assert_allclose(together[index], alone[0], atol=1e-12)
+    assert np.abs(together - double_pendulum().rollout(states, actions)).max() > 1e-3

@@ -132,3 +132,4 @@ def test_every_effect_that_is_left_out_has_a_reason_and_neutral_ones_are_none():
     left = put_into_spec(spec(LIMITED), effects)
     assert [one.effect for one in left] == [effects[i] for i in (2, 3, 4, 5, 6)]
     assert len({one.reason for one in left}) == 5
+    assert left[-1].reason == "it changes numbers of the model at every physics step"

@@ -47,8 +47,8 @@ class JointActuators:
                     "command, position and velocity; choose motors and servos on hinges or slides"
                 )
         joints = model.actuator_trnid[own, 0]
-        self.indices, self.dofs, self.gear = own, model.jnt_dofadr[joints], model.actuator_gear[own, 0].copy()
-        self._positions, self._activations = model.jnt_qposadr[joints], model.actuator_actadr[own].copy()
+        self.indices, self.dofs, self.gear = own, model.jnt_dofadr[joints], model.actuator_gear[own, 0]
+        self._positions, self._activations = model.jnt_qposadr[joints], model.actuator_actadr[own]
         gain, bias = model.actuator_gainprm[own, :3], model.actuator_biasprm[own, :3]
         self._gain = np.where(model.actuator_gaintype[own, None] == _GAINS[1], gain, gain * [1.0, 0.0, 0.0])
         self._bias = np.where(model.actuator_biastype[own, None] == _BIASES[1], bias, 0.0)
