@@ -155,3 +155,41 @@ def test_play_begins_anew_where_time_does_not_go_on():
     after(used, 1.0, 1.0, 0.0)
     assert after(used, 1.0, -1.0, 0.001) == 0.0  # the teeth part, and the link moves without rotor
     assert after(used, 0.0, 1.0, 5.0) == after(new, 0.0, 1.0, 5.0) == 0.002
+
+
+def test_a_link_that_falls_on_a_motor_at_rest_keeps_the_teeth_in_contact():
+    model = mujoco.MjModel.from_xml_string(SERVO.format(play="", actuator=MOTOR))
+    (variation,) = Pipeline([GearPlay(0.05)]).variations(model)
+    raised = States(np.array([[1.0]]), np.array([[0.5]]), np.zeros((1, 0)), np.zeros((1, 1)), np.zeros(1))
+    values = {field: getattr(model, field)[None].copy() for field in variation.fields}
+    variation.apply(raised, values)
+    assert values["dof_armature"][0, 0] == 0.002  # friction brakes the rotor less than the weight brakes the link
+
+
+def test_a_simulation_that_knows_where_the_teeth_are_goes_on_as_if_it_had_never_stopped():
+    xml = SERVO.format(play="", actuator=POSITION)
+    model = mujoco.MjModel.from_xml_string(xml)
+    states = np.zeros((1, mujoco.mj_stateSize(model, FULL_PHYSICS)))
+    targets = 0.6 * np.sin(1.3 * 2.0 * np.pi * 0.001 * np.arange(1200))[None, :, None]
+
+    def after(first: int, last: int, begin: np.ndarray, remembered: np.ndarray | None = None):
+        (variation,) = Pipeline([GearPlay(0.05)]).variations(model)
+        assert variation.memory is not None
+        if remembered is not None:
+            variation.memory.write(remembered)
+        data = [mujoco.MjData(model)]
+        reached = roll_out(ALONE, [model], data, begin, targets[:, first:last], 1, variations=[variation])
+        return reached[0], variation.memory.read()
+
+    whole, _ = after(0, 1200, states)
+    parted = 0
+    for middle in range(100, 1100, 50):
+        before, remembered = after(0, middle, states)
+        parted += int(remembered[0, 0] == 0.0)
+        known, _ = after(middle, 1200, before[-1:], remembered)
+        unknown, _ = after(middle, 1200, before[-1:], np.full_like(remembered, np.nan))
+        # the first step takes the acceleration from the torques, not from the step before
+        np.testing.assert_allclose(known[:100, 1], whole[middle : middle + 100, 1], atol=2e-3)
+        if remembered[0, 0] == 0.0:
+            assert np.abs(unknown[:100, 1] - whole[middle : middle + 100, 1]).max() > 4e-3
+    assert parted >= 3

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -53,6 +53,20 @@ class States(NamedTuple):
 BatchedForce = Callable[[States], np.ndarray]
 
 
+class Memory(Protocol):
+    """What a variation remembers of each world between its calls, beside the state of the model."""
+
+    size: int
+
+    def read(self) -> np.ndarray:
+        """What it remembers after its last call, (B, size)."""
+        ...
+
+    def write(self, remembered: np.ndarray) -> None:
+        """Begins anew in worlds that remember this, (B, size); NaN where that is not known."""
+        ...
+
+
 class Variation(NamedTuple):
     """How numbers of a model depend on its state.
 
@@ -60,10 +74,12 @@ class Variation(NamedTuple):
         fields: fields of ``mujoco.MjModel`` that vary.
         apply: changes their values, (B, ...) by field, in place for the next physics step from B states, and returns
             the generalised forces of that step, (B, nv), or 0.
+        memory: what it remembers; None for a function of the state alone.
     """
 
     fields: tuple[str, ...]
     apply: Callable[[States, dict[str, np.ndarray]], np.ndarray | float]
+    memory: Memory | None = None
 
 
 @dataclass(frozen=True)
@@ -345,7 +361,7 @@ class VaryingEffect(Effect):
     def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         """Returns the variation for many states at once.
 
-        It may remember what it has seen: it knows from the states' time whether they follow those of the last call.
+        It may have a memory: it knows from the states' time whether they follow those of the last call.
 
         Args:
             model: the model in use; names are resolved once, in this call.

@@ -75,6 +75,11 @@ class Blocks:
         return len(self.first)
 
     @property
+    def rows(self) -> np.ndarray:
+        """All rows of the blocks, (B, steps)."""
+        return self.first[:, None] + np.arange(self.steps)
+
+    @property
     def num_horizons(self) -> int:
         """Number of horizons of all windows."""
         return sum(len(windows.horizons) for windows in self.windows)

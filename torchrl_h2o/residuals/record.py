@@ -57,8 +57,9 @@ class Record:
 
     @cached_property
     def activations(self) -> np.ndarray:
-        """Activations of the actuators, (T, na)."""
-        return activations(self.simulation, self.measured, self.executed)
+        """Activations of the actuators, and what effects remember, (T, na + r)."""
+        rows = np.arange(len(self.measured)) if self.rows is None else self.rows
+        return activations(self.simulation, self.measured, self.executed, self.states[0], rows)
 
     @cached_property
     def readings(self) -> tuple[np.ndarray, np.ndarray]:

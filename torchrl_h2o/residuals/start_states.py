@@ -121,7 +121,7 @@ class StartStates:
     @property
     def of_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """The rows of all blocks, (W), and the states of the log, (T, nq + nv), filtered in these rows."""
-        record, rows = self.record, self.blocks.first[:, None] + np.arange(self.blocks.steps)
+        record, rows = self.record, self.blocks.rows
         states = record.states[0].copy()
         states[rows] += (self.mean * record.spread) @ record.into_state.T
         return rows.ravel(), states

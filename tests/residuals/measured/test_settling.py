@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from torchrl.envs import TransformedEnv
 
-from torchrl_h2o.effects import RollingResistance
+from tests.residuals.pendulum import pendulum, recorded
+from torchrl_h2o.effects import GearPlay, RollingResistance
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.residual import residuals, start_states
@@ -61,3 +62,17 @@ def test_windows_are_thinned_in_blocks_of_neighbours():
     assert (np.diff(kept) == 1).sum() == 4 * 24
     assert kept[0] == 0
     assert kept[-1] == 999
+
+
+def test_teeth_of_a_gear_are_where_the_log_has_brought_them():
+    """Each window begins with them as a simulation along the log leaves them, so no error is left but at its begin."""
+    simulation = pendulum().with_effects(GearPlay(0.3))
+    measured = recorded(simulation, 800)
+    rows = np.arange(100, 700)
+    known = np.abs(residuals(simulation, measured, rows, 4)[:, -1, 0])
+    states = start_states(simulation, measured, rows)
+    actions = measured.action[rows[:, None] + np.arange(4)]
+    reached = simulation.rollout(states[rows], actions, time=measured.time[rows])[:, -1, 0]
+    unknown = np.abs(measured.following[rows + 3, 0] - reached)
+    assert (unknown > 0.01).mean() > 0.05
+    assert (known > 0.01).mean() < 0.2 * (unknown > 0.01).mean()

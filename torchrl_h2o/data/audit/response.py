@@ -88,7 +88,7 @@ class Response:
         if margin:  # unobserved coordinates are simulated over the steps before, with the others measured
             before = starts + np.arange(-margin, 0)[:, None]
             time = simulation.control_step * before if log.time is None else log.time[before]
-            after = simulation.follow(states[before], actions[before], time, activations[before])
+            after, _ = simulation.follow(states[before], actions[before], time, activations[before])
             chosen[:, list(simulation.state_map.hidden)] = after[-1]
         return cls(log, simulation, horizon, starts, chosen, actions, activations, moving, noise)
 

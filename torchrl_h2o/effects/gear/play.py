@@ -26,8 +26,8 @@ class GearPlay(VaryingEffect):
     When the torque on the teeth would change its sign, they part: the link moves without motor, rotor and friction, and
     the rotor crosses the play before it pushes the link again. Armature, friction and damping of the joint belong to
     the rotor. A model without armature gets a rotor of a twentieth of the inertia that the joint moves, for the time of
-    the crossing. A simulation starts with the teeth in contact, on the side on which motor, weight and inertia press
-    them.
+    the crossing. Where the side on which the teeth touch is not known from the steps before, a simulation starts with
+    them in contact, on the side on which motor, weight and inertia press them.
 
     Args:
         width: the angle that the link can turn while the motor rests, in rad.
@@ -52,11 +52,11 @@ class GearPlay(VaryingEffect):
     def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         motors, step, half = JointActuators(model, self.actuators), model.opt.timestep, 0.5 * self.width
         dofs = motors.dofs
+        mobility = model.dof_invweight0[dofs]
         crossing = np.where(model.dof_armature[dofs] > 0.0, model.dof_armature[dofs], _ROTOR * model.dof_M0[dofs])
-        teeth: _Teeth | None = None
+        teeth = _Teeth(len(dofs))
 
         def apply(states: States, values: dict[str, np.ndarray]) -> np.ndarray:
-            nonlocal teeth
             armature, dry, viscous = (values[field][:, dofs] for field in _OF_JOINT)
 
             def losses(velocity: np.ndarray) -> np.ndarray:
@@ -64,30 +64,28 @@ class GearPlay(VaryingEffect):
 
             velocity = states.qvel[:, dofs]
             torque = motors.gear * motors.forces(motors.inputs(states), states)
-            if teeth is None:
-                teeth = _Teeth.unknown(velocity)
-            begins = ~np.isclose(states.time - teeth.time, step)
             pushing = torque - losses(velocity)
+            if len(teeth.time) != len(velocity):
+                teeth.write(np.full((len(velocity), teeth.size), np.nan))
+            begins = ~np.isclose(states.time - teeth.time, step)
             if begins.any():
-                acceleration = (pushing + weight(states)[:, dofs]) / model.dof_M0[dofs]
-                teeth.side[begins] = np.where(pushing >= armature * acceleration, 1.0, -1.0)[begins]
-                teeth.link[begins] = velocity[begins]
-            on_teeth = pushing - armature * np.nan_to_num(velocity - teeth.link) / step
-            touch = teeth.side * on_teeth >= 0.0
-            leave = (teeth.side != 0.0) & ~touch
-            free = leave | (teeth.side == 0.0)
+                before = velocity - (pushing + weight(states)[:, dofs]) * mobility * step
+                teeth.link[begins], teeth.pushing[begins] = before[begins], pushing[begins]
+            # the acceleration of the step before, and what the torque that has changed since adds to it
+            acceleration = (velocity - teeth.link) / step + (pushing - teeth.pushing) * mobility
+            on_teeth = pushing - armature * np.nan_to_num(acceleration)
+            unknown = begins[:, None] & (np.isfinite(teeth.time)[:, None] | np.isnan(teeth.side))
+            side = np.where(unknown, np.where(on_teeth >= 0.0, 1.0, -1.0), teeth.side)
+            leave = side * on_teeth < 0.0
+            free = leave | (side == 0.0)
             rotor = np.where(leave, velocity, teeth.rotor)
             rotor = np.where(free, rotor + (torque - losses(rotor)) / crossing * step, velocity)
-            offset = np.where(leave, half * teeth.side, teeth.offset) + (rotor - velocity) * step
+            offset = np.where(leave | ~free, half * side, teeth.offset) + (rotor - velocity) * step
             meet = free & (np.abs(offset) >= half)
             free &= ~meet
-            teeth = _Teeth(
-                np.where(meet, np.sign(offset), np.where(free, 0.0, teeth.side)),
-                offset,
-                rotor,
-                np.where(meet, np.nan, velocity),  # the impact is no acceleration that parts the teeth
-                states.time.copy(),
-            )
+            teeth.side, teeth.offset = np.where(meet, np.sign(offset), np.where(free, 0.0, side)), offset
+            teeth.rotor, teeth.pushing, teeth.time = rotor, pushing, states.time.copy()
+            teeth.link = np.where(meet, np.nan, velocity)  # the impact is no acceleration that parts the teeth
             world, own = np.nonzero(free)
             for field in _OF_JOINT:
                 values[field][world, dofs[own]] = 0.0
@@ -95,21 +93,32 @@ class GearPlay(VaryingEffect):
                 values[field][world, motors.indices[own]] = 0.0
             return motors.on_joints(np.where(meet, armature * (rotor - velocity) / step, 0.0) / motors.gear)
 
-        return Variation((*_OF_JOINT, *_OF_ACTUATOR), apply)
+        return Variation((*_OF_JOINT, *_OF_ACTUATOR), apply, teeth)
 
 
-@dataclass
 class _Teeth:
-    """Where rotors were relative to their links at the last call, (B, k)."""
+    """Where the rotors of k motors were relative to their links at the last call, in B worlds.
 
-    side: np.ndarray  # -1 or 1 where the teeth touch, 0 where they are apart
-    offset: np.ndarray  # rotor minus link, in rad
-    rotor: np.ndarray  # velocity of the rotor, in rad/s
-    link: np.ndarray  # velocity of the link, in rad/s; NaN before an impact
-    time: np.ndarray  # (B,), in s
+    Args:
+        motors: k.
 
-    @classmethod
-    def unknown(cls, velocity: np.ndarray) -> _Teeth:
-        """Before the first call, with velocities of the links, (B, k)."""
-        nothing = np.zeros_like(velocity)
-        return cls(nothing, nothing, nothing, nothing.copy(), np.full(len(velocity), np.nan))
+    Attributes:
+        side: -1 or 1 where the teeth touch, 0 where they are apart, NaN where that is not known, (B, k).
+        offset: rotor minus link, in rad, (B, k).
+        rotor: velocity of the rotor, in rad/s, (B, k).
+        link: velocity of the link, in rad/s, (B, k); NaN before an impact.
+        pushing: torque of the rotor without its losses, in N·m, (B, k).
+        time: in s, (B,); NaN before the first call.
+    """
+
+    def __init__(self, motors: int):
+        self.size = 3 * motors
+        self.write(np.empty((0, self.size)))
+
+    def read(self) -> np.ndarray:
+        return np.hstack([self.side, self.offset, self.rotor])
+
+    def write(self, remembered: np.ndarray) -> None:
+        self.side, self.offset, self.rotor = np.split(remembered, 3, axis=1)
+        self.link, self.pushing = np.full((2, *self.side.shape), np.nan)
+        self.time = np.full(len(remembered), np.nan)

@@ -86,8 +86,9 @@ def force_response(
     states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0]
     executed = executed_actions(simulation, measured)
+    active = activations(simulation, measured, executed, states, starts)
     states, actions = states[starts], executed[starts][:, None]
-    at = {"time": measured.time[starts], "activations": activations(simulation, measured, executed)[starts]}
+    at = {"time": measured.time[starts], "activations": active[starts]}
     change = np.nanstd(missed @ state_map.restore.T, axis=0)[model.nq :]
     change = np.maximum(change, 1e-6 + 1e-4 * np.nanstd(states[:, model.nq :], axis=0))
     size = FORCE_NUDGE * model.dof_M0 * change / simulation.control_step
@@ -127,10 +128,11 @@ def step_path(
     model, steps = simulation.model, simulation.frame_skip
     states = start_states(simulation, measured, starts) if states is None else states
     missed = residuals(simulation, measured, starts, states=states)[:, 0] @ simulation.state_map.restore.T
-    states = states[starts]
     executed = executed_actions(simulation, measured)
+    active = activations(simulation, measured, executed, states, starts)
+    at = {"time": measured.time[starts], "activations": active[starts]}
+    states = states[starts]
     actions = np.repeat(executed[starts][:, None], steps, axis=1)
-    at = {"time": measured.time[starts], "activations": activations(simulation, measured, executed)[starts]}
     finely = replace(simulation, frame_skip=1).rollout(states, actions, **at)
     path = np.concatenate([states[:, None], finely[:, :-1]], axis=1)
     path = path + np.linspace(0.0, 1.0, steps, endpoint=False)[:, None] * missed[:, None]

@@ -39,7 +39,7 @@ def residuals(
         states[starts],
         actions[rows],
         time=measured.time[starts],
-        activations=activations(simulation, measured, actions)[starts],
+        activations=activations(simulation, measured, actions, states, starts)[starts],
     )
     return undelayed_following(simulation, measured)[rows] - simulation.observed(reached)
 

@@ -1,6 +1,8 @@
-"""What a log does not hold: unobserved coordinates, simulated along the data, and activations of actuators."""
+"""What a log does not hold: unobserved coordinates, activations of actuators, and what effects remember."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,9 +17,6 @@ def settle(
 ) -> np.ndarray:
     """Replaces the unobserved coordinates in some rows by those that a simulation along the data reaches.
 
-    A simulation begins ``settling_steps`` rows before the first row that it is for, and goes on to the rows after it.
-    All simulations run side by side. Before the start of a run, its first row is repeated.
-
     Args:
         simulation: the simulator.
         measured: the data.
@@ -28,26 +27,65 @@ def settle(
     Returns:
         The states, (T, nq + nv); ``states`` itself if the simulator has no such coordinates.
     """
-    hidden = np.asarray(simulation.state_map.hidden, int)
+    hidden = simulation.state_map.hidden
     if not len(hidden) or not len(rows):
         return states
+    found, (reached, after, _) = states.copy(), _followed(simulation, measured, states, actions, rows, hidden)
+    found[reached[:, None], list(hidden)] = after
+    return found
+
+
+def activations(
+    simulation: Simulation,
+    measured: Measured,
+    actions: np.ndarray,
+    states: np.ndarray | None = None,
+    rows: np.ndarray | None = None,
+) -> np.ndarray:
+    """Activations of the actuators before each row, run by run, and what effects remember, (T, na + r).
+
+    Args:
+        simulation: the simulator.
+        measured: the data.
+        actions: (T, nu), executed actions.
+        states: (T, nq + nv), states along which a simulation remembers.
+        rows: (W), rows in which this is needed; in others, and without states, it is NaN.
+    """
+    if simulation.model.na:
+        active = np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
+    else:
+        active = np.zeros((len(measured), 0))
+    if states is None or rows is None or not len(rows) or not simulation.num_remembered:
+        return active
+    memory = np.full((len(measured), simulation.num_remembered), np.nan)
+    reached, _, remembered = _followed(simulation, measured, states, actions, rows, ())
+    memory[reached] = remembered
+    return np.hstack([active, memory])
+
+
+def _followed(
+    simulation: Simulation,
+    measured: Measured,
+    states: np.ndarray,
+    actions: np.ndarray,
+    rows: np.ndarray,
+    carried: Sequence[int],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Simulations along the data, from some steps before the first row that each is for to the rows after it.
+
+    All simulations run side by side. Before the start of a run, its first row is repeated.
+
+    Returns:
+        Rows, (R), and in each the ``carried`` coordinates, (R, c), and what effects remember, (R, r).
+    """
     begins = np.concatenate([np.full(run.stop - run.start, run.start) for run in measured.runs])
     first, last = _chains(np.unique(rows), begins, SETTLING_STEPS, SETTLED_ROWS)
     steps = np.arange(-SETTLING_STEPS, (last - first).max())[:, None]
     path = np.clip(first + steps, begins[first], last)
     before = activations(simulation, measured, actions)[path]
-    after = simulation.follow(states[path], actions[path], measured.time[path], before)
+    after, memory = simulation.follow(states[path], actions[path], measured.time[path], before, carried)
     reached = (steps >= -1) & (first + steps < last)
-    found = states.copy()
-    found[(first + steps + 1)[reached][:, None], hidden] = after[reached]
-    return found
-
-
-def activations(simulation: Simulation, measured: Measured, actions: np.ndarray) -> np.ndarray:
-    """Activations of the actuators before each row, (T, na), under executed actions (T, nu), run by run."""
-    if not simulation.model.na:
-        return np.zeros((len(measured), 0))
-    return np.concatenate([simulation.activations(actions[run]) for run in measured.runs])
+    return (first + steps + 1)[reached], after[reached], memory[reached]
 
 
 def _chains(rows: np.ndarray, begins: np.ndarray, far: int, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -60,8 +60,8 @@ def simulate_transitions(simulation: Simulation, real: TensorDictBase, *, seed: 
             noise = effect.process(simulation.control_step, rng)(noise)
     states = start_states(simulation, replace(measured, observation=measured.observation - noise))
     actions = executed_actions(simulation, measured, rng)
-    at = {"time": measured.time, "activations": activations(simulation, measured, actions)}
-    reached = simulation.rollout(states, actions[:, None], **at)[:, 0]
+    active = activations(simulation, measured, actions, states, np.arange(len(states)))
+    reached = simulation.rollout(states, actions[:, None], time=measured.time, activations=active)[:, 0]
     following = simulation.state_map.observations(reached)
     for effect in sensors:
         if effect.memoryless:

@@ -184,6 +184,12 @@ class Simulation:
             self._scratch.data = [mujoco.MjData(self.model) for _ in range(max(1, pool.nthread))]
         return pool, self._scratch.data
 
+    @cached_property
+    def num_remembered(self) -> int:
+        """Number of values that effects remember between physics steps, beside the state of the model."""
+        variations = self.pipeline.variations(self.model)
+        return sum(one.memory.size for one in variations if one.memory is not None)
+
     def catalogue(self) -> tuple[CatalogueEntry, ...]:
         """Returns candidate effects that the simulator may lack, sized by the model with the present effects."""
         spec = self.spec()
@@ -253,7 +259,7 @@ class Simulation:
             actions: executed actions of H control steps, (B, H, nu).
             time: initial time in s, (B,); 0 by default.
             activations: initial activations of the actuators, (B, na); by default those after a long time under the
-                first actions.
+                first actions. What effects remember may follow them, (B, na + r), with NaN for what is not known.
             applied: generalised forces in N or N·m, (B, H, nv), added to those of the effects.
 
         Returns:
@@ -267,14 +273,19 @@ class Simulation:
         parts = []
         with _no_warnings:
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
-                own = None if applied is None else applied[rows]
-                parts.append(self._stepped(full[rows], actions[rows], own))
+                own, known = (None if one is None else one[rows] for one in (applied, activations))
+                parts.append(self._stepped(full[rows], actions[rows], own, known)[0])
         return np.concatenate(parts) if parts else np.zeros((0, horizon, states.shape[1]))
 
     def follow(
-        self, states: np.ndarray, actions: np.ndarray, time: np.ndarray, activations: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Simulates the hidden coordinates of many recordings side by side.
+        self,
+        states: np.ndarray,
+        actions: np.ndarray,
+        time: np.ndarray,
+        activations: np.ndarray | None = None,
+        carried: Sequence[int] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Simulates the hidden coordinates of many recordings side by side, and what effects remember.
 
         At each step the observed coordinates begin at the recorded values, and the hidden ones where the step before
         has brought them. Where a simulation diverges, they begin anew.
@@ -284,22 +295,26 @@ class Simulation:
             actions: executed actions, (L, B, nu).
             time: time of the states in s, (L, B).
             activations: activations of the actuators, (L, B, na); by default those after a long time under the actions.
+            carried: coordinates to simulate in place of the hidden ones.
 
         Returns:
-            The hidden coordinates after each step, (L, B, hidden).
+            After each step, the hidden coordinates, (L, B, hidden), and what effects remember, (L, B, r).
         """
-        hidden = np.asarray(self.state_map.hidden, int)
+        hidden = np.asarray(self.state_map.hidden if carried is None else carried, int)
         full, places = self._full(states, time, activations, actions), 1 + hidden
         reached = np.empty((*states.shape[:2], len(hidden)))
-        carried = states[0][:, hidden]
+        memories = np.empty((*states.shape[:2], self.num_remembered))
+        now_hidden, active = states[0][:, hidden], np.zeros((states.shape[1], self.model.na))
+        memory = np.full(memories.shape[1:], np.nan)
         with _no_warnings:
             for step, now in enumerate(full):
-                now[:, places] = carried
-                carried = self._stepped(now, actions[step][:, None])[:, 0, hidden]
-                if not np.isfinite(carried).all():
-                    carried = np.where(np.isfinite(carried), carried, states[step][:, hidden])
-                reached[step] = carried
-        return reached
+                now[:, places] = now_hidden
+                after, memory = self._stepped(now, actions[step][:, None], None, np.hstack([active, memory]))
+                now_hidden = after[:, 0, hidden]
+                if not np.isfinite(now_hidden).all():
+                    now_hidden = np.where(np.isfinite(now_hidden), now_hidden, states[step][:, hidden])
+                reached[step], memories[step] = now_hidden, memory
+        return reached, memories
 
     def _full(
         self, states: np.ndarray, time: np.ndarray, activations: np.ndarray | None, actions: np.ndarray
@@ -310,24 +325,43 @@ class Simulation:
         after = 1 + states.shape[-1]
         full[..., 1:after] = states
         if self.model.na:
-            settled = settled_activations(self.model, actions) if activations is None else activations
-            full[..., after : after + self.model.na] = settled
+            known = settled_activations(self.model, actions) if activations is None else activations
+            full[..., after : after + self.model.na] = known[..., : self.model.na]
         return full
 
-    def _stepped(self, full: np.ndarray, actions: np.ndarray, applied: np.ndarray | None = None) -> np.ndarray:
-        """States (B, H, nq + nv) after each control step from full physics states (B, size); NaN where it diverges."""
+    def _stepped(
+        self,
+        full: np.ndarray,
+        actions: np.ndarray,
+        applied: np.ndarray | None = None,
+        activations: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Steps full physics states (B, size), and what effects remember with the activations, (B, na + r).
+
+        Returns:
+            The states after each control step, (B, H, nq + nv), NaN where the simulation diverges; and what effects
+            remember in the end, (B, r).
+        """
         self.check()
         pool, data = self._workers
-        varies, parts = bool(self.pipeline.of_kind(VaryingEffect)), []
+        varies, parts, memories = bool(self.pipeline.of_kind(VaryingEffect)), [], []
         size = _COPIES if varies else max(1, len(full))
         for rows in (slice(i, i + size) for i in range(0, max(1, len(full)), size)):
             models = self._copies[: len(full[rows])] if varies else self.model
+            variations = self.pipeline.variations(self.model)
+            remembering = [one.memory for one in variations if one.memory is not None]
+            if activations is not None and activations.shape[1] > self.model.na:
+                ends = np.cumsum([memory.size for memory in remembering])[:-1]
+                known = np.split(activations[rows, self.model.na :], ends, axis=1)
+                for memory, own in zip(remembering, known, strict=True):
+                    memory.write(own)
             pushes = {
                 "forces": self.pipeline.batched_forces(self.model),
-                "variations": self.pipeline.variations(self.model),
+                "variations": variations,
                 "applied": None if applied is None else applied[rows],
             }
             parts.append(roll_out(pool, models, data, full[rows], actions[rows], self.frame_skip, **pushes))
+            memories.append(np.hstack([np.empty((len(full[rows]), 0)), *(memory.read() for memory in remembering)]))
         reached = np.concatenate(parts)
         # MuJoCo resets a simulation and its clock if the state is not finite or too large
         control_step = self.control_step
@@ -336,7 +370,7 @@ class Simulation:
         states = reached[:, :, 1 : 1 + self.model.nq + self.model.nv].copy()
         if jumps.any():
             states[np.maximum.accumulate(jumps, axis=1)] = np.nan
-        return states
+        return states, np.concatenate(memories)
 
 
 class _NoWarnings:
