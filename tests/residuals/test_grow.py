@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
-from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from tests.residuals.pendulum import DOUBLE, double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     ActionBias,
     ActionDelay,
@@ -18,6 +19,7 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
     Payload,
     ResidualForce,
+    StribeckFriction,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.residuals.gains import Gains
@@ -71,6 +73,20 @@ def test_a_far_factor_is_simulated_for_itself():
     trials = {(one.entry.name, one.trial["scale"]): one.shares for one in directions}
     assert trials.keys() == {("BodyMass upper", 0.8), *(("LinkLength upper", scale) for scale in (0.05, 0.4, 0.8))}
     assert min(trials["LinkLength upper", 0.8]) < 0.0 == min(trials["LinkLength upper", 0.05])
+
+
+def test_what_has_no_neutral_value_stays_as_it_was_simulated():
+    """Half of a friction at rest fades at the same speed."""
+    arm = DOUBLE.replace("motor joint", 'position kp="2" joint')
+    servos = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(arm))
+    entries = [entry for entry in servos.catalogue() if isinstance(entry.effect, StribeckFriction)]
+    directions = sweep(Ground.of(servos, recorded(servos, 400)).rough(()), entries[:1])
+    trials = [tuple(one.trial.values()) for one in directions]
+    assert len(set(trials)) == len(trials) == 4  # of a torque and of a share of the load, at two speeds
+    for one in directions:
+        half = one.effect(0.5)
+        assert (half.torque, half.share) == pytest.approx((0.5 * one.trial["torque"], 0.5 * one.trial["share"]))
+        assert half.speed == one.trial["speed"]
 
 
 def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_them():

@@ -155,8 +155,10 @@ def _simulated_trials(entry: CatalogueEntry) -> list[Mapping[str, float]]:
     lines = {}
     for trial in entry.trials:
         moves = np.array([value - neutral[name] for name, value in trial.items()])
+        moves = moves[np.isfinite(moves)]
         largest = moves[np.abs(moves).argmax()]
-        line = tuple(np.round(moves / largest, 6))
+        fixed = (value for name, value in trial.items() if not math.isfinite(neutral[name]))
+        line = (*fixed, *np.round(moves / largest, 6))
         if largest > 0.0 or line not in lines:  # the opposite direction is the same line
             lines[line] = trial
     return list(lines.values())

@@ -93,7 +93,8 @@ def gear_entries(mechanism: Mechanism, joints: Sequence[int]) -> Iterator[Catalo
 
     def at_rest(own: tuple[int, ...]) -> Trials:
         torque = 0.1 * float(np.median([mechanism.torque(joint) for joint in own]))
-        return tuple({"torque": torque, "speed": speed} for speed in (0.1, 1.0))
+        amounts = ({"torque": torque, "share": 0.0}, {"torque": 0.0, "share": 0.1})
+        return tuple(amount | {"speed": speed} for amount in amounts for speed in (0.2, 2.0))
 
     yield from entries_of(StribeckFriction, "joints", chosen, at_rest)
 

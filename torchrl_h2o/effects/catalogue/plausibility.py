@@ -11,6 +11,7 @@ from torchrl_h2o.effects.action.signal import ActionBias
 from torchrl_h2o.effects.action.timing import ActionDelay, ActionLag
 from torchrl_h2o.effects.effect import Effect
 from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
+from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, Payload
 from torchrl_h2o.effects.model.geom import RollingResistance
 from torchrl_h2o.effects.model.joint import Armature, JointDamping, JointFrictionLoss
@@ -25,6 +26,7 @@ USUAL = (
     Armature,
     LoadFriction,
     StribeckFriction,
+    GearPlay,
     RollingResistance,
     ActionDelay,
     ActionLag,

@@ -1,5 +1,6 @@
 """Dry friction of gears: it grows with the load on the teeth, and falls once the joint moves."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -84,7 +85,7 @@ class StribeckFriction(VaryingEffect):
 
     wording: ClassVar[str] = "dry friction of {joints} + {torque} and {share} of the load below about {speed}"
     torque: float = parameter(unit="N·m", bounds=ANY_AMOUNT, neutral=0.0)
-    speed: float = parameter(unit="rad/s", bounds=(1e-3, 1e3), neutral=0.1)
+    speed: float = parameter(unit="rad/s", bounds=(1e-3, math.inf), neutral=math.inf)
     share: float = parameter(unit="1", bounds=_SHARES, neutral=0.0)
     weight: float = parameter(unit="1", bounds=_SHARES, neutral=1.0)
     exponent: float = parameter(unit="1", bounds=(0.1, 10.0), neutral=2.0)
