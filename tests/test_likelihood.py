@@ -36,3 +36,13 @@ def test_what_acts_in_three_blocks_of_thirty_shows_no_evidence():
     rare = np.full(300, 0.01)
     rare[[5, 105, 205]] = 5.0
     assert Difference.of_losses(rare, np.full(300, 0.01)).evidence == 0.0
+
+
+def test_bursts_that_only_gain_are_evidence_and_bursts_that_also_lose_are_not():
+    """The scatter of bursts hides their mean from a test of normal values."""
+    rng = np.random.default_rng(0)
+    quiet, bursts = 0.1 * rng.normal(size=60), np.zeros(60)
+    bursts[::6] = 6.0 * rng.exponential(size=10)
+    assert Difference(quiet + bursts).evidence > 1.1 * ENOUGH
+    assert Difference(-(quiet + bursts)).evidence < -1.1 * ENOUGH
+    assert abs(Difference(quiet + bursts * rng.choice([-1.0, 1.0], size=60)).evidence) < 0.5 * ENOUGH

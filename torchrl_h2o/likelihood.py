@@ -12,6 +12,7 @@ TAIL = 4.0  # degrees of freedom of Student's t, by which errors are distributed
 ACTS = 0.02  # difference of a block, in nats, below which two explanations predict it alike
 MOST_NATS = 20.0  # difference of a block beyond which it says no more
 FEWEST = 4  # blocks that must differ
+LOG_ODDS = np.logspace(-2.0, 0.0, 21)  # tried log odds that a difference is positive, per nat; a likelihood ratio has 1
 BLOCKS = 30  # blocks of neighbouring windows, which count as independent
 
 
@@ -62,13 +63,16 @@ class Difference:
     def evidence(self) -> float:
         """Logarithm of the likelihood ratio of a positive mean and none, in nats; negative for a negative mean.
 
-        The differences are taken as normal, with the scatter that they have. An effect that acts rarely, such as the
-        end of a joint's range, leaves most blocks as they are, so only those count that differ.
+        It is the larger one of two: that of the differences as normal values with the scatter that they have, and that
+        of their signs, whose log odds are in proportion to the size. What acts in bursts, such as play in a gear, makes
+        a few blocks much better; their scatter hides the mean from the first, but not from the second. What acts
+        rarely, such as the end of a joint's range, leaves most blocks as they are, so only those count that differ.
         """
         alike = np.abs(self.by_block) <= ACTS  # False for NaN, which must not pass for no evidence
         acting = np.clip(self.by_block[~alike], -MOST_NATS, MOST_NATS)
         if len(acting) < FEWEST:
             return 0.0
-        n = len(acting)
-        square = acting.mean() ** 2 / max(acting.var(ddof=1) / n, 1e-24)
-        return float(np.sign(acting.mean()) * 0.5 * n * np.log1p(square / (n - 1)))
+        n, mean = len(acting), acting.mean()
+        normal = 0.5 * n * np.log1p(mean**2 / max(acting.var(ddof=1) / n, 1e-24) / (n - 1))
+        signs = n * math.log(2.0) - np.logaddexp(0.0, -LOG_ODDS[:, None] * np.sign(mean) * acting).sum(1).min()
+        return float(np.sign(mean) * np.maximum(normal, signs))
