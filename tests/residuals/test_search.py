@@ -13,6 +13,7 @@ from torchrl_h2o.effects import (
     ActionGain,
     ActionNoise,
     Armature,
+    BodyCentreOfMass,
     BodyMass,
     Gravity,
     JointDamping,
@@ -154,10 +155,18 @@ def test_bodies_that_share_an_effect_beside_a_further_one_have_one_each():
     assert {effect.bodies: effect.scale for effect in apart.effects} == {"upper": 2.0, "lower": 1.0}
 
 
-def test_an_effect_whose_interval_holds_its_neutral_value_is_left_out_of_the_last_fit():
-    effects = Gravity(1.3), JointDamping(1e-3, "elbow")
-    entries = [entry_of(effect, CATALOGUE) for effect in effects]
-    for truth in (effects[:1], (effects[0], JointDamping(0.03, "elbow"))):
+@pytest.mark.parametrize(
+    ("idle", "there"),
+    [
+        (JointDamping(1e-3, "elbow"), JointDamping(0.03, "elbow")),
+        (BodyCentreOfMass(1e-4, 1e-4, 1e-4, bodies="lower"), BodyCentreOfMass(z=0.05, bodies="lower")),
+    ],
+    ids=["one value", "several values"],
+)
+def test_an_effect_whose_interval_holds_its_neutral_value_is_left_out_of_the_last_fit(idle, there):
+    effects = Gravity(1.3), idle
+    entries = [entry_of(effect, SIMULATION.catalogue()) for effect in effects]
+    for truth in (effects[:1], (effects[0], there)):
         ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(*truth), 800, noise=0.01))
         found, fit, _ = with_intervals(ground, ground.found(entries, effects), [])
         assert [type(effect) for effect in found.effects] == [type(effect) for effect in truth]

@@ -105,7 +105,7 @@ def half_widths_between(values: np.ndarray, variances: np.ndarray) -> np.ndarray
         [5.0, 0.5]
     """
     weight, total, _ = _weighted(values, variances)
-    of_mean = (weight**2).sum(0) / total**2
+    of_mean = ((weight / total) ** 2).sum(0)
     found = np.zeros(values.shape[1])
     for index in np.flatnonzero(np.isfinite(variances).sum(0) > 1):
         known = np.isfinite(variances[:, index])

@@ -55,7 +55,7 @@ class Found:
         entries: entries of the catalogue.
         effects: the effects with their values.
         scores: scores of the blocks for fits and of those for selection, (F + S).
-        one_step: scores of the blocks for selection one step ahead, (S), and those with noisy logged commands.
+        one_step: scores of all blocks one step ahead, (F + S), and those with noisy logged commands.
         is_noise: whether these errors are noise of the motion or of the logged commands.
         slopes: estimated derivatives of the errors on the rows for fits by its values, (N, p), if there are any.
     """

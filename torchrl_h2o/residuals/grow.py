@@ -178,15 +178,15 @@ def with_one_more(
     leads = [
         lead
         for lead in candidates.leads
-        if lead.names - found.names not in {frozenset({rival}), *passed_over}
-        and not lead.names <= found.names
-        and lead.evidence > least
+        if lead.names - found.names not in {frozenset({rival}), *passed_over} and not lead.names <= found.names
     ]
-    if pairs:
-        leads = candidates.gains.pairs([lead for lead in leads if not _kinds(lead) & _kinds_of(found)])
-    elif rival is not None:
+    if rival is None or pairs:
+        leads = [lead for lead in leads if lead.evidence > least]
+    else:
         gain = max((lead.gain for lead in candidates.leads if lead.names == {rival}), default=0.0)
         leads = [lead for lead in leads if lead.gain > 0.25 * gain]
+    if pairs:
+        leads = candidates.gains.pairs([lead for lead in leads if not _kinds(lead) & _kinds_of(found)])
     is_new = joints is not None and joints.names - found.names not in {frozenset(), *passed_over}
     if rival is None and not pairs and joints and is_new and joints.evidence > least:
         leads = [joints, *(lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names)]

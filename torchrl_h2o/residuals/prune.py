@@ -94,7 +94,7 @@ def replaced(
         if sum(kind_of(other) == kind_of(effect) for other in found.effects) > 1:
             alike.append([])
             continue
-        fewer = ground.found(*found.without({entry.name}))
+        fewer = ground.fitted(*found.without({entry.name}))
         candidates = Candidates.of(ground, fewer, directions)
         others = _alike(ground, found, fewer, with_one_more(ground, candidates, rival=entry.name))
         if not others:  # two effects say no more than one that explains the data as well
@@ -102,7 +102,7 @@ def replaced(
             others = _alike(ground, found, fewer, pairs)
         better = [one for one in others if is_preferred(one, found) and _is_worth_it(ground, one, found, directions)]
         if better and swaps < SWAPS:
-            found, alike, swaps = most_usual(better), [], swaps + 1
+            found, alike, swaps = prune(ground, most_usual(better)), [], swaps + 1
         else:
             alike.append(sorted(others, key=lambda one: -one.scores.mean()))
     return found, alike

@@ -173,7 +173,10 @@ class Predictions:
         record, measured = self.record, self.record.measured
         same = simulation is record.simulation
         executed = record.executed if same else executed_actions(simulation, measured)
-        active = record.activations if same else activations(simulation, measured, executed)
+        if same:
+            active = record.activations
+        else:
+            active = activations(simulation, measured, executed, record.states[0], self.blocks.rows)
         n, found = record.num_readings, []
         for windows, start in zip(self.blocks.windows, states, strict=True):
             reached = simulation.rollout(
@@ -285,7 +288,7 @@ class Model:
         return self._scored(tuple(effects))[0]
 
     def one_step_ahead(self, effects: Sequence[Effect] = ()) -> tuple[np.ndarray, bool]:
-        """Score of the blocks for selection one step ahead, (S), and whether these errors are noise of the motion.
+        """Scores of all blocks one step ahead, (F + S), and whether these errors are noise of the motion.
 
         They are if they are larger than the sensors' noise, and independent in successive rows.
         """
@@ -296,10 +299,13 @@ class Model:
             errors, ahead = self.fit.errors(effects), self.selection.errors(effects)
             scales = fitted_scales(self.fit, errors)
             by_block = np.append(scores(self.fit, errors, scales), scores(self.selection, ahead, scales))
-            windows, known = self.selection.blocks.windows[0], self.selection.variances[0][:, 0]
-            density = _density(ahead[0][:, 0], known + scales[0][0]).sum(1)
-            one_step = np.bincount(windows.block, density) / np.bincount(windows.block)
+            one_step = []
+            for part, error in ((self.fit, errors), (self.selection, ahead)):
+                density = _density(error[0][:, 0], part.variances[0][:, 0] + scales[0][0]).sum(1)
+                block = part.blocks.windows[0].block
+                one_step.append(np.bincount(block, density) / np.bincount(block))
+            known = self.selection.variances[0][:, 0]
             is_larger = np.median(scales[0][0] / np.median(known, axis=0)) > 1.0
             is_white = self.fit.likeness_of_neighbours(errors) < WHITE
-            self._found[effects] = by_block, one_step, bool(is_larger and is_white)
+            self._found[effects] = by_block, np.concatenate(one_step), bool(is_larger and is_white)
         return self._found[effects]

@@ -291,12 +291,13 @@ def with_intervals(
 
 
 def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
-    """Distance of an effect's only value from neutral, in half-widths of its interval; infinite for other effects."""
-    if len(half_widths) != 1:
-        return math.inf
-    ((name, half),) = half_widths.items()
-    parameter = effect.parameters[name]
-    return abs(parameter.value - parameter.neutral) / half if half > 0.0 else math.inf
+    """Largest distance of an effect's values from neutral, in half-widths of their intervals.
+
+    A value that has no finite neutral one, such as a limit, is passed over; infinite for effects without others.
+    """
+    values = {name: effect.parameters[name] for name, half in half_widths.items() if half > 0.0}
+    distances = [abs(one.value - one.neutral) / half_widths[name] for name, one in values.items()]
+    return max((one for one in distances if math.isfinite(one)), default=math.inf)
 
 
 def _explanation(found: Found, fit: SetFit | None = None, alike: Sequence[Sequence[Found]] = ()) -> Explanation:
