@@ -10,10 +10,14 @@ from torchrl_h2o.effects import (
     BodyCentreOfMass,
     Gravity,
     JointDamping,
+    LoadFriction,
     Payload,
     ResidualForce,
+    StribeckFriction,
     is_negligible,
 )
+
+STICKS = StribeckFriction(1e-12, speed=0.5, share=0.1)
 
 
 @pytest.mark.parametrize(
@@ -25,6 +29,8 @@ from torchrl_h2o.effects import (
         ActionDelay(1e-12),
         ActionSaturation(1e9),
         BodyCentreOfMass(1e-12),
+        StribeckFriction(1e-12, speed=0.5, share=1e-12),
+        LoadFriction(1e-12, weight=0.3),
     ],
 )
 def test_a_value_within_rounding_is_no_effect(effect):
@@ -33,7 +39,7 @@ def test_a_value_within_rounding_is_no_effect(effect):
 
 @pytest.mark.parametrize(
     "effect",
-    [Payload(1e-4), Gravity(1.001), ActionDelay(1e-5), ActionSaturation(0.9), BodyCentreOfMass(1e-12, z=0.01)],
+    [Payload(1e-4), Gravity(1.001), ActionDelay(1e-5), ActionSaturation(0.9), BodyCentreOfMass(1e-12, z=0.01), STICKS],
 )
 def test_a_small_value_is_an_effect(effect):
     assert not is_negligible(effect)

@@ -90,7 +90,8 @@ class Effect(ABC):
     it acts on, by name patterns (``Names``) or indices (``Indices``). The class attribute ``wording`` describes the
     effect, with the fields' names in braces, and ``{load}`` for "torque" or "force". ``random`` marks effects that draw
     from the generator that :meth:`process` receives. ``of_signal`` names the parameter that has the unit of the
-    actions or observations that the effect acts on, if there is one.
+    actions or observations that the effect acts on, if there is one. ``amounts`` names the parameters without which the
+    others, such as the place of a payload, change nothing; by default, all.
 
     Raises:
         ValueError: for a parameter that is not a number within its bounds, or a field of type ``Names`` or
@@ -111,6 +112,7 @@ class Effect(ABC):
     wording: ClassVar[str]
     random: ClassVar[bool] = False
     of_signal: ClassVar[str | None] = None
+    amounts: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
@@ -186,8 +188,9 @@ class Effect(ABC):
 
     @property
     def is_neutral(self) -> bool:
-        """Whether every parameter has its neutral value, so that the effect changes nothing."""
-        return all(p.value == p.neutral for p in self.parameters.values())
+        """Whether its amounts, or all parameters, have their neutral values, so that the effect changes nothing."""
+        parameters = self.parameters
+        return all(parameters[name].value == parameters[name].neutral for name in self.amounts or parameters)
 
     def with_parameters(self, values: Mapping[str, float]) -> "Effect":
         """Returns the effect with other values for some or all of its parameters, by name.

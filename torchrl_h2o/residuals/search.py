@@ -291,13 +291,13 @@ def with_intervals(
 
 
 def _certainty(effect: Effect, half_widths: Mapping[str, float]) -> float:
-    """Largest distance of an effect's values from neutral, in half-widths of their intervals.
+    """Largest distance of an effect's amounts from neutral, in half-widths of their intervals.
 
-    A value that has no finite neutral one, such as a limit, is passed over; infinite for effects without others.
+    Infinite for an effect without an interval, or with a limit, which has no finite neutral value.
     """
-    values = {name: effect.parameters[name] for name, half in half_widths.items() if half > 0.0}
-    distances = [abs(one.value - one.neutral) / half_widths[name] for name, one in values.items()]
-    return max((one for one in distances if math.isfinite(one)), default=math.inf)
+    certain = {name: half for name, half in half_widths.items() if half > 0.0}
+    values = {name: effect.parameters[name] for name in effect.amounts or half_widths if name in certain}
+    return max((abs(one.value - one.neutral) / certain[name] for name, one in values.items()), default=math.inf)
 
 
 def _explanation(found: Found, fit: SetFit | None = None, alike: Sequence[Sequence[Found]] = ()) -> Explanation:

@@ -111,8 +111,6 @@ def is_negligible(effect: Effect, trials: tuple[Mapping[str, float], ...] = ()) 
         for name, parameter in effect.parameters.items()
         if _is_rounding(parameter, [trial[name] for trial in trials if name in trial])
     }
-    if isinstance(effect, Payload) and "mass" in rounded:
-        return True  # wherever it is
     return effect.is_neutral or (bool(rounded) and effect.with_parameters(rounded).is_neutral)
 
 

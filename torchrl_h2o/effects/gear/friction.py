@@ -42,6 +42,7 @@ class LoadFriction(VaryingEffect):
     :math:`K_e / K_m` of M5.
     """
 
+    amounts: ClassVar[tuple[str, ...]] = ("share",)
     wording: ClassVar[str] = "dry friction of {joints} + {share} of the load"
     share: float = parameter(unit="1", bounds=_SHARES, neutral=0.0)
     weight: float = parameter(unit="1", bounds=_SHARES, neutral=1.0)
@@ -65,7 +66,7 @@ class StribeckFriction(VaryingEffect):
 
     Args:
         torque: :math:`\tau_s`, by which friction at rest exceeds that in motion, in N·m.
-        speed: :math:`v_s`, at which most of it has gone, in rad/s.
+        speed: :math:`v_s`, at which most of it has gone, in rad/s; by default, it never goes.
         share: :math:`K_s`, the same per load.
         weight: :math:`e`, as for :class:`LoadFriction`.
         exponent: :math:`\alpha`.
@@ -83,6 +84,7 @@ class StribeckFriction(VaryingEffect):
     Systems with Friction*, IEEE Transactions on Automatic Control 40 (1995), Eq. (5).
     """
 
+    amounts: ClassVar[tuple[str, ...]] = ("torque", "share")
     wording: ClassVar[str] = "dry friction of {joints} + {torque} and {share} of the load below about {speed}"
     torque: float = parameter(unit="N·m", bounds=ANY_AMOUNT, neutral=0.0)
     speed: float = parameter(unit="rad/s", bounds=(1e-3, math.inf), neutral=math.inf)

@@ -144,6 +144,7 @@ class Payload(ModelEffect):
         'payload of 1.5 kg at x 0 m, y 0 m, z 0.1 m on bodies torso'
     """
 
+    amounts: ClassVar[tuple[str, ...]] = ("mass",)
     wording: ClassVar[str] = "payload of {mass} at x {x}, y {y}, z {z} on {bodies}"
     mass: float = parameter(unit="kg", bounds=ANY_AMOUNT, neutral=0.0)
     x: float = parameter(unit="m", bounds=(-10.0, 10.0), neutral=0.0)

@@ -48,8 +48,8 @@ def activations(
         simulation: the simulator.
         measured: the data.
         actions: (T, nu), executed actions.
-        states: (T, nq + nv), states along which a simulation remembers.
-        rows: (W), rows in which this is needed; in others, and without states, it is NaN.
+        states: (T, nq + nv), states along which effects remember something; without them, this is left out.
+        rows: (W), rows in which it is needed; in others it is NaN.
     """
     if simulation.model.na:
         active = np.concatenate([simulation.activations(actions[run]) for run in measured.runs])

@@ -273,7 +273,8 @@ class Simulation:
         parts = []
         with _no_warnings:
             for rows in (slice(i, i + chunk) for i in range(0, batch, chunk)):
-                own, known = (None if one is None else one[rows] for one in (applied, activations))
+                own = None if applied is None else applied[rows]
+                known = None if activations is None else activations[rows, self.model.na :]
                 parts.append(self._stepped(full[rows], actions[rows], own, known)[0])
         return np.concatenate(parts) if parts else np.zeros((0, horizon, states.shape[1]))
 
@@ -304,12 +305,11 @@ class Simulation:
         full, places = self._full(states, time, activations, actions), 1 + hidden
         reached = np.empty((*states.shape[:2], len(hidden)))
         memories = np.empty((*states.shape[:2], self.num_remembered))
-        now_hidden, active = states[0][:, hidden], np.zeros((states.shape[1], self.model.na))
-        memory = np.full(memories.shape[1:], np.nan)
+        now_hidden, memory = states[0][:, hidden], np.full(memories.shape[1:], np.nan)
         with _no_warnings:
             for step, now in enumerate(full):
                 now[:, places] = now_hidden
-                after, memory = self._stepped(now, actions[step][:, None], None, np.hstack([active, memory]))
+                after, memory = self._stepped(now, actions[step][:, None], None, memory)
                 now_hidden = after[:, 0, hidden]
                 if not np.isfinite(now_hidden).all():
                     now_hidden = np.where(np.isfinite(now_hidden), now_hidden, states[step][:, hidden])
@@ -334,9 +334,9 @@ class Simulation:
         full: np.ndarray,
         actions: np.ndarray,
         applied: np.ndarray | None = None,
-        activations: np.ndarray | None = None,
+        remembered: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Steps full physics states (B, size), and what effects remember with the activations, (B, na + r).
+        """Steps full physics states (B, size), where effects remember something, (B, r).
 
         Returns:
             The states after each control step, (B, H, nq + nv), NaN where the simulation diverges; and what effects
@@ -350,10 +350,9 @@ class Simulation:
             models = self._copies[: len(full[rows])] if varies else self.model
             variations = self.pipeline.variations(self.model)
             remembering = [one.memory for one in variations if one.memory is not None]
-            if activations is not None and activations.shape[1] > self.model.na:
-                ends = np.cumsum([memory.size for memory in remembering])[:-1]
-                known = np.split(activations[rows, self.model.na :], ends, axis=1)
-                for memory, own in zip(remembering, known, strict=True):
+            if remembered is not None and remembered.shape[1]:
+                ends = np.cumsum([memory.size for memory in remembering])
+                for memory, own in zip(remembering, np.split(remembered[rows], ends[:-1], axis=1), strict=True):
                     memory.write(own)
             pushes = {
                 "forces": self.pipeline.batched_forces(self.model),
