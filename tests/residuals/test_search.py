@@ -20,7 +20,9 @@ from torchrl_h2o.effects import (
     JointFrictionLoss,
     JointRange,
     JointSpring,
+    LoadFriction,
     ResidualForce,
+    StribeckFriction,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.model.joint import LOCKED
@@ -29,7 +31,7 @@ from torchrl_h2o.residuals.evidence import why_no_conclusion
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.ground import Found, Ground
 from torchrl_h2o.residuals.progress import LoopBar, OutOfTimeError
-from torchrl_h2o.residuals.search import disjoint, known_set, with_intervals
+from torchrl_h2o.residuals.search import disjoint, known_set, with_intervals, without_endless_rest
 
 SIMULATION = double_pendulum()
 KINDS = (JointFrictionLoss, JointDamping, Armature, ActionDelay, ActionGain, Gravity)
@@ -153,6 +155,22 @@ def test_bodies_that_share_an_effect_beside_a_further_one_have_one_each():
     assert None not in entries
     apart, _ = disjoint(Found(tuple(entries), effects, np.zeros(0)), [], SIMULATION.catalogue(), SIMULATION)
     assert {effect.bodies: effect.scale for effect in apart.effects} == {"upper": 2.0, "lower": 1.0}
+
+
+@pytest.mark.parametrize("speed", [1e4, 0.5])
+def test_friction_at_rest_that_no_motion_leaves_is_dry_friction(speed):
+    arm = DOUBLE.replace("motor joint", 'position kp="2" joint')
+    servos = replace(SIMULATION, spec=lambda: mujoco.MjSpec.from_string(arm))
+    effects = JointFrictionLoss(0.01, "elbow"), StribeckFriction(0.02, speed, 0.1, joints="elbow")
+    entries = [entry_of(effect, catalogue := servos.catalogue()) for effect in effects]
+    ground = Ground.of(servos, recorded(servos, 400))
+    sets, alike = ground.found(entries, effects), [[], [ground.found((), ())]]
+    changed, others = without_endless_rest(ground, sets, alike, catalogue)
+    if speed > 1.0:
+        assert changed.effects == (JointFrictionLoss(0.03, "elbow"), LoadFriction(0.1, joints="elbow"))
+        assert others == [[], []]
+    else:
+        assert (changed, others) == (sets, alike)
 
 
 @pytest.mark.parametrize(
