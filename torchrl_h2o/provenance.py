@@ -38,7 +38,7 @@ def provenance(since: float = 0.0) -> dict[str, Any]:
         "commit": commit,
         "dirty": dirty,
         "versions": _versions(),
-        "cpu_s": round(cpu_seconds() - since, 1),
+        "cpu_s": round(cpu_seconds() - since, 3),
         "threads": torch.get_num_threads(),
         "instruction_set": torch.backends.cpu.get_cpu_capability(),
     }
