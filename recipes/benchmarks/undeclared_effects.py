@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import ForceEffect, ModelEffect, Names, parameter, selection
-from torchrl_h2o.effects.effect import BatchedForce, Force, States
+from torchrl_h2o.effects.effect import Force
 from torchrl_h2o.effects.model.inertial import edit_inertials
+from torchrl_h2o.effects.states import BatchedForce, States
 
 _TORQUE = {"unit": "N·m", "bounds": (-1000.0, 1000.0), "neutral": 0.0}
 _SLOW = 0.05  # rad/s; below it dry friction fades to avoid chattering

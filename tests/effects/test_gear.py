@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from torchrl_h2o.effects import GearPlay, LoadFriction, Pipeline, StribeckFriction
-from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.gear import loads
 from torchrl_h2o.effects.gear.loads import JointActuators, Weight
+from torchrl_h2o.effects.states import States
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
 
 ARM = """

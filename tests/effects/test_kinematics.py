@@ -6,8 +6,8 @@ import pytest
 from torchrl.envs import GymEnv
 
 from torchrl_h2o.effects import LinearDrag, QuadraticDrag
-from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.force.kinematics import com_jacobians
+from torchrl_h2o.effects.states import States
 from torchrl_h2o.envs import mujoco_model
 
 MIXED = """

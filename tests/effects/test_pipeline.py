@@ -25,7 +25,7 @@ from torchrl_h2o.effects import (
     Pipeline,
     parameter,
 )
-from torchrl_h2o.effects.effect import States
+from torchrl_h2o.effects.states import States
 
 DT = 0.02
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from tests.effects.models import CART
 from torchrl_h2o.effects import ResidualForce
-from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.force.term import Factor, ForceTerm
 from torchrl_h2o.effects.serialisation import effect_from_dict, effect_to_dict
+from torchrl_h2o.effects.states import States
 
 FREE = """<mujoco><worldbody><body><freejoint name="root"/><geom size="1"/></body></worldbody></mujoco>"""
 MOTORED = CART.replace("</mujoco>", '<actuator><motor joint="slider"/><motor joint="hinge"/></actuator></mujoco>')

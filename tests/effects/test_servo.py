@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from torchrl_h2o.effects import ActionLead, Pipeline, ServoDamping, ServoDeadBand, TorqueSpeedLine, compile_model
-from torchrl_h2o.effects.effect import States
+from torchrl_h2o.effects.states import States
 
 XML = """
 <mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>

@@ -28,7 +28,7 @@ from torchrl_h2o.effects import (
     QuadraticDrag,
     compile_model,
 )
-from torchrl_h2o.effects.effect import States
+from torchrl_h2o.effects.states import States
 
 DT = 0.005
 ON_ACTIONS = [

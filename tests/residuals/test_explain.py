@@ -5,7 +5,7 @@ import pytest
 
 from tests.residuals.pendulum import UnknownForce, pendulum, recorded
 from torchrl_h2o.effects import ActionNoise, CatalogueEntry, Gravity, JointForce, JointFrictionLoss
-from torchrl_h2o.effects.effect import States
+from torchrl_h2o.effects.states import States
 from torchrl_h2o.residuals import Evidence, explain
 from torchrl_h2o.residuals.progress import OTHERS, LoopBar, OutOfTimeError
 

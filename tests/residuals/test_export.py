@@ -27,7 +27,7 @@ from torchrl_h2o.effects import (
     ServoStiffness,
     StribeckFriction,
 )
-from torchrl_h2o.effects.effect import States
+from torchrl_h2o.effects.states import States
 from torchrl_h2o.options.sources import require_folder
 from torchrl_h2o.residuals import Report, Simulation
 from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from torchrl_h2o.effects.joint_units import motion, unit_under
 from torchrl_h2o.effects.parameter import Parameter
 from torchrl_h2o.effects.selection import Indices, Names, checked_indices, checked_names
+from torchrl_h2o.effects.states import BatchedForce, States, Variation
 
 # by a field's type, which is a string in modules with ``from __future__ import annotations``
 _SELECTIONS = {Names: checked_names, "Names": checked_names, Indices: checked_indices, "Indices": checked_indices}
@@ -25,61 +26,6 @@ EntryNames = Mapping[str, Sequence[str]]
 NO_NAMES: EntryNames = MappingProxyType({})
 Process = Callable[[np.ndarray], np.ndarray]
 Force = Callable[[mujoco.MjData], np.ndarray]
-
-
-class States(NamedTuple):
-    """B states of one model, with what drives it.
-
-    Args:
-        qpos: positions, (B, nq).
-        qvel: velocities, (B, nv).
-        act: activations of the actuators, (B, na).
-        ctrl: executed controls, (B, nu).
-        time: time in s, (B,).
-    """
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    act: np.ndarray
-    ctrl: np.ndarray
-    time: np.ndarray
-
-    @classmethod
-    def of(cls, data: mujoco.MjData) -> "States":
-        """The one state of a simulation, as a batch of one."""
-        return cls(data.qpos[None], data.qvel[None], data.act[None], data.ctrl[None], np.array([data.time]))
-
-
-BatchedForce = Callable[[States], np.ndarray]
-
-
-class Memory(Protocol):
-    """What a variation remembers of each world between its calls, beside the state of the model."""
-
-    size: int
-
-    def read(self) -> np.ndarray:
-        """What it remembers after its last call, (B, size)."""
-        ...
-
-    def write(self, remembered: np.ndarray) -> None:
-        """Begins anew in worlds that remember this, (B, size); NaN where that is not known."""
-        ...
-
-
-class Variation(NamedTuple):
-    """How numbers of a model depend on its state.
-
-    Args:
-        fields: fields of ``mujoco.MjModel`` that vary.
-        apply: changes their values, (B, ...) by field, in place for the next physics step from B states, and returns
-            the generalised forces of that step, (B, nv), or 0.
-        memory: what it remembers; None for a function of the state alone.
-    """
-
-    fields: tuple[str, ...]
-    apply: Callable[[States, dict[str, np.ndarray]], np.ndarray | float]
-    memory: Memory | None = None
 
 
 @dataclass(frozen=True)

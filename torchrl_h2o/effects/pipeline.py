@@ -18,13 +18,11 @@ import numpy as np
 from torchrl_h2o.effects.action.timing import ActionDelay
 from torchrl_h2o.effects.effect import (
     ActionEffect,
-    BatchedForce,
     Effect,
     Force,
     ForceEffect,
     ObservationEffect,
     Process,
-    Variation,
     VaryingEffect,
     checked_effects,
 )
@@ -32,6 +30,7 @@ from torchrl_h2o.effects.gear.loads import Weight
 from torchrl_h2o.effects.model.compilation import compile_model, edit_spec
 from torchrl_h2o.effects.noise_balance import balanced
 from torchrl_h2o.effects.observation.sensor import ObservationDelay
+from torchrl_h2o.effects.states import BatchedForce, Variation
 
 Kind = TypeVar("Kind", bound=Effect)
 Key = TypeVar("Key", bound=Hashable)

@@ -27,8 +27,9 @@ from torchrl_h2o.effects import (
     effect_from_dict,
     effect_to_dict,
 )
-from torchrl_h2o.effects.effect import BatchedForce, States, Variation, checked_effects
+from torchrl_h2o.effects.effect import checked_effects
 from torchrl_h2o.effects.model.compilation import require_changes
+from torchrl_h2o.effects.states import BatchedForce, States, Variation
 from torchrl_h2o.envs.backends.gymnasium import GymnasiumBackend
 from torchrl_h2o.envs.dynamics_gap import DrawEffects, DynamicsGap, GapContent, transforms_of
 from torchrl_h2o.envs.mujoco_model import find_backend

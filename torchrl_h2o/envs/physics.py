@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
-from torchrl_h2o.effects.effect import BatchedForce, States, Variation
+from torchrl_h2o.effects.states import BatchedForce, States, Variation
 
 FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _CTRL = int(mujoco.mjtState.mjSTATE_CTRL)

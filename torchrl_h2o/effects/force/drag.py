@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect, States
+from torchrl_h2o.effects.effect import Force, ForceEffect
 from torchrl_h2o.effects.force.kinematics import com_jacobians
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, ANY_SIZE, parameter
 from torchrl_h2o.effects.selection import Names
+from torchrl_h2o.effects.states import BatchedForce, States
 
 
 @dataclass(frozen=True)

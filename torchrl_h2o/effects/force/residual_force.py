@@ -8,9 +8,10 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import NO_NAMES, BatchedForce, EntryNames, Force, ForceEffect, States
+from torchrl_h2o.effects.effect import NO_NAMES, EntryNames, Force, ForceEffect
 from torchrl_h2o.effects.force.term import ForceTerm
 from torchrl_h2o.effects.parameter import Parameter
+from torchrl_h2o.effects.states import BatchedForce, States
 
 _AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 

@@ -7,10 +7,11 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import BatchedForce, Force, ForceEffect, States
+from torchrl_h2o.effects.effect import Force, ForceEffect
 from torchrl_h2o.effects.gear.loads import JointActuators
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, parameter
 from torchrl_h2o.effects.selection import Indices
+from torchrl_h2o.effects.states import BatchedForce, States
 
 
 class _OfActuators(ForceEffect):

@@ -8,10 +8,11 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import NO_NAMES, BatchedForce, EntryNames, States, Variation, VaryingEffect
+from torchrl_h2o.effects.effect import NO_NAMES, EntryNames, VaryingEffect
 from torchrl_h2o.effects.gear.loads import JointActuators
 from torchrl_h2o.effects.parameter import ANY_AMOUNT, parameter
 from torchrl_h2o.effects.selection import Names
+from torchrl_h2o.effects.states import BatchedForce, States, Variation
 
 _SHARES = (0.0, 10.0)
 

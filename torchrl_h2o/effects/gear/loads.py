@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 
 from torchrl_h2o.effects import selection
-from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.force.kinematics import com_jacobians
 from torchrl_h2o.effects.selection import Names
+from torchrl_h2o.effects.states import States
 
 _ON_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))

@@ -8,10 +8,11 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from torchrl_h2o.effects.effect import BatchedForce, States, Variation, VaryingEffect
+from torchrl_h2o.effects.effect import VaryingEffect
 from torchrl_h2o.effects.gear.loads import JointActuators
 from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Indices
+from torchrl_h2o.effects.states import BatchedForce, States, Variation
 
 _CREEP = 1e-3  # rad/s, below which the rotor's dry friction fades
 _ROTOR = 0.05  # inertia of the rotor of a model without armature, over the inertia that the joint moves

@@ -12,8 +12,8 @@ import numpy as np
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_h2o.effects import Effect, ForceEffect, ModelEffect, Pipeline, VaryingEffect, compile_model
-from torchrl_h2o.effects.effect import States
 from torchrl_h2o.effects.model.compilation import saved_model
+from torchrl_h2o.effects.states import States
 from torchrl_h2o.envs.episode import GapEpisodes
 
 # fields of MjModel that a dynamics gap must not change
