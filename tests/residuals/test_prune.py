@@ -3,11 +3,13 @@
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
-from torchrl_h2o.effects import Gravity, JointFrictionLoss
+from torchrl_h2o.effects import ActionBias, ActionGain, Gravity, JointDamping, JointForce, JointFrictionLoss
 from torchrl_h2o.residuals.ground import Ground
-from torchrl_h2o.residuals.prune import prune
+from torchrl_h2o.residuals.prune import prune, replaced
 from torchrl_h2o.residuals.search import known_set
+from torchrl_h2o.residuals.sweep import sweep
 
+KINDS = (ActionBias, ActionGain, Gravity, JointDamping, JointForce)
 FRICTION = JointFrictionLoss(0.001, "shoulder"), JointFrictionLoss(0.02, "elbow")
 
 
@@ -29,3 +31,19 @@ def test_an_effect_on_several_joints_stays_on_all_or_on_none(true, found, left):
     pruned = prune(ground, ground.fitted(start.entries, start.effects))
     assert len(pruned.effects) == left
     assert all(isinstance(effect, JointFrictionLoss) for effect in pruned.effects)
+
+
+def test_the_more_usual_effect_takes_the_place_of_another_and_what_is_idle_then_goes():
+    """A constant torque on a joint acts as an offset of its motor's commands, which is more usual."""
+    simulation = double_pendulum()
+    measured = recorded(simulation.with_effects(ActionBias(0.05, (1,))), 2000, 0.002)
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, KINDS)]
+    start = known_set(catalogue, (JointForce(0.05, "elbow"), Gravity(1.0001)))
+    ground = Ground.of(simulation, measured, start.effects)
+    found = ground.fitted(start.entries, start.effects)
+    directions = sweep(ground.rough(found.effects), catalogue, found.effects)
+    changed, alike = replaced(ground, found, directions, lambda: None)
+    (bias,) = changed.effects
+    assert isinstance(bias, ActionBias)
+    assert bias.bias == pytest.approx(0.05, rel=0.05)
+    assert [type(effect) for one in alike[0] for effect in one.effects] == [JointForce]

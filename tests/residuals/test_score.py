@@ -58,6 +58,8 @@ def test_noise_of_the_commands_is_white_one_step_ahead_and_missing_gravity_is_no
     measured, simulation = recorded(pendulum(), 2000, 1e-4), pendulum()
     noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
     noisy = Model.of(simulation, replace(measured, action=measured.action + noise))
+    blocks = len(noisy.fit.blocks) + len(noisy.selection.blocks)
+    assert noisy.one_step_ahead()[0].shape == noisy.scores().shape == (blocks,)
     assert noisy.one_step_ahead()[1]
     assert not noisy.one_step_ahead((Gravity(2.0),))[1]
 

@@ -18,7 +18,6 @@ from torchrl_h2o.effects import (
     ResidualForce,
     StribeckFriction,
     is_negligible,
-    selection,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.effects.catalogue.plausibility import surprise
@@ -47,7 +46,6 @@ RESWEPT = 64  # entries of the largest estimated gain, which are simulated again
 NEUTRAL = 0.1  # half-widths from neutral up to which effects are left out together
 MOST_LEFT_OUT = 3  # fits after which effects are left out whose intervals hold their neutral values
 SWEEPS = 6  # largest number of sweeps
-HARDLY_FALLS = 0.05  # share by which friction at rest falls in the fastest motion, up to which it is friction always
 
 
 #: the test by which the search for effects stops
@@ -107,9 +105,9 @@ def search(
     except OutOfTimeError as end:
         ended_in = str(end)
     found, alike = disjoint(latest[-1], alike, catalogue, simulation)
-    found, alike = without_endless_rest(grounds[-1], found, alike, catalogue)
     progress.begin_last_fit(bool(found.entries))
     try:
+        found, alike = without_endless_rest(grounds[-1], found, alike, catalogue)
         explanation = _explanation(*with_intervals(grounds[-1], found, alike))
     except OutOfTimeError as end:
         explanation, ended_in = _explanation(found), ended_in or str(end)
@@ -254,32 +252,28 @@ def disjoint(
 def without_endless_rest(
     ground: Ground, found: Found, alike: Sequence[Sequence[Found]], catalogue: Sequence[CatalogueEntry]
 ) -> tuple[Found, Sequence[Sequence[Found]]]:
-    """A set and its alternatives, with dry friction in the place of friction at rest that no measured motion leaves."""
-    record = ground.base.fit.record
-    model, path = record.simulation.model, record.states[0]
+    """A set and its alternatives, with dry friction in the place of friction at rest where that explains as much.
+
+    Friction at rest that no measured motion leaves is dry friction, which is more usual.
+    """
     for entry, effect in zip(found.entries, found.effects, strict=True):
         if not isinstance(effect, StribeckFriction):
             continue
-        dofs = np.array(selection.joint_dofs(model, effect.joints))
         constant: tuple[Effect, ...] = (
             JointFrictionLoss(effect.torque, effect.joints),
             LoadFriction(effect.share, effect.weight, effect.joints),
         )
-        entries = [own for one in constant if (own := entry_of(one, catalogue)) is not None]
-        if effect.fall(np.nanmax(np.abs(path[:, model.nq + dofs]))) > HARDLY_FALLS or len(entries) < len(constant):
+        offered = [(own, one) for one in constant if (own := entry_of(one, catalogue)) is not None]
+        if len(offered) < len(constant):
             continue
-        pairs = zip(found.entries, found.effects, strict=True)
-        kept = {one.name: (one, present) for one, present in pairs}
+        kept = {one.name: (one, present) for one, present in zip(found.entries, found.effects, strict=True)}
         others = dict(zip(kept, alike, strict=False))
         del kept[entry.name]
-        for own, one in zip(entries, constant, strict=True):
-            if own.name in kept:
-                kept[own.name] = own, summed(one, kept[own.name][1])
-            elif not one.is_neutral:
-                kept[own.name] = own, one
-        alike = [others.get(name, []) for name in kept] if alike else alike
-        entries, effects = zip(*kept.values(), strict=True)
-        found = replace(found, entries=entries, effects=effects, slopes=None)
+        for own, one in offered:
+            kept[own.name] = own, summed(one, kept[own.name][1]) if own.name in kept else one
+        usual = ground.fitted(*zip(*kept.values(), strict=True))
+        if is_preferred(usual, ground.found(found.entries, found.effects)):
+            found, alike = usual, [others.get(name, []) for name in kept] if alike else alike
     return found, alike
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from torchrl.envs import TransformedEnv
 
-from tests.residuals.pendulum import pendulum, recorded
-from torchrl_h2o.effects import GearPlay, RollingResistance
+from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from torchrl_h2o.effects import GearPlay, LoadFriction, RollingResistance
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.residual import residuals, start_states
@@ -66,7 +66,7 @@ def test_windows_are_thinned_in_blocks_of_neighbours():
 
 def test_teeth_of_a_gear_are_where_the_log_has_brought_them():
     """Each window begins with them as a simulation along the log leaves them, so no error is left but at its begin."""
-    simulation = pendulum().with_effects(GearPlay(0.3))
+    simulation = pendulum().with_effects(LoadFriction(0.01), GearPlay(0.3))
     measured = recorded(simulation, 800)
     rows = np.arange(100, 700)
     known = np.abs(residuals(simulation, measured, rows, 4)[:, -1, 0])
@@ -76,3 +76,14 @@ def test_teeth_of_a_gear_are_where_the_log_has_brought_them():
     unknown = np.abs(measured.following[rows + 3, 0] - reached)
     assert (unknown > 0.01).mean() > 0.05
     assert (known > 0.01).mean() < 0.2 * (unknown > 0.01).mean()
+
+
+def test_each_gear_remembers_its_own_teeth():
+    """Play that two effects give to two motors is the play that one effect gives to both."""
+    gears = (), (GearPlay(0.2),), (GearPlay(0.2, (0,)), GearPlay(0.2, (1,)))
+    none, both, each = (double_pendulum().with_effects(*own) for own in gears)
+    measured, rows = recorded(none, 600), np.arange(100, 500)
+    assert both.num_remembered == each.num_remembered == 6
+    errors = [residuals(simulation, measured, rows, 4) for simulation in (both, each)]
+    np.testing.assert_allclose(*errors, atol=1e-12)
+    assert (np.abs(errors[0][:, -1]).max(0) > 0.01).all()

@@ -97,16 +97,12 @@ class StribeckFriction(VaryingEffect):
     def describe(self, names: EntryNames = NO_NAMES) -> str:
         return super().describe(names) + _details(self)
 
-    def fall(self, velocity: np.ndarray | float) -> np.ndarray:
-        """Share by which the friction has fallen at velocities in rad/s."""
-        return -np.expm1(-(np.abs(velocity / self.speed) ** self.exponent))
-
     def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         chosen = _mask(model, self.joints)
         load = _load(model, self.joints, self.weight, weight) if self.share else None
 
         def friction(states: States) -> np.ndarray:
-            at_rest = 1.0 - self.fall(states.qvel)
+            at_rest = np.exp(-(np.abs(states.qvel / self.speed) ** self.exponent))
             return at_rest * (self.torque * chosen + (self.share * load(states) if load else 0.0))
 
         return _added(friction)

@@ -259,7 +259,7 @@ class Simulation:
             actions: executed actions of H control steps, (B, H, nu).
             time: initial time in s, (B,); 0 by default.
             activations: initial activations of the actuators, (B, na); by default those after a long time under the
-                first actions. What effects remember may follow them, (B, na + r), with NaN for what is not known.
+                first actions. Further columns are what effects remember, (B, na + r); it is not known where it is NaN.
             applied: generalised forces in N or N·m, (B, H, nv), added to those of the effects.
 
         Returns:
