@@ -166,6 +166,22 @@ def test_a_link_that_falls_on_a_motor_at_rest_keeps_the_teeth_in_contact():
     assert values["dof_armature"][0, 0] == 0.002  # friction brakes the rotor less than the weight brakes the link
 
 
+def test_a_motor_that_pushes_less_than_before_keeps_the_teeth_in_contact():
+    """The link then accelerates less, at once."""
+    model = mujoco.MjModel.from_xml_string(SERVO.format(play="", actuator=MOTOR))
+    (variation,) = Pipeline([GearPlay(0.05)]).variations(model)
+
+    def rotor(velocity: float, torque: float, time: float) -> float:
+        states = np.zeros((1, 1)), np.array([[velocity]]), np.zeros((1, 0)), np.array([[torque]]), np.array([time])
+        values = {field: getattr(model, field)[None].copy() for field in variation.fields}
+        variation.apply(States(*states), values)
+        return values["dof_armature"][0, 0]
+
+    assert rotor(1.0, 0.5, 0.0) == 0.002
+    assert rotor(1.0 + 0.48 * 0.001 / model.dof_M0[0], 0.05, 0.001) == 0.002
+    assert rotor(1.0 + 0.51 * 0.001 / model.dof_M0[0], -0.5, 0.002) == 0.0
+
+
 def test_a_simulation_that_knows_where_the_teeth_are_goes_on_as_if_it_had_never_stopped():
     xml = SERVO.format(play="", actuator=POSITION)
     model = mujoco.MjModel.from_xml_string(xml)

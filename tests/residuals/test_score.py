@@ -11,6 +11,7 @@ from tests.residuals.pendulum import double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     Armature,
     CatalogueEntry,
+    GearPlay,
     Gravity,
     JointDamping,
     JointFrictionLoss,
@@ -161,6 +162,17 @@ def test_a_search_adds_nothing_where_nothing_is_missing():
 
 def test_a_score_that_is_no_number_is_no_evidence_of_likeness():
     assert np.isnan(Difference(np.full(10, np.nan)).evidence)
+
+
+def test_windows_begin_with_the_teeth_of_a_gear_where_the_log_has_brought_them():
+    simulation, play = pendulum(), GearPlay(0.3)
+    data = recorded(simulation.with_effects(play), 1000)
+    in_simulator = Model.of(simulation.with_effects(play), data).fit
+    added = Ground.of(simulation, data, (play,)).fit_part((play,))
+    predicted = added.errors(), added.errors((play,)), in_simulator.errors()
+    far = [np.mean(np.abs(errors[-1]) > 0.05) for errors in predicted]
+    assert far[0] > 0.2
+    assert max(far[1:]) < 0.1 * far[0]
 
 
 @pytest.mark.parametrize("effect", [ObservationBias(0.1, (0,)), Gravity(1.2)], ids=["sensor", "gravity"])

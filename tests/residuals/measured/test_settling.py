@@ -11,6 +11,7 @@ from torchrl_h2o.effects import GearPlay, LoadFriction, RollingResistance
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.residuals import Measured, Simulation
 from torchrl_h2o.residuals.measured.residual import residuals, start_states
+from torchrl_h2o.residuals.measured.settling import activations
 from torchrl_h2o.residuals.measured.transitions import SETTLING_STEPS, thinned
 
 ROWS = 600
@@ -76,6 +77,15 @@ def test_teeth_of_a_gear_are_where_the_log_has_brought_them():
     unknown = np.abs(measured.following[rows + 3, 0] - reached)
     assert (unknown > 0.01).mean() > 0.05
     assert (known > 0.01).mean() < 0.2 * (unknown > 0.01).mean()
+
+
+def test_teeth_follow_the_velocities_of_the_log_where_no_sensor_reads_them():
+    whole = pendulum().with_effects(GearPlay(0.3))
+    measured, rows = recorded(pendulum(), 400), np.arange(100, 300)
+    positions = replace(whole, state_map=replace(whole.state_map, hidden=(1,)))
+    states = whole.state_map.states(measured.observation)
+    known, read = (activations(one, measured, measured.action, states, rows)[rows] for one in (positions, whole))
+    np.testing.assert_allclose(known, read, atol=1e-12)
 
 
 def test_each_gear_remembers_its_own_teeth():

@@ -81,7 +81,7 @@ class GearPlay(VaryingEffect):
             free = leave | (side == 0.0)
             rotor = np.where(leave, velocity, teeth.rotor)
             rotor = np.where(free, rotor + (torque - losses(rotor)) / crossing * step, velocity)
-            offset = np.where(leave | ~free, half * side, teeth.offset) + (rotor - velocity) * step
+            offset = np.where(leave, half * side, teeth.offset) + (rotor - velocity) * step
             meet = free & (np.abs(offset) >= half)
             free &= ~meet
             teeth.side, teeth.offset = np.where(meet, np.sign(offset), np.where(free, 0.0, side)), offset
