@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.envs import GymEnv, TransformedEnv
 
-from tests.residuals.pendulum import double_pendulum, pendulum, recorded
+from tests.residuals.pendulum import UnknownForce, double_pendulum, pendulum, recorded
 from torchrl_h2o.effects import (
     Armature,
     CatalogueEntry,
@@ -21,7 +21,7 @@ from torchrl_h2o.effects import (
 )
 from torchrl_h2o.envs import DynamicsGap, WheelLeggedEnv, noisy_balance_controller, record
 from torchrl_h2o.likelihood import Difference
-from torchrl_h2o.residuals import Measured, Simulation, StateMap, start_states
+from torchrl_h2o.residuals import Measured, Simulation, Split, StateMap, start_states
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.progress import LoopBar
 from torchrl_h2o.residuals.refit import fit_set, slopes_of, variables_of
@@ -53,6 +53,18 @@ def difference(measured, better, worse):
 )
 def test_the_true_effect_predicts_better_than_a_wrong_one(measured, wrong):
     assert difference(measured, (TRUTH,), wrong).evidence > 10.0
+
+
+def test_what_is_right_predicts_better_where_all_errors_are_larger():
+    """The rows for selection are faster than those for fits, so that an undeclared drag matters more there."""
+    real = pendulum().with_effects(TRUTH, UnknownForce(1.0, law=lambda q, v, t: -0.05 * v**3))
+    slow = recorded(pendulum(), 2000)
+    action = np.where(slow.split[:, None] == Split.FIT, 0.3 * slow.action, slow.action)
+    path = np.vstack([np.zeros(2), real.rollout(np.zeros((1, 2)), action[None])[0]])
+    measured = replace(slow, observation=path[:-1], action=action, following=path[1:])
+    ground = Ground.of(pendulum(), measured)
+    right, none = ground.fitted(CATALOGUE[1:2], (TRUTH,)), ground.found((), ())
+    assert Difference((right.scores - none.scores)[ground.num_fit :]).evidence > 5.0
 
 
 def test_noise_of_the_commands_is_white_one_step_ahead_and_missing_gravity_is_not():

@@ -88,7 +88,9 @@ def test_the_last_fit_has_the_expected_commands_if_the_time_is_up(monkeypatch):
     monkeypatch.setattr(module, "with_intervals", lambda *args: grounds.append(args[0]) or with_intervals(*args))
     measured = recorded(SIMULATION.with_effects(JointFrictionLoss(0.03)), 2000, noise=1e-4)
     noise = 0.3 * measured.action.std(0) * np.random.default_rng(1).standard_normal(measured.action.shape)
-    assert found(replace(measured, action=measured.action + noise)).ended_in == "looking for effects"
+    frictions = [entry for entry in CATALOGUE if isinstance(entry.effect, JointFrictionLoss)]
+    noisy = replace(measured, action=measured.action + noise)
+    assert found(noisy, frictions).ended_in == "looking for effects"
     assert grounds[0].logged is not None
 
 
