@@ -33,6 +33,9 @@ from torchrl_h2o.residuals import Report
 
 NOISE = (0.001, 0.003)  # of the encoders, shares of the signals' standard deviations
 ROWS = 3000  # 30 s
+SEEN, IN_ROWS = 3.0, 0.1  # change of a position, in its noise, that a cause makes in at least this share of the rows
+LOOKED_AT = 1000  # rows, 10 s, in which a cause is to be visible
+TRIES = 50  # draws of a cause until one is
 COUNTS = (1, 1, 3)  # joints, in turn
 #: what every joint has, so that no cause is named by it
 USUAL = (JointFrictionLoss, JointDamping, ServoDamping, Armature)
@@ -112,22 +115,43 @@ def with_cause(arm: Arm, cause: str, rng: np.random.Generator) -> Arm:
 
 
 def servo(number: int, rng: np.random.Generator) -> ServoCase:
-    """Each cause in turn; every other log has positions alone."""
+    """Each cause in turn, drawn until it is visible; every other log has positions alone."""
     cause = CAUSES[number % len(CAUSES)]
-    arm = Arm.draw(rng, COUNTS[number % len(COUNTS)])
-    arm = with_cause(arm, cause, rng)
+    plain = Arm.draw(rng, COUNTS[number % len(COUNTS)])
+    noise, seed = float(rng.uniform(*NOISE)), int(rng.integers(2**31))
+    before, _ = plain.record(LOOKED_AT, seed)
+    for _ in range(TRIES):
+        arm = with_cause(plain, cause, rng)
+        if cause == "M1" or is_visible(arm, before, noise, seed):
+            break
+    else:
+        raise RuntimeError(f"servos {number}: no {cause} that can be seen in {TRIES} tries; draw anew")
     return ServoCase(
         name=f"{cause} {len(arm.servos)} {number}",
         system="arm",
         judge=judge_servo,
-        noise=float(rng.uniform(*NOISE)),
+        noise=noise,
         truth=effects_of(arm),
-        seed=int(rng.integers(2**31)),
+        seed=seed,
         transitions=ROWS,
         machine=arm,
         cause=cause,
         velocities=number % 2 == 0,
     )
+
+
+def is_visible(arm: Arm, before: np.ndarray, noise: float, seed: int) -> bool:
+    """Whether an arm moves otherwise than without its cause, by more than the noise of a position.
+
+    Args:
+        arm: the arm with its cause.
+        before: the run without it, (T, 2 n).
+        noise: standard deviation of the noise, as a share of each position's.
+        seed: of the run.
+    """
+    moved, _ = arm.record(LOOKED_AT, seed)
+    change = np.abs(moved - before) > SEEN * noise * before.std(0)
+    return bool(change[:, : len(arm.servos)].mean(0).max() >= IN_ROWS)
 
 
 def effects_of(arm: Arm) -> tuple[Effect, ...]:

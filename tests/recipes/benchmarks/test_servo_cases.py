@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from cases import draw_case
 from running import FAMILIES
-from servo_cases import CAUSES, USUAL
+from servo_cases import CAUSES, LOOKED_AT, USUAL, is_visible
+from servos import Arm
 
 from tests.recipes.benchmarks.made_up import report
 from torchrl_h2o.effects import ActionDelay, Armature, JointFrictionLoss, LoadFriction, StribeckFriction
@@ -33,13 +34,23 @@ def test_the_further_cause_explains_what_friction_and_rotors_leave(number):
     assert error(case.truth) < 0.9 * error(usual)
 
 
-def test_every_cause_is_drawn_and_a_control_has_none():
-    assert {draw_case(FAMILIES, "servos", number, SEED).cause for number in range(len(CAUSES))} == set(CAUSES)
-    for number in range(len(CAUSES)):
-        case, plain = (draw_case(FAMILIES, family, number, SEED) for family in ("servos", "servo_controls"))
-        assert plain.seed == case.seed
-        assert all(isinstance(effect, USUAL) for effect in plain.truth)
-        assert [one.friction for one in plain.machine.servos] == [one.friction for one in case.machine.servos]
+@pytest.mark.parametrize("number", [*(0, 3), *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 4, 5, 6))])
+def test_each_cause_is_drawn_in_turn_and_a_control_has_none(number):
+    case, plain = (draw_case(FAMILIES, family, number, SEED) for family in ("servos", "servo_controls"))
+    assert case.cause == CAUSES[number]
+    assert plain.seed == case.seed
+    assert all(isinstance(effect, USUAL) for effect in plain.truth)
+    assert [one.friction for one in plain.machine.servos] == [one.friction for one in case.machine.servos]
+
+
+def test_a_play_that_moves_the_arm_less_than_the_noise_is_not_drawn():
+    plain = draw_case(FAMILIES, "servo_controls", 0, SEED).machine
+    before, _ = plain.record(LOOKED_AT, 0)
+    seen = [
+        is_visible(Arm(tuple(replace(one, play=play) for one in plain.servos)), before, noise=0.002, seed=0)
+        for play in (0.001, 0.2)
+    ]
+    assert seen == [False, True]
 
 
 @pytest.mark.parametrize(
