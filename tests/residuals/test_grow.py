@@ -22,6 +22,7 @@ from torchrl_h2o.effects import (
     StribeckFriction,
 )
 from torchrl_h2o.effects.catalogue.entry import entry_of
+from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
 from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
@@ -198,3 +199,15 @@ def test_the_most_unusual_of_a_kind_counts_and_each_term_of_a_force():
     assert surprise_of(two) == 2 * surprise_of(one)  # joints have friction in common, but not forces
     one, two = (ResidualForce(("torque on elbow: 0.1 · t",) * n) for n in (1, 2))
     assert 0 < surprise_of([one]) < surprise_of([two])
+
+
+def test_an_unusual_set_needs_more_evidence_to_take_the_place_of_a_usual_one():
+    usual = Found((entry_of(JointDamping(0.01), CATALOGUE),), (JointDamping(0.01),), np.zeros(40))
+    unusual = Found((entry_of(Gravity(0.9), CATALOGUE),), (Gravity(0.9),), np.zeros(40))
+    scatter = np.random.default_rng(0).standard_normal(40)
+    scatter -= scatter.mean()
+    for gain, is_better in ((0.5, False), (1.0, True)):
+        better = replace(unusual, scores=scatter + gain)
+        assert Difference(better.scores).evidence > 3.0
+        assert is_preferred(better, usual) == is_better
+        assert (most_usual([usual, better]) is better) == is_better

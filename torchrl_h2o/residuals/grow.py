@@ -14,7 +14,7 @@ from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
 from torchrl_h2o.residuals.gains import Gains, Lead
-from torchrl_h2o.residuals.ground import FITTED, GROWN, SKETCH, Found, Ground, kind_of
+from torchrl_h2o.residuals.ground import FITTED, GROWN, NATS_OF_SURPRISE, SKETCH, Found, Ground, kind_of
 from torchrl_h2o.residuals.refit import FARTHEST, Variable, fit_set, slopes_of, variables_of, with_values
 from torchrl_h2o.residuals.score import Predictions
 from torchrl_h2o.residuals.sweep import Direction
@@ -273,13 +273,19 @@ def is_usable(ground: Ground, found: Found, before: Found) -> bool:
 
 
 def most_usual(sets: Sequence[Found]) -> Found:
-    """The best set, or the most usual and smallest one of those that are not significantly worse."""
+    """The best set, or the most usual and smallest one of those over which it has no significant advantage."""
     best = max(sets, key=lambda one: one.scores.mean())
-    alike = [one for one in sets if Difference(best.scores - one.scores).evidence < ALIKE]
+    alike = [one for one in sets if advantage(best, one) < ALIKE]
     return min([best, *alike], key=lambda one: (*one.unusual, -one.scores.mean()))
 
 
 def is_preferred(other: Found, found: Found) -> bool:
-    """Whether a set explains the data better than another, or as well and by fewer or more usual effects."""
-    evidence = Difference(other.scores - found.scores).evidence
-    return evidence > ALIKE or (evidence > -ALIKE and other.unusual < found.unusual)
+    """Whether a set has an advantage over another, or none, but fewer or more usual effects."""
+    own = advantage(other, found)
+    return own > ALIKE or (own > -ALIKE and other.unusual < found.unusual)
+
+
+def advantage(one: Found, other: Found) -> float:
+    """Evidence for a set against another, in nats, less what it needs for being more unusual."""
+    evidence = Difference(one.scores - other.scores).evidence
+    return evidence - NATS_OF_SURPRISE * (one.surprise - other.surprise)

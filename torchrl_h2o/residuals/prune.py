@@ -14,6 +14,7 @@ from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
 from torchrl_h2o.residuals.grow import (
     ALIKE,
     Candidates,
+    advantage,
     gains_beside,
     is_preferred,
     is_usable,
@@ -111,6 +112,8 @@ def replaced(
 def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]) -> list[Found]:
     """Of sets that explain at least half of what an effect explains, those that explain as much once they are fitted.
 
+    A more usual set may explain less, by what the effect needs for being unusual.
+
     Args:
         ground: where sets are compared.
         found: the set with the effect.
@@ -132,7 +135,8 @@ def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]
     return [
         one
         for one in fitted
-        if is_usable(ground, one, fewer) and Difference(found.scores - one.scores).evidence < ALIKE
+        if is_usable(ground, one, fewer)
+        and min(Difference(found.scores - one.scores).evidence, advantage(found, one)) < ALIKE
     ]
 
 
