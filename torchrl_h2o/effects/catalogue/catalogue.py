@@ -124,7 +124,7 @@ def _servo_entries(mechanism: Mechanism, spec: mujoco.MjSpec, dt: float) -> Iter
     stalls = of_stiffness("stall", 0.03, 0.1, 0.3)
 
     def lines(chosen: tuple[int, ...]) -> Trials:
-        return tuple({**stall, "speed": speed} for stall in stalls(chosen) for speed in (3.0, 10.0))
+        return tuple({**stall, "speed": speed} for stall in stalls(chosen) for speed in (2.0, 5.0, 12.0))
 
     yield from entries_of(TorqueSpeedLine, "actuators", servos, lines)
     # without a limit of its torque, the damping of a servo is that of its joint
