@@ -25,7 +25,7 @@ from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
-from torchrl_h2o.residuals.grow import Candidates, gains_beside, is_preferred, most_usual, with_one_more
+from torchrl_h2o.residuals.grow import Candidates, choices, gains_beside, is_preferred, most_usual, with_one_more
 from torchrl_h2o.residuals.sweep import Direction, sweep
 from torchrl_h2o.residuals.whitened import flat
 
@@ -211,3 +211,15 @@ def test_an_unusual_set_needs_more_evidence_to_take_the_place_of_a_usual_one():
         assert Difference(better.scores).evidence > 3.0
         assert is_preferred(better, usual) == is_better
         assert (most_usual([usual, better]) is better) == is_better
+
+
+def test_damping_and_a_rotor_are_one_choice_and_two_other_effects_are_two():
+    entries = {type(entry.effect): entry for entry in CATALOGUE}
+
+    def more(*effects):
+        return Found(tuple(entries[type(effect)] for effect in effects), effects, np.zeros(0))
+
+    assert choices(30, more(JointDamping(0.1), Armature(0.1)), more()) == 30
+    assert choices(30, more(JointDamping(0.1), Gravity(0.9)), more()) == 900
+    assert choices(30, more(ActionGain(0.9), Gravity(0.9)), more()) == 900
+    assert choices(30, more(ActionGain(0.9), Gravity(0.9)), more(Gravity(0.9))) == 30

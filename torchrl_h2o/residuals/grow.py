@@ -13,7 +13,7 @@ from torchrl_h2o.effects.catalogue.plausibility import is_outside
 from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.explanation import Tried
 from torchrl_h2o.residuals.forces.candidates import force_candidates
-from torchrl_h2o.residuals.gains import Gains, Lead
+from torchrl_h2o.residuals.gains import OF_JOINTS, Gains, Lead
 from torchrl_h2o.residuals.ground import FITTED, GROWN, NATS_OF_SURPRISE, SKETCH, Found, Ground, kind_of
 from torchrl_h2o.residuals.refit import FARTHEST, Variable, fit_set, slopes_of, variables_of, with_values
 from torchrl_h2o.residuals.score import Predictions
@@ -99,7 +99,7 @@ def grow(
             fitted = with_one_more(ground, candidates, pairs=True)
         for one in fitted:
             _remember(tried, one, found)
-        better = [one for one in fitted if ground.adds(one, found, _choices(among, one, found))]
+        better = [one for one in fitted if ground.adds(one, found, choices(among, one, found))]
         if better:
             best = most_usual(better)
             before, found, refused = found, ground.fitted(best.entries, best.effects), set()
@@ -114,11 +114,16 @@ def grow(
     return found
 
 
-def _choices(among: int, more: Found, less: Found) -> int:
-    """Number of sets of which a larger one is the best: 1 for what each of several joints has."""
+def choices(among: int, more: Found, less: Found) -> int:
+    """Number of sets of which a larger one is the best.
+
+    It is 1 for what each of several joints has. Friction, damping and rotors, which every joint has, are one choice.
+    """
     added = more.without(less.names)[1]
     kinds = {*map(kind_of, added)}
-    return 1 if _is_many(more, less) and len(kinds) < len(added) else among ** len(kinds)
+    if _is_many(more, less) and len(kinds) < len(added):
+        return 1
+    return among ** (len(kinds - {*OF_JOINTS}) + bool(kinds & {*OF_JOINTS}))
 
 
 def _is_many(more: Found, less: Found) -> bool:

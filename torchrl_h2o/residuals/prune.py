@@ -15,6 +15,7 @@ from torchrl_h2o.residuals.grow import (
     ALIKE,
     Candidates,
     advantage,
+    choices,
     gains_beside,
     is_preferred,
     is_usable,
@@ -142,5 +143,5 @@ def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]
 
 def _is_worth_it(ground: Ground, other: Found, found: Found, directions: Sequence[Direction]) -> bool:
     """Whether a set with more effects predicts better by what the best of many needs; others need not."""
-    added = len(other.entries) - len(found.entries)
-    return added <= 0 or ground.adds(other, found, len({one.entry.name for one in directions}) ** (added + 1))
+    among = len({one.entry.name for one in directions})
+    return len(other.entries) <= len(found.entries) or ground.adds(other, found, choices(among, other, found))
