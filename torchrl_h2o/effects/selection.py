@@ -51,22 +51,6 @@ def joint_dofs(model: mujoco.MjModel, patterns: Names) -> list[int]:
     return [dof for dof in range(model.nv) if model.dof_jntid[dof] in chosen]
 
 
-def driven_dofs(model: mujoco.MjModel) -> frozenset[int]:
-    """Returns the degrees of freedom on which an actuator acts in some pose.
-
-    These are all of them in a model with equality constraints, which carry the actuators' forces to other joints.
-    """
-    if model.neq:
-        return frozenset(range(model.nv))
-    data, rng, driven = mujoco.MjData(model), np.random.default_rng(0), set()
-    for size in (0.0, 0.3, 1.0, 1.0):
-        mujoco.mj_integratePos(model, data.qpos, size * rng.standard_normal(model.nv), 1.0)
-        mujoco.mj_fwdPosition(model, data)
-        used = int(data.moment_rownnz.sum())
-        driven |= set(data.moment_colind[:used][np.abs(data.actuator_moment[:used]) > 1e-9].tolist())
-    return frozenset(driven)
-
-
 def body_ids(model: mujoco.MjModel, patterns: Names) -> list[int]:
     """Returns the ids of the matching bodies of a compiled model, except the world."""
     views = [model.body(i) for i in range(1, model.nbody)]
