@@ -242,16 +242,18 @@ def exported(tmp_path, simulation, *effects):
         ((LoadFriction(0.07, joints="knee"),), "m3"),
         ((LoadFriction(0.07, joints="knee"), StribeckFriction(0.03, 0.4, 0.05, joints="knee")), "m4"),
         ((LoadFriction(0.07, 0.2, joints="knee"), StribeckFriction(0.03, 0.4, 0.05, joints="knee")), "m5"),
+        ((StribeckFriction(0.03, 0.4, motor_square=0.3, weight_square=0.7, joints="knee"),), "m6"),
     ],
 )
-def test_bam_has_the_friction_of_the_mended_simulator(tmp_path, simulation, effects, kind):
+@pytest.mark.parametrize("command", [0.9, 0.2, -0.9])  # above the weight, below it, in its direction
+def test_bam_has_the_friction_of_the_mended_simulator(tmp_path, simulation, effects, kind, command):
     usual = (JointFrictionLoss(0.05, "knee"), Armature(0.01, "knee"))
     folder = exported(tmp_path, simulation, *usual, *effects)
     servo = json.loads((folder / "bam" / "knee.json").read_text())
     assert (servo["model"], servo["armature"], servo["friction_viscous"]) == (kind, 0.01, 0.1)
     model, velocity = simulation.with_effects(*usual, *effects).model, 0.3
     data = mujoco.MjData(model)
-    data.qpos, data.qvel[1], data.ctrl = (0.4, 0.7), velocity, (0.0, 0.9)
+    data.qpos, data.qvel[1], data.ctrl = (0.4, 0.7), velocity, (0.0, command)
     values = {"dof_frictionloss": model.dof_frictionloss[None].copy()}
     for variation in Pipeline(effects).variations(model):
         variation.apply(States.of(data), values)
@@ -267,12 +269,15 @@ def friction_of_bam(servo: dict, motor: float, external: float, velocity: float)
     moving = np.exp(-(abs(velocity / servo.get("dtheta_stribeck", 1.0)) ** servo.get("alpha", 1.0)))
 
     def load(end: str) -> float:
-        if servo["model"] == "m5":
+        if servo["model"] in ("m5", "m6"):
             shares = (servo[f"load_friction_{of}{end}"] for of in ("motor", "external"))
             return abs(sum(share * torque for share, torque in zip(shares, (motor, -external), strict=True)))
         return servo.get(f"load_friction{end or '_base'}", 0.0) * abs(motor - external)
 
     rest = servo.get("friction_stribeck", 0.0) + load("_stribeck")
+    if servo["model"] == "m6" and motor * external < 0.0:
+        of, weaker = ("external", external) if abs(external) < abs(motor) else ("motor", motor)
+        rest += servo[f"load_friction_{of}_quad"] * weaker**2
     return servo["friction_base"] + load("") + (moving * rest if "friction_stribeck" in servo else 0.0)
 
 

@@ -62,8 +62,9 @@ class StribeckFriction(VaryingEffect):
     r"""Dry friction in joints that is larger at rest than in motion.
 
     The friction exceeds the model's own by
-    :math:`e^{-|\dot q / v_s|^\alpha} \left(\tau_s + K_s |\tau_m - e\,\tau_w|\right)`, with the torques of
-    :class:`LoadFriction`.
+    :math:`e^{-|\dot q / v_s|^\alpha} \left(\tau_s + K_s |\tau_m - e\,\tau_w| + q\right)`, with the torques of
+    :class:`LoadFriction`. Where motor and weight pull in different directions, q is :math:`Q_w \tau_w^2` if the motor
+    is the stronger one, and :math:`Q_m \tau_m^2` if the weight is.
 
     Args:
         torque: :math:`\tau_s`, by which friction at rest exceeds that in motion, in N·m.
@@ -71,6 +72,8 @@ class StribeckFriction(VaryingEffect):
         share: :math:`K_s`, the same per load.
         weight: :math:`e`, as for :class:`LoadFriction`.
         exponent: :math:`\alpha`.
+        motor_square: :math:`Q_m`, in 1/(N·m).
+        weight_square: :math:`Q_w`, in 1/(N·m).
         joints: name patterns of the joints.
 
     Raises:
@@ -80,18 +83,21 @@ class StribeckFriction(VaryingEffect):
         >>> StribeckFriction(0.02, 0.5, joints="*knee*").describe()
         'dry friction of joints *knee* + 0.02 N·m and 0 of the load below about 0.5 rad/s'
 
-    Source: Duclusaud et al. (see :class:`LoadFriction`), :math:`K_{cs}` and :math:`K_{ls}` of its models M2, M4 and M5;
-    the exponent 2 is that of C. Canudas de Wit, H. Olsson, K. J. Åström, P. Lischinsky, *A New Model for Control of
-    Systems with Friction*, IEEE Transactions on Automatic Control 40 (1995), Eq. (5).
+    Source: Duclusaud et al. (see :class:`LoadFriction`), :math:`K_{cs}` and :math:`K_{ls}` of its models M2, M4 and M5,
+    and the quadratic terms of M6 as in the authors' code (github.com/Rhoban/bam, ``bam/model.py``); the exponent 2 is
+    that of C. Canudas de Wit, H. Olsson, K. J. Åström, P. Lischinsky, *A New Model for Control of Systems with
+    Friction*, IEEE Transactions on Automatic Control 40 (1995), Eq. (5).
     """
 
-    amounts: ClassVar[tuple[str, ...]] = ("torque", "share")
+    amounts: ClassVar[tuple[str, ...]] = ("torque", "share", "motor_square", "weight_square")
     wording: ClassVar[str] = "dry friction of {joints} + {torque} and {share} of the load below about {speed}"
     torque: float = parameter(unit="N·m", bounds=ANY_AMOUNT, neutral=0.0)
     speed: float = parameter(unit="rad/s", bounds=(1e-3, math.inf), neutral=math.inf)
     share: float = parameter(unit="1", bounds=_SHARES, neutral=0.0)
     weight: float = parameter(unit="1", bounds=_SHARES, neutral=1.0)
     exponent: float = parameter(unit="1", bounds=(0.1, 10.0), neutral=2.0)
+    motor_square: float = parameter(unit="1/(N·m)", bounds=ANY_AMOUNT, neutral=0.0)
+    weight_square: float = parameter(unit="1/(N·m)", bounds=ANY_AMOUNT, neutral=0.0)
     joints: Names = "*"
 
     def describe(self, names: EntryNames = NO_NAMES) -> str:
@@ -100,12 +106,22 @@ class StribeckFriction(VaryingEffect):
     def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         chosen = _mask(model, self.joints)
         load = _load(model, self.joints, self.weight, weight) if self.share else None
+        has_squares = self.motor_square or self.weight_square
+        actuators = JointActuators.on(model, self.joints) if has_squares else None
 
         def friction(states: States) -> np.ndarray:
             at_rest = np.exp(-(np.abs(states.qvel / self.speed) ** self.exponent))
-            return at_rest * (self.torque * chosen + (self.share * load(states) if load else 0.0))
+            at_load = self.share * load(states) if load else 0.0
+            squares = chosen * self._squares(actuators.torques(states), weight(states)) if actuators else 0.0
+            return at_rest * (self.torque * chosen + at_load + squares)
 
         return _added(friction)
+
+    def _squares(self, motor: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Friction that grows with the square of the weaker one of two torques in different directions, (B, nv)."""
+        by_motor = self.weight_square * weight**2 * (np.abs(motor) > np.abs(weight))
+        by_weight = self.motor_square * motor**2 * (np.abs(motor) < np.abs(weight))
+        return (by_motor + by_weight) * (np.sign(motor) != np.sign(weight))
 
 
 def _added(friction: BatchedForce) -> Variation:
@@ -120,8 +136,9 @@ def _added(friction: BatchedForce) -> Variation:
 
 def _details(effect: LoadFriction | StribeckFriction) -> str:
     """Words for what is rarely set."""
-    rare = {name: effect.parameters[name] for name in ("weight", "exponent") if name in effect.parameters}
-    return "".join(f", {name} {one.value:g}" for name, one in rare.items() if one.value != one.neutral)
+    names = ("weight", "exponent", "motor_square", "weight_square")
+    rare = {name: effect.parameters[name] for name in names if name in effect.parameters}
+    return "".join(f", {name.replace('_', ' ')} {one}" for name, one in rare.items() if one.value != one.neutral)
 
 
 def _mask(model: mujoco.MjModel, joints: Names) -> np.ndarray:

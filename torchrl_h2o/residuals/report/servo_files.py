@@ -48,7 +48,7 @@ def delay_of(effects: Sequence[Effect], actuators: Sequence[int]) -> float:
 def bam_files(report: ReportContents, simulation: Simulation) -> dict[str, str]:
     """Parameters of BAM's friction model as JSON, by the name of the driven joint.
 
-    The model is the simplest of M1 to M5 that holds the effects. BAM's loader also needs the name of the servo
+    The model is the simplest of M1 to M6 that holds the effects. BAM's loader also needs the name of the servo
     (``actuator``), which is left empty, and takes its own ``kt`` and ``R``, which positions do not tell.
 
     Source: github.com/Rhoban/bam, ``bam/model.py``; see :class:`~torchrl_h2o.effects.LoadFriction` for the paper.
@@ -75,8 +75,12 @@ def _bam(effects: Sequence[Effect], model: mujoco.MjModel, dof: int) -> dict[str
         "friction_base": float(model.dof_frictionloss[dof]),
         "friction_viscous": float(model.dof_damping[dof]),
     }
-    directional = any(one.weight != 1.0 for one in gears)
-    has_load = bool(load) or any(one.share for one in rest)
+    squares = {
+        f"load_friction_{of}_quad": sum(getattr(one, name) for one in rest)
+        for of, name in (("motor", "motor_square"), ("external", "weight_square"))
+    }
+    directional = any(one.weight != 1.0 for one in gears) or any(squares.values())
+    has_load = bool(load) or any(one.share for one in rest) or any(squares.values())
     if has_load:
         values |= _shares("load_friction", load, directional)
     if rest:
@@ -88,11 +92,12 @@ def _bam(effects: Sequence[Effect], model: mujoco.MjModel, dof: int) -> dict[str
         if has_load:
             values |= _shares("load_friction", rest, directional, "_stribeck")
     names = {(False, False): "m1", (True, False): "m2", (False, True): "m3", (True, True): "m4"}
-    # M5 alone tells motor and weight apart, and it has all other terms
-    values["model"] = "m5" if directional else names[bool(rest), has_load]
+    # M5 and M6 alone tell motor and weight apart, and have all other terms
+    values["model"] = ("m6" if any(squares.values()) else "m5") if directional else names[bool(rest), has_load]
     if directional:
         zeros = ("friction_stribeck", *(f"load_friction_{of}_stribeck" for of in ("motor", "external")))
         values = dict.fromkeys(zeros, 0.0) | {"dtheta_stribeck": 1.0, "alpha": 1.0} | values
+        values |= squares if any(squares.values()) else {}
     return values
 
 
