@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from cases import Case, Family
 from chains import MODEL_STEPS, torque_of_gravity
+from drawn_cases import TRIES
 from joint_case import JointCase
 from servos import STEP, Arm, Servo
 
@@ -35,7 +36,6 @@ NOISE = (0.001, 0.003)  # of the encoders, shares of the signals' standard devia
 ROWS = 3000  # 30 s
 SEEN, IN_ROWS = 3.0, 0.1  # change of a position, in its noise, that a cause makes in at least this share of the rows
 LOOKED_AT = 1000  # rows, 10 s, in which a cause is to be visible
-TRIES = 50  # draws of an arm until it is
 COUNTS = (1, 1, 3)  # joints, in turn
 #: what every joint has, so that no cause is named by it
 USUAL = (JointFrictionLoss, JointDamping, ServoDamping, Armature)

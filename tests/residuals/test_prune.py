@@ -1,5 +1,8 @@
 """What several joints have is dropped on all of them or on none; what the rows do not need goes."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
@@ -46,3 +49,26 @@ def test_the_better_effect_takes_the_place_of_another_and_what_is_idle_then_goes
     (bias,) = changed.effects
     assert isinstance(bias, ActionBias)
     assert bias.bias == pytest.approx(0.05, rel=0.05)
+
+
+@pytest.mark.parametrize(("worse_by", "takes_the_place"), [(0.0, True), (0.5, True), (1.0, False)])
+def test_a_usual_effect_takes_the_place_of_an_unusual_one_that_explains_hardly_more(
+    worse_by, takes_the_place, monkeypatch
+):
+    """Gravity needs 4 nats for being unusual. At 0.5 nats a block, the evidence for it is more than 3 nats."""
+    simulation = double_pendulum()
+    catalogue = [entry for entry in simulation.catalogue() if isinstance(entry.effect, Gravity | JointDamping)]
+    damping, gravity = (known_set(catalogue, (effect,)) for effect in (JointDamping(0.01), Gravity(0.9)))
+    ground = Ground.of(simulation, recorded(simulation.with_effects(JointDamping(0.01)), 400))
+    scatter = np.random.default_rng(0).standard_normal(40)
+    scatter -= scatter.mean()
+    damping = replace(damping, scores=np.zeros(40))
+    gravity = replace(gravity, scores=scatter + worse_by)
+    none = replace(ground.found((), ()), scores=np.full(40, -9.0))
+    sets = {one.names: one for one in (damping, gravity, none)}
+    monkeypatch.setattr(Ground, "fitted", lambda self, entries, effects: sets[frozenset(one.name for one in entries)])
+    monkeypatch.setattr(Ground, "found", Ground.fitted)
+    monkeypatch.setattr("torchrl_h2o.residuals.prune.Candidates.of", lambda *args: None)
+    monkeypatch.setattr("torchrl_h2o.residuals.prune.with_one_more", lambda *args, **options: [damping])
+    monkeypatch.setattr("torchrl_h2o.residuals.prune.prune", lambda ground, found: found)
+    assert replaced(ground, gravity, [], lambda: None)[0] is (damping if takes_the_place else gravity)

@@ -137,7 +137,7 @@ def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]
         one
         for one in fitted
         if is_usable(ground, one, fewer)
-        and min(Difference(found.scores - one.scores).evidence, advantage(found, one)) < ALIKE
+        and (Difference(found.scores - one.scores).evidence < ALIKE or advantage(found, one) < ALIKE)
     ]
 
 

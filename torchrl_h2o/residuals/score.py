@@ -298,16 +298,17 @@ class Model:
 
     def _scored(self, effects: tuple[Effect, ...]) -> tuple[np.ndarray, np.ndarray, bool]:
         if effects not in self._found:
-            errors, ahead = self.fit.errors(effects), self.selection.errors(effects)
-            by_block, one_step, scales = [], [], []
-            for part, error in ((self.fit, errors), (self.selection, ahead)):
-                scales.append(fitted_scales(part, error))
-                by_block.append(scores(part, error, scales[-1]))
-                density = _density(error[0][:, 0], part.variances[0][:, 0] + scales[-1][0][0]).sum(1)
+            parts = [(part, part.errors(effects)) for part in (self.fit, self.selection)]
+            scales = [fitted_scales(*each) for each in parts]
+            by_block = [scores(*each, scale) for each, scale in zip(parts, scales, strict=True)]
+            one_step = []
+            for (part, errors), scale in zip(parts, scales, strict=True):
+                density = _density(errors[0][:, 0], part.variances[0][:, 0] + scale[0][0]).sum(1)
                 block = part.blocks.windows[0].block
                 one_step.append(np.bincount(block, density) / np.bincount(block))
+            (in_fit, *_), _ = scales
             known = self.selection.variances[0][:, 0]
-            is_larger = np.median(scales[0][0][0] / np.median(known, axis=0)) > 1.0
-            is_white = self.fit.likeness_of_neighbours(errors) < WHITE
+            is_larger = np.median(in_fit[0] / np.median(known, axis=0)) > 1.0
+            is_white = self.fit.likeness_of_neighbours(parts[0][1]) < WHITE
             self._found[effects] = np.concatenate(by_block), np.concatenate(one_step), bool(is_larger and is_white)
         return self._found[effects]

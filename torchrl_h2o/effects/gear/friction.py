@@ -53,8 +53,13 @@ class LoadFriction(VaryingEffect):
         return super().describe(names) + _details(self)
 
     def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
-        load = _load(model, self.joints, self.weight, weight)
-        return _added(lambda states: self.share * load(states))
+        chosen, actuators = _mask(model, self.joints), JointActuators.on(model, self.joints)
+
+        def friction(states: States) -> np.ndarray:
+            carried = self.weight * weight(states) if self.weight else 0.0
+            return self.share * chosen * np.abs(actuators.torques(states) - carried)
+
+        return _added(friction)
 
 
 @dataclass(frozen=True)
@@ -105,23 +110,22 @@ class StribeckFriction(VaryingEffect):
 
     def vary(self, model: mujoco.MjModel, weight: BatchedForce) -> Variation:
         chosen = _mask(model, self.joints)
-        load = _load(model, self.joints, self.weight, weight) if self.share else None
-        has_squares = self.motor_square or self.weight_square
-        actuators = JointActuators.on(model, self.joints) if has_squares else None
+        depends_on_load = self.share or self.motor_square or self.weight_square
+        actuators = JointActuators.on(model, self.joints) if depends_on_load else None
 
         def friction(states: States) -> np.ndarray:
             at_rest = np.exp(-(np.abs(states.qvel / self.speed) ** self.exponent))
-            at_load = self.share * load(states) if load else 0.0
-            squares = chosen * self._squares(actuators.torques(states), weight(states)) if actuators else 0.0
-            return at_rest * (self.torque * chosen + at_load + squares)
+            loaded = self._loaded(actuators.torques(states), weight(states)) if actuators else 0.0
+            return at_rest * chosen * (self.torque + loaded)
 
         return _added(friction)
 
-    def _squares(self, motor: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Friction that grows with the square of the weaker one of two torques in different directions, (B, nv)."""
+    def _loaded(self, motor: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """The part of the friction at rest that the torques of motors and weight cause, (B, nv)."""
         by_motor = self.weight_square * weight**2 * (np.abs(motor) > np.abs(weight))
         by_weight = self.motor_square * motor**2 * (np.abs(motor) < np.abs(weight))
-        return (by_motor + by_weight) * (np.sign(motor) != np.sign(weight))
+        squares = (by_motor + by_weight) * (np.sign(motor) != np.sign(weight))
+        return self.share * np.abs(motor - self.weight * weight) + squares
 
 
 def _added(friction: BatchedForce) -> Variation:
@@ -146,16 +150,3 @@ def _mask(model: mujoco.MjModel, joints: Names) -> np.ndarray:
     mask = np.zeros(model.nv)
     mask[selection.joint_dofs(model, joints)] = 1.0
     return mask
-
-
-def _load(model: mujoco.MjModel, joints: Names, share_of_weight: float, weight: BatchedForce) -> BatchedForce:
-    """The load on the gears of joints as a function of states, (B, nv); 0 for other joints."""
-    chosen, actuators = _mask(model, joints), JointActuators.on(model, joints)
-
-    def load(states: States) -> np.ndarray:
-        torque = actuators.torques(states)
-        if share_of_weight:
-            torque = torque - share_of_weight * weight(states)
-        return chosen * np.abs(torque)
-
-    return load

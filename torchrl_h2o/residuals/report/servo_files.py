@@ -79,8 +79,9 @@ def _bam(effects: Sequence[Effect], model: mujoco.MjModel, dof: int) -> dict[str
         f"load_friction_{of}_quad": sum(getattr(one, name) for one in rest)
         for of, name in (("motor", "motor_square"), ("external", "weight_square"))
     }
-    directional = any(one.weight != 1.0 for one in gears) or any(squares.values())
-    has_load = bool(load) or any(one.share for one in rest) or any(squares.values())
+    has_squares = any(squares.values())
+    directional = has_squares or any(one.weight != 1.0 for one in gears)
+    has_load = has_squares or bool(load) or any(one.share for one in rest)
     if has_load:
         values |= _shares("load_friction", load, directional)
     if rest:
@@ -93,12 +94,11 @@ def _bam(effects: Sequence[Effect], model: mujoco.MjModel, dof: int) -> dict[str
             values |= _shares("load_friction", rest, directional, "_stribeck")
     names = {(False, False): "m1", (True, False): "m2", (False, True): "m3", (True, True): "m4"}
     # M5 and M6 alone tell motor and weight apart, and have all other terms
-    values["model"] = ("m6" if any(squares.values()) else "m5") if directional else names[bool(rest), has_load]
+    values["model"] = "m6" if has_squares else "m5" if directional else names[bool(rest), has_load]
     if directional:
         zeros = ("friction_stribeck", *(f"load_friction_{of}_stribeck" for of in ("motor", "external")))
         values = dict.fromkeys(zeros, 0.0) | {"dtheta_stribeck": 1.0, "alpha": 1.0} | values
-        values |= squares if any(squares.values()) else {}
-    return values
+    return values | squares if has_squares else values
 
 
 def _shares(
