@@ -14,7 +14,7 @@ from drawn_cases import DECOY, JOINT_BY_JOINT, NOISY_TORQUES, NOTHING, SEVERAL, 
 from machine_cases import MACHINE
 from paper_cases import PAPER, PAPER_WITH_NOISE
 from robot_cases import ROBOT
-from servo_cases import SERVO_CONTROLS, SERVOS
+from servo_cases import SERVO_CONTROLS, SERVO_DRIVES, SERVOS
 from version_cases import VERSIONS
 
 from torchrl_h2o.comparison.records import Record
@@ -39,6 +39,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
         "versions": VERSIONS,
         "servos": SERVOS,
         "servo_controls": SERVO_CONTROLS,
+        "servo_drives": SERVO_DRIVES,
     }
 )
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from cases import Case, Family
@@ -18,15 +19,20 @@ from torchrl_h2o.effects import (
     ActionLag,
     ActionLead,
     Armature,
+    BodyCentreOfMass,
     BodyInertia,
+    BodyMass,
     Effect,
     GearPlay,
     JointDamping,
     JointFrictionLoss,
     LoadFriction,
     ObservationDelay,
+    Payload,
+    PseudoInertia,
     ServoDamping,
     ServoDeadBand,
+    ServoStiffness,
     StribeckFriction,
     TorqueSpeedLine,
 )
@@ -48,8 +54,34 @@ KINDS: Mapping[str, tuple[tuple[type[Effect], ...], ...]] = {
     "lead": ((ActionLead,),),
     "sag": ((TorqueSpeedLine,),),
     "delay": ((ActionDelay, ActionLag, ObservationDelay),),
+    "gain": ((ServoStiffness,),),
+    "lag": ((ActionLag, ActionDelay, ObservationDelay),),
+    "dead": ((ServoDeadBand, GearPlay),),
+    "box": ((PseudoInertia, BodyCentreOfMass, BodyMass, BodyInertia, Payload),),
 }
-CAUSES = tuple(KINDS)
+#: ranges of the parameters of a servo that each cause changes, drawn with even logarithms
+RANGES: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "M1": {},
+    "M3": {"load": (0.05, 0.25)},
+    "M4": {
+        "load": (0.03, 0.15),
+        "rest": (0.02, 0.1),  # in largest torques of gravity
+        "rest_load": (0.05, 0.15),
+        "speed": (0.1, 2.0),
+        "exponent": (1.0, 2.0),
+    },
+    "play": {"play": (0.01, 0.04)},
+    "lead": {"lead": (0.01, 0.04)},
+    "sag": {"stall": (0.8, 1.5), "no_load": (1.5, 4.0)},  # the first in largest torques of gravity
+    "delay": {"delay": (0.005, 0.02)},
+    "gain": {"gain": (0.6, 0.9)},
+    "lag": {"lag": (0.01, 0.05)},
+    "dead": {"dead": (0.01, 0.04)},
+    "box": {"load_mass": (0.3, 1.0), "load_place": (0.3, 0.9), "load_offset": (0.4, 0.8)},  # the first in link masses
+}
+CAUSES = ("M1", "M3", "M4", "play", "lead", "sag", "delay")
+DRIVES = ("gain", "lag", "dead", "box")
+ON_ONE_BUS = ("delay", "lag")  # causes that all servos have with the same values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,57 +98,27 @@ class ServoCase(JointCase):
     @property
     def words(self) -> str:
         first = self.machine.servos[0]
-        told = ", ".join(f"{name} {getattr(first, name):.3g}" for name in PARTS[self.cause])
+        told = ", ".join(f"{name} {getattr(first, name):.3g}" for name in RANGES[self.cause])
         return f"{self.cause} ({told})" if told else self.cause
 
 
-#: parameters of a servo that belong to each cause
-PARTS: Mapping[str, tuple[str, ...]] = {
-    "M1": (),
-    "M3": ("load",),
-    "M4": ("load", "rest", "rest_load", "speed", "exponent"),
-    "play": ("play",),
-    "lead": ("lead",),
-    "sag": ("stall", "no_load"),
-    "delay": ("delay",),
-}
-
-
 def with_cause(arm: Arm, cause: str, rng: np.random.Generator) -> Arm:
-    """Put a cause into all servos of an arm, with the same values but for scatter."""
-
-    def uniform(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
-
-    drawn = {
-        "M1": {},
-        "M3": {"load": uniform(0.05, 0.25)},
-        "M4": {
-            "load": uniform(0.03, 0.15),
-            "rest": uniform(0.02, 0.1),
-            "rest_load": uniform(0.05, 0.15),
-            "speed": math.exp(uniform(math.log(0.1), math.log(2.0))),
-            "exponent": uniform(1.0, 2.0),
-        },
-        "play": {"play": uniform(0.01, 0.04)},
-        "lead": {"lead": uniform(0.01, 0.04)},
-        "sag": {"stall": uniform(0.8, 1.5), "no_load": uniform(1.5, 4.0)},
-        "delay": {"delay": uniform(0.005, 0.02)},
-    }[cause]
+    """Put a cause into all servos of an arm, with the same values but for scatter; a box on the last link alone."""
+    drawn = {name: math.exp(rng.uniform(*np.log(ends))) for name, ends in RANGES[cause].items()}
     servos = []
     for index, servo in enumerate(arm.servos):
         weight = torque_of_gravity(arm.servos[index:])
-        own = {name: value * uniform(0.9, 1.1) for name, value in drawn.items()}
-        if cause == "delay":  # one bus
-            own = dict(drawn)
+        own = {name: value * (1.0 if cause in ON_ONE_BUS else rng.uniform(0.9, 1.1)) for name, value in drawn.items()}
         own |= {name: weight * own[name] for name in ("rest", "stall") if name in own}
-        servos.append(replace(servo, **own))
+        own |= {name: servo.mass * own[name] for name in ("load_mass",) if name in own}
+        is_without = cause == "box" and index < len(arm.servos) - 1
+        servos.append(servo if is_without else replace(servo, **own))
     return Arm(tuple(servos))
 
 
-def servo(number: int, rng: np.random.Generator) -> ServoCase:
+def servo(number: int, rng: np.random.Generator, causes: Sequence[str] = CAUSES) -> ServoCase:
     """Each cause in turn, in an arm in which it is visible; every other log has positions alone."""
-    cause = CAUSES[number % len(CAUSES)]
+    cause = causes[number % len(causes)]
     noise, seed = float(rng.uniform(*NOISE)), int(rng.integers(2**31))
     for _ in range(TRIES):
         plain = Arm.draw(rng, COUNTS[number % len(COUNTS)])
@@ -166,17 +168,23 @@ def effects_of(arm: Arm) -> tuple[Effect, ...]:
             ActionLead(one.lead, (index,)),
             TorqueSpeedLine(one.stall, one.no_load, (index,)),
             ActionDelay(one.delay, (index,)),
+            ServoStiffness(one.gain, (index,)),
+            ActionLag(one.lag, (index,)),
+            ServoDeadBand(one.dead, (index,)),
         )
         found += [effect for effect in drawn if not effect.is_neutral]
+        if one.load_mass:
+            x, z = one.load_offset * one.length, -one.load_place * one.length
+            found.append(Payload(one.load_mass, x, z, 0.5 * x, bodies=f"link{index}"))
         if one.rest:
             found.append(StribeckFriction(one.rest, one.speed, one.rest_load, exponent=one.exponent, joints=name))
     return tuple(found)
 
 
-def control(number: int, rng: np.random.Generator) -> ServoCase:
+def control(number: int, rng: np.random.Generator, causes: Sequence[str] = CAUSES) -> ServoCase:
     """The arm of a drawn servo without its cause."""
-    drawn = servo(number, rng)
-    plain = {name: Servo.__dict__[name] for parts in PARTS.values() for name in parts}
+    drawn = servo(number, rng, causes)
+    plain = {name: Servo.__dict__[name] for ranges in RANGES.values() for name in ranges}
     arm = Arm(tuple(replace(one, **plain) for one in drawn.machine.servos))
     return replace(drawn, machine=arm, truth=effects_of(arm), cause="M1", name=f"without {drawn.name}")
 
@@ -217,5 +225,7 @@ def _is_of_a_step(effect: Effect) -> bool:
     return late and all(parameter.value <= STEP / MODEL_STEPS for parameter in effect.parameters.values())
 
 
-SERVOS = Family(servo, 20, 17, "the cause named beside friction and rotors, and no other", stream=13)
+_NAMED = "the cause named beside friction and rotors, and no other"
+SERVOS = Family(servo, 20, 17, _NAMED, stream=13)
 SERVO_CONTROLS = Family(control, 20, 20, "friction and rotors alone", stream=SERVOS.stream)
+SERVO_DRIVES = Family(partial(servo, causes=DRIVES), 12, 10, _NAMED, stream=14)

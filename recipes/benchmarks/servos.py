@@ -36,6 +36,12 @@ class Servo(Joint):
         stall: largest torque at rest, in N·m.
         no_load: velocity at which no torque is left, in rad/s.
         delay: time by which commands act late, in s.
+        gain: factor on the stiffness of the data sheet.
+        lag: time constant of a filter of the commands, in s.
+        dead: error up to which the servo makes no torque, in rad.
+        load_mass: mass beside the link, on a box that the model lacks, in kg.
+        load_place: place of the box along the link, as a share of its length.
+        load_offset: its distance to the side, as a share of the link's length.
     """
 
     load: float = 0.0
@@ -48,6 +54,12 @@ class Servo(Joint):
     stall: float = math.inf
     no_load: float = math.inf
     delay: float = 0.0
+    gain: float = 1.0
+    lag: float = 0.0
+    dead: float = 0.0
+    load_mass: float = 0.0
+    load_place: float = 0.5
+    load_offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,6 +110,11 @@ class Arm:
             if servo.play:
                 stop = f'limited="true" range="{-servo.play / 2.0} {servo.play / 2.0}" solreflimit="0.001 1"'
                 hinges[-1] += f'<joint name="play{index}" axis="{axis(index)}" {stop}/>'
+            if servo.load_mass:
+                x, z = servo.load_offset * servo.length, -servo.load_place * servo.length
+                size = f"{0.3 * servo.length} {0.1 * servo.length} {0.2 * servo.length}"
+                box = f'pos="{x} {0.5 * x} {z}" euler="0.5 0.5 0" size="{size}" mass="{servo.load_mass}"'
+                hinges[-1] += f'<geom name="box{index}" type="box" {box}/>'
         drives = [f'<motor joint="{name}"/>' for name in self.names]
         return mjcf(self.servos, hinges, drives, STEP / SUBSTEPS)
 
@@ -109,6 +126,8 @@ class Arm:
         values = {one.name: np.array([getattr(servo, one.name) for servo in self.servos]) for one in fields(Servo)}
         waiting = [deque([0.0] * round(servo.delay * SUBSTEPS / STEP)) for servo in self.servos]
         before = targets[0]
+        filtered, step = np.array(before), STEP / SUBSTEPS
+        share = -np.expm1(-step / np.maximum(values["lag"], 1e-9))  # of the way to a command in a physics step
 
         def state() -> np.ndarray:
             moved = [np.where(plays >= 0, part[plays], 0.0) + part[motors] for part in (data.qpos, data.qvel)]
@@ -122,8 +141,11 @@ class Arm:
                 for queue, command in zip(waiting, led, strict=True):
                     queue.append(command)
                 late = np.array([queue.popleft() for queue in waiting])
+                filtered += share * (late - filtered)
                 position, velocity = np.split(state(), 2)
-                torque = values["stiffness"] * (late - position) - values["brake"] * velocity
+                error = filtered - position
+                error -= np.clip(error, -values["dead"], values["dead"])
+                torque = values["gain"] * values["stiffness"] * error - values["brake"] * velocity
                 ratio = data.qvel[motors] / values["no_load"]
                 data.ctrl[:] = np.clip(torque, -values["stall"] * (1.0 + ratio), values["stall"] * (1.0 - ratio))
                 model.dof_frictionloss[motors] = _friction(values, data.ctrl, data, motors)
