@@ -25,7 +25,15 @@ from torchrl_h2o.effects.catalogue.entry import entry_of
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.gains import Gains
 from torchrl_h2o.residuals.ground import Found, Ground, surprise_of
-from torchrl_h2o.residuals.grow import Candidates, choices, gains_beside, is_preferred, most_usual, with_one_more
+from torchrl_h2o.residuals.grow import (
+    Candidates,
+    choices,
+    gains_beside,
+    is_preferred,
+    most_usual,
+    on_best_elements,
+    with_one_more,
+)
 from torchrl_h2o.residuals.sweep import Direction, sweep
 from torchrl_h2o.residuals.whitened import flat
 
@@ -112,6 +120,18 @@ def test_of_sets_that_explain_equally_well_the_one_of_all_joints_is_taken():
     )
     assert most_usual([of_one, of_all]) is of_all
     assert is_preferred(of_all, of_one)
+
+
+def test_an_effect_that_is_there_acts_on_the_elements_with_the_best_score():
+    def with_friction(joints, mean):
+        effect = JointFrictionLoss(0.1, joints)
+        return Found((entry_of(effect, CATALOGUE),), (effect,), mean + 0.01 * np.arange(20.0) % 0.07)
+
+    nothing = Found((), (), np.zeros(20))
+    of_all, of_one = with_friction("*", 9.0), with_friction("elbow", 6.0)
+    delay = Found((entry_of(ActionDelay(0.1), CATALOGUE),), (ActionDelay(0.1),), np.full(20, 12.0))
+    assert on_best_elements([of_one], [delay, of_all, of_one], nothing) is of_all
+    assert on_best_elements([of_all], [delay, of_all, of_one], nothing) is of_all
 
 
 def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():

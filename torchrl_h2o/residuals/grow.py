@@ -101,7 +101,7 @@ def grow(
             _remember(tried, one, found)
         better = [one for one in fitted if ground.adds(one, found, choices(among, one, found))]
         if better:
-            best = most_usual(better)
+            best = on_best_elements(better, fitted, found)
             before, found, refused = found, ground.fitted(best.entries, best.effects), set()
             advance(found, before)
             if _is_many(best, before) or ground.leaves_little(found):  # many change how candidates change the errors
@@ -112,6 +112,20 @@ def grow(
         else:
             break
     return found
+
+
+def on_best_elements(better: Sequence[Found], fitted: Sequence[Found], before: Found) -> Found:
+    """The most usual of better sets, or one that adds effects of the same kinds elsewhere and predicts better.
+
+    Whether an effect is there is one question. On which joints, motors or geoms it acts is another, for which no
+    further evidence is needed: one of them it must be.
+    """
+
+    def added(one: Found) -> set[type]:
+        return {type(effect) for effect in one.without(before.names)[1]}
+
+    best = most_usual(better)
+    return most_usual([best, *(one for one in fitted if added(one) == added(best))])
 
 
 def choices(among: int, more: Found, less: Found) -> int:
