@@ -41,6 +41,7 @@ from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
 from torchrl_h2o.training.task import Task
+from torchrl_h2o.training.warm_start import HELD, clone_behaviour, hold
 
 
 @hydra_main("config", "h2o_plus", RunOptions)
@@ -97,6 +98,9 @@ def train(cfg: DictConfig, folder: Path) -> None:
         observation_dim, action_dim, cfg.num_cells, layer_norm=cfg.layer_norm, ensemble=cfg.num_qvalue_nets
     )
 
+    if cfg.warm_start:  # begins at the behaviour in the real data, and stays there while the critics learn its value
+        clone_behaviour(actor, action_spec, shown, cfg.seed)
+
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     value_loss = make_value_loss(cfg, observation_dim)  # with V; expectile, sparse or exponential
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_dim, replay, delayed=True)
@@ -139,13 +143,15 @@ def train(cfg: DictConfig, folder: Path) -> None:
             replay.extend(simulated)
 
             # Update
-            for _ in training.epoch_updates():
+            for update in training.epoch_updates():
                 batch = replay.sample(cfg.batch_size)
                 pairs = pairs_replay.sample(cfg.discriminator_batch_size)
                 losses = loss_fn(batch, pairs)
                 training.check(losses)  # a loss that is not finite ends the run, and the last checkpoint stays
                 optimiser.zero_grad()
                 total_loss(losses).backward()
+                if cfg.warm_start and epoch * cfg.updates_per_epoch + update < HELD:
+                    hold(actor.parameters())
                 optimiser.step()
                 targets.step()
             schedule.step()

@@ -28,6 +28,9 @@ SMALL = [
     "discriminator_batch_size=[8,8]",
     "render=false",
     "threads=1",
+    "mend=false",  # the last three are the defaults of train.py
+    "warm_start=false",
+    "keep=last",
 ]
 ROBOT = ["env.make.max_episode_steps=40", "env.recording.num_transitions=200"]
 

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
 from torchrl_h2o.objectives import make_actor, make_qvalue, total_loss
 from torchrl_h2o.training.cuda_graph import as_cuda_graph
+from torchrl_h2o.training.warm_start import hold
 
 
 @dataclass
@@ -67,15 +68,17 @@ class Learner:
         first, second = self.batch_sizes
         return [self.replay.sample(first), self.pairs.sample(second)]
 
-    def update(self) -> dict[str, torch.Tensor]:
-        """Makes one update of all networks and returns the terms."""
+    def update(self, is_held: bool = False) -> dict[str, torch.Tensor]:
+        """Makes one update of all networks, or of all but the policy, and returns the terms."""
         self.batches = self.sample()
-        return self.learn(*self.batches)
+        return self._learn(*self.batches, is_held=True) if is_held else self.learn(*self.batches)
 
-    def _learn(self, *batches: TensorDictBase) -> dict[str, torch.Tensor]:
+    def _learn(self, *batches: TensorDictBase, is_held: bool = False) -> dict[str, torch.Tensor]:
         losses = self.terms_of(*batches)
         self.optimiser.zero_grad()
         total_loss(losses).backward()
+        if is_held:
+            hold(self.actor.parameters())
         self.optimiser.step()
         self.targets.step()
         return {name: loss.detach() for name, loss in losses.items()}

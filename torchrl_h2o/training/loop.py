@@ -29,6 +29,7 @@ from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import keeps_best
+from torchrl_h2o.training.warm_start import HELD, clone_behaviour
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
 
@@ -64,6 +65,7 @@ class Trainee:
         task, self._preprocessing = task_of(cfg), preprocessing_of(cfg)
         reality = task.make_reality(preprocessing=self._preprocessing)
         observation_dim = reality.observation_spec["observation"].shape[-1]
+        self._action_spec = reality.action_spec_unbatched
         with replay.device:
             action_spec = reality.action_spec_unbatched.to(replay.device)
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
@@ -100,6 +102,12 @@ class Trainee:
     def _copy_to_cpu(self) -> None:
         if self._actor is not self.learner.actor:
             self._actor.load_state_dict(self.learner.actor.state_dict())
+
+    def clone_behaviour(self, real: TensorDictBase) -> None:
+        """Lets the policy begin at the behaviour in the real data, ``[T]``, if ``warm_start`` requires it."""
+        if self.cfg.warm_start:
+            shown = self._preprocessing.apply(real).to(self.learner.replay.device)
+            clone_behaviour(self.learner.actor, self._action_spec, shown, self.cfg.seed)
 
     def begin_epoch(self, epoch: int) -> None:
         """Seeds torch and the simulator for the epoch, and collects the epoch's transitions."""
@@ -150,6 +158,7 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     replay = make_replay(cfg, real)
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
+    trainee.clone_behaviour(real)
     if learner.trains_discriminators:
         learner.pairs = trainee.make_pairs(real)
     if replay.device.type == "cpu":
@@ -165,8 +174,9 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     with closing(trainee):
         for epoch, evaluating in training.epochs():
             trainee.begin_epoch(epoch)
-            for _ in training.epoch_updates():
-                losses = learner.update()
+            for update in training.epoch_updates():
+                is_held = cfg.warm_start and epoch * cfg.updates_per_epoch + update < HELD
+                losses = learner.update(is_held)
                 training.check(losses)
             schedule.step()
             if evaluating:

@@ -13,6 +13,7 @@ from torchrl_h2o.training.cuda_graph import as_cuda_graph
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.populations.population import Population
 from torchrl_h2o.training.populations.replay import PopulationReplay
+from torchrl_h2o.training.warm_start import hold
 
 
 class PopulationLearner:
@@ -25,10 +26,13 @@ class PopulationLearner:
         replay: the members' data.
         lr: learning rate of Adam.
         tau: weight of the online networks in an update of the target networks.
+        held: number of first updates in which the policies stay as they are.
     """
 
-    def __init__(self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float) -> None:
-        self.learners, self.replay, self.tau = learners, replay, tau
+    def __init__(
+        self, learners: Sequence[Learner], replay: PopulationReplay, lr: float, tau: float, held: int = 0
+    ) -> None:
+        self.learners, self.replay, self.tau, self.held = learners, replay, tau, held
         self.population = Population([cast(nn.Module, learner.terms_of) for learner in learners])  # H2O+'s are its loss
         self.losses_of: Callable[..., dict[str, Tensor]] = self.population  # may be compiled
         self.optimiser = torch.optim.Adam(self.population.parameters(), lr=lr, fused=True)
@@ -56,6 +60,8 @@ class PopulationLearner:
             self._note_failures(healthy, terms)
         for number in self.failures:
             self.population.stop(number, self.optimiser)
+        if self.updates < self.held:
+            hold(self.population.policies)
         step()
         self.updates += 1
         return terms

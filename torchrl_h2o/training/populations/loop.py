@@ -29,6 +29,7 @@ from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed, write_metrics
+from torchrl_h2o.training.warm_start import HELD
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
@@ -134,7 +135,9 @@ def train_population(
         if own.gap not in pairs:
             pairs[own.gap] = trainees[name].make_pairs(real)
         trainees[name].learner.pairs = pairs[own.gap]
-    learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau)
+        trainees[name].clone_behaviour(real)
+    held = HELD if cfg.warm_start else 0
+    learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau, held)
     if replay.device.type != "cpu" and cfg.compiled is not False:  # on a CPU, compiled stacked networks are slower
         learner.use_cuda_graphs()
     budget = Budget.from_config(cfg)

@@ -119,6 +119,13 @@ class Population(nn.Module):
                 source = self.stacked.get((*owner, name.removeprefix("target_")))
                 self.stacked.get(path).data.lerp_(source.data, 1.0 - (1.0 - tau))  # rounds like SoftUpdate
 
+    @property
+    def policies(self) -> list[Tensor]:
+        """The stacked parameters of the members' policies, as the optimiser has them."""
+        own = {id(parameter) for parameter in self.parameters()}
+        stacks = [self.stacked.get(path) for path in self._paths if path[-1] == "actor_network_params"]
+        return [leaf for stack in stacks for leaf in stack.values(True, True) if id(leaf) in own]
+
     def finite(self) -> Tensor:
         """Whether all parameters of a member are finite, ``[N]``."""
         leaves = [leaf.detach().isfinite().reshape(len(self), -1).all(1) for leaf in self.parameters()]

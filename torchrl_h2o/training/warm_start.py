@@ -1,0 +1,52 @@
+"""The option ``warm_start``: a training begins at the behaviour in the real data, and its critics learn that first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
+from torch.optim.lr_scheduler import LinearLR
+from torchrl.data import Bounded
+from torchrl.objectives import BCLoss
+
+CLONED = 2000  # updates of behaviour cloning
+ROWS = 256  # of each
+LR = 1e-3  # at the first of them; it falls to zero
+HELD = 1000  # first updates of a training in which the cloned policy stays as it is
+INSIDE = 1e-3  # share of their range by which actions at its ends are moved inside, because a tanh never reaches them
+
+
+def clone_behaviour(
+    actor: ProbabilisticTensorDictSequential, action_spec: Bounded, real: TensorDictBase, seed: int
+) -> None:
+    """Fits a policy to the actions in real data, with TorchRL's loss.
+
+    Args:
+        actor: the policy.
+        action_spec: spec of the actions.
+        real: the measured transitions with the run's preprocessing, ``[T]``.
+        seed: the run's seed.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    loss, shown = BCLoss(actor), real.select(*actor.in_keys, "action")
+    low, high = action_spec.space.low.to(real.device), action_spec.space.high.to(real.device)
+    edge = INSIDE * (high - low)
+    shown["action"] = shown["action"].clamp(low + edge, high - edge)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=LR)
+    schedule = LinearLR(optimiser, 1.0, 0.0, total_iters=CLONED)
+    for _ in range(CLONED):
+        chosen = torch.randint(len(shown), (min(ROWS, len(shown)),), generator=generator)
+        loss(shown[chosen])["loss_bc"].backward()
+        optimiser.step()
+        optimiser.zero_grad()
+        schedule.step()
+
+
+def hold(parameters: Iterable[Tensor]) -> None:
+    """Takes the gradients of a policy's parameters, so that Adam, which has not moved them yet, leaves them."""
+    for parameter in parameters:
+        if parameter.grad is not None:
+            parameter.grad.zero_()
