@@ -7,7 +7,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from torchrl_h2o.training.returns import Evaluation, evaluate
 from torchrl_h2o.whole_file import write_text
 
 DATA = "the data's behaviour"
+COLLAPSED = 0.1  # mean weight of simulated rows below which a training hardly uses the simulator
 
 
 def judge(
@@ -70,11 +71,46 @@ def judge(
         "return_trial": best_trial(trainings[main].rows),
         "return_data": behaviour.summary(),
         "baselines": {name: in_reality[name].summary() for name in policies if name != main},
+        "warnings": warnings_of(cfg, in_reality[main], behaviour, trainings[main].rows),
         "updates_per_second": trainings[main].updates_per_second,
         "wall_s": wall_s + time.perf_counter() - start,
     }
     write_summary(directory, summary)
     return in_reality | {DATA: behaviour}
+
+
+def warnings_of(
+    cfg: DictConfig, result: Evaluation, behaviour: Evaluation, rows: Sequence[Mapping[str, Any]]
+) -> list[str]:
+    """Says that a policy is worse than the data's behaviour, or that its training hardly used the simulator.
+
+    Args:
+        cfg: the run's configuration.
+        result: the policy's evaluation in reality.
+        behaviour: the episodes in the data. Of longer ones than an evaluation, the first part counts.
+        rows: metrics of the training.
+
+    Returns:
+        Sentences with what to do; empty if there is nothing to say.
+    """
+    found, limit = [], cfg.env.make.get("max_episode_steps") or max(result.lengths)
+    share = min(1.0, limit / behaviour.mean_length)
+    if result.mean < behaviour.mean * share:
+        wanted = {"mend": True, "warm_start": True, "keep": "best_in_simulator"}
+        options = " ".join(f"{key}={str(value).lower()}" for key, value in wanted.items() if cfg.get(key) != value)
+        remedy = f"set {options}" if options else "train with another seed, or record more data"
+        found.append(
+            f"the policy is worse in reality than the data's behaviour, whose return is {behaviour.mean * share:.0f}: "
+            f"do not use it; {remedy}"
+        )
+    weight = rows[-1].get("ratio_of_sim") if rows else None
+    if weight is not None and weight < COLLAPSED:
+        remedy = "train without weights: ratio=false" if cfg.get("mend") else "set mend=true"
+        found.append(
+            f"the mean weight of simulated rows is {weight:.2g}, because they hardly look real: the training made "
+            f"little use of the simulator; {remedy}"
+        )
+    return found
 
 
 def best_trial(rows: Iterable[Mapping[str, Any]]) -> float | None:
@@ -142,8 +178,15 @@ def table_of_run(
         f"\nresults    {folder}/summary.json, metrics.csv",
         f"look at    {folder}/learning_curve.png" + (f", {film.name}" if film else ""),
         f"replay     python recipes/evaluate.py checkpoint={folder}",
+        *(f"warning    {warning}" for warning in _warnings_in(directory)),
     ]
     return "\n".join(lines)
+
+
+def _warnings_in(directory: Path) -> list[str]:
+    """The warnings in the summary of a run; none if it has no summary, or one of an earlier version."""
+    summary = directory / "summary.json"
+    return json.loads(summary.read_text()).get("warnings", []) if summary.exists() else []
 
 
 def table_of_population(
@@ -170,6 +213,7 @@ def table_of_population(
         f"\nresults    {folder}/*/summary.json, metrics.csv, learning_curve.png",
         *([] if best is None else [f"use        {best}, the best in the simulator: {tried[best]:.0f}"]),
         f"replay     python recipes/evaluate.py checkpoint={folder}/{best or next(iter(in_reality))}",
+        *(f"warning    {name}: {warning}" for name in in_reality for warning in _warnings_in(directory / name)),
     ]
     return "\n".join(lines)
 

@@ -12,6 +12,7 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorSpec
@@ -107,7 +108,8 @@ class Trainee:
         """Lets the policy begin at the behaviour in the real data, ``[T]``, if ``warm_start`` requires it."""
         if self.cfg.warm_start:
             shown = self._preprocessing.apply(real).to(self.learner.replay.device)
-            clone_behaviour(self.learner.actor, self._action_spec, shown, self.cfg.seed)
+            actor = cast(TensorDictModule, self.learner.actor)
+            clone_behaviour(actor, self._action_spec, shown, self.cfg.seed)
 
     def begin_epoch(self, epoch: int) -> None:
         """Seeds torch and the simulator for the epoch, and collects the epoch's transitions."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.optim.lr_scheduler import LinearLR
-from torchrl.data import Bounded
+from torchrl.data import TensorSpec
+from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.objectives import BCLoss
 
 CLONED = 2000  # updates of behaviour cloning
@@ -19,9 +21,7 @@ HELD = 1000  # first updates of a training in which the cloned policy stays as i
 INSIDE = 1e-3  # share of their range by which actions at its ends are moved inside, because a tanh never reaches them
 
 
-def clone_behaviour(
-    actor: ProbabilisticTensorDictSequential, action_spec: Bounded, real: TensorDictBase, seed: int
-) -> None:
+def clone_behaviour(actor: TensorDictModule, action_spec: TensorSpec, real: TensorDictBase, seed: int) -> None:
     """Fits a policy to the actions in real data, with TorchRL's loss.
 
     Args:
@@ -32,7 +32,8 @@ def clone_behaviour(
     """
     generator = torch.Generator().manual_seed(seed)
     loss, shown = BCLoss(actor), real.select(*actor.in_keys, "action")
-    low, high = action_spec.space.low.to(real.device), action_spec.space.high.to(real.device)
+    space = cast(ContinuousBox, action_spec.space)
+    low, high = space.low.to(real.device), space.high.to(real.device)
     edge = INSIDE * (high - low)
     shown["action"] = shown["action"].clamp(low + edge, high - edge)
     optimiser = torch.optim.Adam(loss.parameters(), lr=LR)

@@ -123,7 +123,8 @@ class Population(nn.Module):
     def policies(self) -> list[Tensor]:
         """The stacked parameters of the members' policies, as the optimiser has them."""
         own = {id(parameter) for parameter in self.parameters()}
-        stacks = [self.stacked.get(path) for path in self._paths if path[-1] == "actor_network_params"]
+        paths = [path for path in self._paths if path[-1] == "actor_network_params"]
+        stacks = [cast(TensorDictBase, self.stacked.get(path)) for path in paths]
         return [leaf for stack in stacks for leaf in stack.values(True, True) if id(leaf) in own]
 
     def finite(self) -> Tensor:
