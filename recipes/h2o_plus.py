@@ -1,9 +1,10 @@
 """Trains H2O+ from real data and an imperfect simulator, and evaluates the policy in reality.
 
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
+python recipes/h2o_plus.py mend=false warm_start=false keep=last       # the same without what precedes and follows H2O+
 python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
-python recipes/h2o_plus.py mend=true                                   # first adds what the simulator lacks to it
+python recipes/h2o_plus.py env=halfcheetah mend=true data=...          # first adds what the simulator lacks to it
 python recipes/h2o_plus.py ratio_estimator=pairs                       # another estimator of the dynamics ratio
 python recipes/h2o_plus.py backbone=sparse mixing=0.5 ratio=false      # --help lists the options
 python recipes/h2o_plus.py resume=outputs/wheel_legged/...             # continue an interrupted run

@@ -299,7 +299,7 @@ def test_each_world_of_the_collection_has_a_draw_and_evaluations_the_best_values
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["mend=true", f"gap_fix={__file__}"], "leave one of them out"),
+        (["mend=true", f"gap_fix={__file__}"], "gap_fix with mend=false, or mend alone"),
         (["mend=posterior", "env.batched=false"], "is not batched: use mend=true"),
         (["mend=posterior", "num_worlds=12"], "a multiple of 12"),
     ],

@@ -210,7 +210,7 @@ class RunOptions(ExperimentOptions):
         if self.gap_fix is not None:
             raise ValueError(
                 f"gap_fix={self.gap_fix} mend={str(self.mend).lower()}: gap_fix takes the effects from a report, mend "
-                "searches for them in the run's own data; leave one of them out"
+                "searches for them in the run's own data; take one of them: gap_fix with mend=false, or mend alone"
             )
         if self.mend == "posterior" and not self.env.batched:
             raise ValueError(
