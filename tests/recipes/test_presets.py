@@ -34,3 +34,13 @@ def test_ten_steps_of_the_robot_are_50_ms():
 
 def test_an_option_on_the_command_line_comes_before_the_preset():
     assert chosen("train", "preset=paper", "n_steps=4")[0] == 4
+
+
+@pytest.mark.parametrize(
+    ("config", "env", "is_mended"),
+    [("h2o_plus", "wheel_legged", True), ("h2o_plus", "halfcheetah", False), ("train", "wheel_legged", False)],
+)
+def test_the_first_command_alone_mends_the_robot_s_simulator(config, env, is_mended):
+    cfg = composed(config, f"env={env}")
+    assert (bool(cfg.mend), cfg.warm_start, cfg.keep == "best_in_simulator") == (is_mended,) * 3
+    assert not composed(config, f"env={env}", "mend=false").mend
