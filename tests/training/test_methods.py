@@ -15,7 +15,7 @@ from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.trained_policy import load_policy
 
 methods = pytest.mark.parametrize("name", METHODS)
-OFFLINE = ("cql", "iql")
+OFFLINE = ("cql", "iql", "td3_bc")
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_one_command_trains_a_method_and_another_replays_it(command, tmp_path):
 def test_a_method_that_there_is_not_is_said(command):
     done = subprocess.run(**command("method=ppo", script="train.py"), text=True, check=False)
     assert done.returncode != 0
-    assert "method=ppo: must be sac, cql, iql, darc" in done.stdout
+    assert "method=ppo: must be sac, cql, iql, td3_bc, darc" in done.stdout
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, na
     monkeypatch.setattr("torchrl_h2o.training.learner.Learner.update", recorded(sizes))
     train(METHODS[name], cfg, real, tmp_path)
     policy_s, *discriminators = sizes[0]
-    expected = {"sac": (0, 16), "darc": (0, 16), "cql": (16, 0), "iql": (16, 0)}
+    expected = {"sac": (0, 16), "darc": (0, 16), "cql": (16, 0), "iql": (16, 0), "td3_bc": (16, 0)}
     assert tuple(policy_s) == expected.get(name, (8, 8))
     assert [tuple(size) for size in discriminators] == ([(8, 8)] if name in ("darc", "h2o", "h2o_plus", "td3") else [])
 
@@ -101,7 +101,7 @@ def recorded(sizes):
 
     update = Learner.update
 
-    def recording(self):
+    def recording(self, is_held=False):
         sizes.append(list(self.batch_sizes))
         return update(self)
 

@@ -17,7 +17,7 @@ from torchrl_h2o.options.nearest import did_you_mean
 from torchrl_h2o.training.methods import METHODS
 
 SIX = ("sac", "cql", "iql", "darc", "h2o", "h2o_plus")
-OFFLINE = ("cql", "iql")  # they use no simulator, so the gap has no effect and one run counts for every gap
+OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so the gap has no effect and one run counts for every gap
 MEDIUM, REPLAY = "halfcheetah/medium-v0", "halfcheetah/medium-replay-v0"
 ENVS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d"}
 

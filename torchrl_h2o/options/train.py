@@ -22,7 +22,7 @@ from torchrl_h2o.options.types import (
     option,
 )
 
-Method = Literal["sac", "cql", "iql", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
+Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
 
 
 def _each_once(values: list) -> list:
@@ -62,6 +62,14 @@ class CQLOptions(Options):
     num_random: Few = option(10)
 
 
+class TD3BCOptions(Options):
+    """``td3_bc``: arguments of TorchRL's TD3BCLoss, of which others may be added."""
+
+    model_config = ConfigDict(extra="allow")
+
+    alpha: Positive = option(2.5, "weight of Q over that of the distance to the data's actions")
+
+
 class CollectorOptions(Options):
     """``collector``: where the simulators run."""
 
@@ -92,6 +100,7 @@ class AnyMethodOptions(ExperimentOptions):
     h2o: H2OOptions = H2OOptions()
     iql: IQLOptions = IQLOptions()
     cql: CQLOptions = CQLOptions()
+    td3_bc: TD3BCOptions = TD3BCOptions()
 
     results: str | None = option(
         None, "CSV file to which the run's results are appended; its curve goes to a second file"
