@@ -1,8 +1,8 @@
 """Trains H2O+ from real data and an imperfect simulator, and evaluates the policy in reality.
 
 python recipes/h2o_plus.py                                             # the wheel-legged robot, nothing downloaded
-python recipes/h2o_plus.py mend=false warm_start=false keep=last       # the same without what precedes and follows H2O+
-python recipes/h2o_plus.py data=standing_still.txt                     # the same with the real robot's log
+python recipes/h2o_plus.py mend=false warm_start=false keep=last       # H2O+ alone
+python recipes/h2o_plus.py data=standing_still.txt                     # with the real robot's log
 python recipes/h2o_plus.py env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/h2o_plus.py env=halfcheetah mend=true data=...          # first adds what the simulator lacks to it
 python recipes/h2o_plus.py ratio_estimator=pairs                       # another estimator of the dynamics ratio
@@ -42,7 +42,7 @@ from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
 from torchrl_h2o.training.task import Task
-from torchrl_h2o.training.warm_start import HELD, clone_behaviour, hold
+from torchrl_h2o.training.warm_start import clone_behaviour, held_updates, hold
 
 
 @hydra_main("config", "h2o_plus", RunOptions)
@@ -151,8 +151,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
                 training.check(losses)  # a loss that is not finite ends the run, and the last checkpoint stays
                 optimiser.zero_grad()
                 total_loss(losses).backward()
-                if cfg.warm_start and epoch * cfg.updates_per_epoch + update < HELD:
-                    hold(actor.parameters())
+                if epoch * cfg.updates_per_epoch + update < held_updates(cfg):
+                    hold(actor.parameters(), optimiser)
                 optimiser.step()
                 targets.step()
             schedule.step()

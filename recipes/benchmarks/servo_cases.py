@@ -59,7 +59,7 @@ KINDS: Mapping[str, tuple[tuple[type[Effect], ...], ...]] = {
     "dead": ((ServoDeadBand, GearPlay),),
     "box": ((PseudoInertia, BodyCentreOfMass, BodyMass, BodyInertia, Payload),),
 }
-#: ranges of the parameters of a servo that each cause changes, drawn with even logarithms
+#: ranges of the parameters of a servo that each cause changes; their logarithms are drawn uniformly
 RANGES: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "M1": {},
     "M3": {"load": (0.05, 0.25)},
@@ -89,7 +89,7 @@ class ServoCase(JointCase):
     """A case with the log of an arm.
 
     Args:
-        cause: one of :data:`CAUSES`.
+        cause: a key of :data:`RANGES`.
     """
 
     machine: Arm
@@ -117,7 +117,7 @@ def with_cause(arm: Arm, cause: str, rng: np.random.Generator) -> Arm:
 
 
 def servo(number: int, rng: np.random.Generator, causes: Sequence[str] = CAUSES) -> ServoCase:
-    """Each cause in turn, in an arm in which it is visible; every other log has positions alone."""
+    """Each cause in turn, in an arm in which it is visible; in every other turn, logs have positions alone."""
     cause = causes[number % len(causes)]
     noise, seed = float(rng.uniform(*NOISE)), int(rng.integers(2**31))
     for _ in range(TRIES):
@@ -137,7 +137,7 @@ def servo(number: int, rng: np.random.Generator, causes: Sequence[str] = CAUSES)
         transitions=ROWS,
         machine=arm,
         cause=cause,
-        velocities=number % 2 == 0,
+        velocities=number // len(causes) % 2 == 0,
     )
 
 
@@ -181,9 +181,9 @@ def effects_of(arm: Arm) -> tuple[Effect, ...]:
     return tuple(found)
 
 
-def control(number: int, rng: np.random.Generator, causes: Sequence[str] = CAUSES) -> ServoCase:
+def control(number: int, rng: np.random.Generator) -> ServoCase:
     """The arm of a drawn servo without its cause."""
-    drawn = servo(number, rng, causes)
+    drawn = servo(number, rng)
     plain = {name: Servo.__dict__[name] for ranges in RANGES.values() for name in ranges}
     arm = Arm(tuple(replace(one, **plain) for one in drawn.machine.servos))
     return replace(drawn, machine=arm, truth=effects_of(arm), cause="M1", name=f"without {drawn.name}")

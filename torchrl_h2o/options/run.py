@@ -100,7 +100,7 @@ class ExperimentOptions(Options):
     data: Data = option("recorded", "recorded, Minari name, D4RL file, robot's log or TED folder; several: [a,b]")
     columns: Layout | None = option(None, "YAML file that describes a log's columns, or a name of the library's")
     data_seconds: Positive | None = option(None, "only the first seconds of the real data, s; null uses all")
-    warm_start: bool = option(False, "whether the policy begins at the behaviour in the real data")
+    warm_start: bool = option(False, "begins at the behaviour in the data, and holds the policy for 1,000 updates")
 
     # H2O+
     backbone: Literal["expectile", "sparse", "exponential"] = option("expectile", "value loss: IQL's, SQL's or EQL's")

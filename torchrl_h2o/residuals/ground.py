@@ -256,9 +256,12 @@ class Ground:
         logged ones.
         """
         needed = self.needed(more, less)
-        difference = more.scores - less.scores
-        in_all, in_selection = Difference(difference).evidence, Difference(difference[self.num_fit :]).evidence
-        if in_selection <= 0.0 or in_all <= needed + math.log(among):
+        is_shown = Difference(more.scores - less.scores).evidence > needed + math.log(among)
+        return is_shown and self.agrees(more, less, needed)
+
+    def agrees(self, more: Found, less: Found, needed: float = 0.0) -> bool:
+        """Whether the rows for selection speak for a set and, where there is noise, the next rows by some evidence."""
+        if Difference((more.scores - less.scores)[self.num_fit :]).evidence <= 0.0:
             return False
         return not less.is_noise or all(
             Difference(one - other).evidence > needed for one, other in zip(more.one_step, less.one_step, strict=True)

@@ -101,7 +101,7 @@ def grow(
             _remember(tried, one, found)
         better = [one for one in fitted if ground.adds(one, found, choices(among, one, found))]
         if better:
-            best = on_best_elements(better, fitted, found)
+            best = on_best_elements(better, [one for one in fitted if ground.agrees(one, found)], found)
             before, found, refused = found, ground.fitted(best.entries, best.effects), set()
             advance(found, before)
             if _is_many(best, before) or ground.leaves_little(found):  # many change how candidates change the errors
@@ -115,10 +115,15 @@ def grow(
 
 
 def on_best_elements(better: Sequence[Found], fitted: Sequence[Found], before: Found) -> Found:
-    """The most usual of better sets, or one that adds effects of the same kinds elsewhere and predicts better.
+    """The most usual of better sets, or the best one that adds effects of the same kinds to other elements.
 
-    Whether an effect is there is one question. On which joints, motors or geoms it acts is another, for which no
-    further evidence is needed: one of them it must be.
+    Whether an effect is there is one question. On which joints, motors or geoms it acts is another. This one needs no
+    evidence of its own, because the effect must act on some of them.
+
+    Args:
+        better: sets with enough evidence.
+        fitted: further sets that may take their place.
+        before: the set to which they add effects.
     """
 
     def added(one: Found) -> set[type]:

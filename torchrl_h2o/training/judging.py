@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import sys
@@ -16,6 +17,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
+from torchrl_h2o.comparison.grids import OFFLINE
 from torchrl_h2o.provenance import provenance
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
@@ -87,25 +89,28 @@ def warnings_of(
     Args:
         cfg: the run's configuration.
         result: the policy's evaluation in reality.
-        behaviour: the episodes in the data. Of longer ones than an evaluation, the first part counts.
+        behaviour: the episodes in the data. The returns of episodes that are longer than the task's limit are scaled to
+            that length.
         rows: metrics of the training.
 
     Returns:
         Sentences with what to do; empty if there is nothing to say.
     """
-    found, limit = [], cfg.env.make.get("max_episode_steps") or max(result.lengths)
+    found, limit = [], cfg.env.make.get("max_episode_steps") or math.inf
     share = min(1.0, limit / behaviour.mean_length)
-    if result.mean < behaviour.mean * share:
-        wanted = {"mend": True, "warm_start": True, "keep": "best_in_simulator"}
-        options = " ".join(f"{key}={str(value).lower()}" for key, value in wanted.items() if cfg.get(key) != value)
-        remedy = f"set {options}" if options else "train with another seed, or record more data"
+    usual, is_mended = share * behaviour.mean, bool(cfg.mend or cfg.gap_fix)
+    if result.mean < usual - 2.0 * math.hypot(result.error, share * behaviour.error):
+        has_simulator = cfg.get("method", "h2o_plus") not in OFFLINE
+        options = ["mend=true"] * (has_simulator and not is_mended)
+        options += ["warm_start=true"] * (not cfg.warm_start)
+        options += ["keep=best_in_simulator"] * (has_simulator and cfg.keep == "last")
+        remedy = f"set {' '.join(options)}" if options else "train with another seed, or record more data"
         found.append(
-            f"the policy is worse in reality than the data's behaviour, whose return is {behaviour.mean * share:.0f}: "
-            f"do not use it; {remedy}"
+            f"the policy is worse in reality than the data's behaviour, whose return is {usual:.0f}: do not use it; {remedy}"
         )
-    weight = rows[-1].get("ratio_of_sim") if rows else None
+    weight = rows[-1].get("ratio_of_sim") if rows and cfg.get("ratio", True) else None
     if weight is not None and weight < COLLAPSED:
-        remedy = "train without weights: ratio=false" if cfg.get("mend") else "set mend=true"
+        remedy = "train without weights: ratio=false" if is_mended else "set mend=true"
         found.append(
             f"the mean weight of simulated rows is {weight:.2g}, because they hardly look real: the training made "
             f"little use of the simulator; {remedy}"
@@ -145,6 +150,8 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
         "gap": cfg.gap,
         "gap_fix": cfg.gap_fix,
         "mend": cfg.mend,
+        "warm_start": cfg.warm_start,
+        "keep": cfg.keep,
         "data": cfg.data if isinstance(cfg.data, str) else list(cfg.data),
         "data_seconds": cfg.data_seconds,
         "transitions": len(real),
@@ -163,7 +170,7 @@ def write_summary(directory: Path, summary: dict) -> None:
 def table_of_run(
     in_reality: Mapping[str, Evaluation], directory: Path, film: Path | None, seconds_per_step: float
 ) -> str:
-    """Format what ``mend`` found, returns and lengths of the episodes in reality by policy, and the names of the files.
+    """Format what ``mend`` found, episodes in reality by policy, the names of the files, and the run's warnings.
 
     Args:
         in_reality: evaluations by the name of the policy.

@@ -78,7 +78,7 @@ class Learner:
         self.optimiser.zero_grad()
         total_loss(losses).backward()
         if is_held:
-            hold(self.actor.parameters())
+            hold(self.actor.parameters(), self.optimiser)
         self.optimiser.step()
         self.targets.step()
         return {name: loss.detach() for name, loss in losses.items()}

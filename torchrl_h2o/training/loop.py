@@ -30,7 +30,7 @@ from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import keeps_best
-from torchrl_h2o.training.warm_start import HELD, clone_behaviour
+from torchrl_h2o.training.warm_start import clone_behaviour, held_updates
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
 
@@ -105,11 +105,14 @@ class Trainee:
             self._actor.load_state_dict(self.learner.actor.state_dict())
 
     def clone_behaviour(self, real: TensorDictBase) -> None:
-        """Lets the policy begin at the behaviour in the real data, ``[T]``, if ``warm_start`` requires it."""
+        """Fits the policy to the actions in the real data, ``[T]``, if ``warm_start`` is true."""
         if self.cfg.warm_start:
             shown = self._preprocessing.apply(real).to(self.learner.replay.device)
             actor = cast(TensorDictModule, self.learner.actor)
             clone_behaviour(actor, self._action_spec, shown, self.cfg.seed)
+            for loss in self.learner.losses.values():  # TD3's have a target of the policy, which was copied before
+                if (target := getattr(loss, "target_actor_network_params", None)) is not None:
+                    target.data.copy_(cast(Any, loss).actor_network_params.data)
 
     def begin_epoch(self, epoch: int) -> None:
         """Seeds torch and the simulator for the epoch, and collects the epoch's transitions."""
@@ -177,7 +180,7 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
         for epoch, evaluating in training.epochs():
             trainee.begin_epoch(epoch)
             for update in training.epoch_updates():
-                is_held = cfg.warm_start and epoch * cfg.updates_per_epoch + update < HELD
+                is_held = epoch * cfg.updates_per_epoch + update < held_updates(cfg)
                 losses = learner.update(is_held)
                 training.check(losses)
             schedule.step()

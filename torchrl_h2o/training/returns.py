@@ -41,6 +41,11 @@ class Evaluation:
         return float(torch.tensor(self.returns).std(correction=0))
 
     @property
+    def error(self) -> float:
+        """Standard error of the mean return."""
+        return self.std / len(self.returns) ** 0.5
+
+    @property
     def mean_length(self) -> float:
         return sum(self.lengths) / len(self.lengths)
 

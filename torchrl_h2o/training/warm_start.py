@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import cast
 
 import torch
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
@@ -15,7 +16,7 @@ from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.objectives import BCLoss
 
 CLONED = 2000  # updates of behaviour cloning
-ROWS = 256  # of each
+ROWS = 256  # transitions of each
 LR = 1e-3  # at the first of them; it falls to zero
 HELD = 1000  # first updates of a training in which the cloned policy stays as it is
 INSIDE = 1e-3  # share of their range by which actions at its ends are moved inside, because a tanh never reaches them
@@ -46,8 +47,19 @@ def clone_behaviour(actor: TensorDictModule, action_spec: TensorSpec, real: Tens
         schedule.step()
 
 
-def hold(parameters: Iterable[Tensor]) -> None:
-    """Takes the gradients of a policy's parameters, so that Adam, which has not moved them yet, leaves them."""
+def held_updates(cfg: DictConfig) -> int:
+    """Number of first updates in which the policy stays as it is: none without ``warm_start``, at most half of all."""
+    return min(HELD, cfg.updates // 2) if cfg.warm_start else 0
+
+
+def hold(parameters: Iterable[Tensor], optimiser: torch.optim.Optimizer) -> None:
+    """Sets the gradients of a policy's parameters to zero, so that Adam, which has not moved them yet, leaves them.
+
+    The optimiser's count of steps begins anew as well: without its correction for few steps, the first real ones would
+    be several times too large.
+    """
     for parameter in parameters:
         if parameter.grad is not None:
             parameter.grad.zero_()
+        if "step" in optimiser.state[parameter]:
+            optimiser.state[parameter]["step"].zero_()

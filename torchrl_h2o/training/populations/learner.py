@@ -61,7 +61,7 @@ class PopulationLearner:
         for number in self.failures:
             self.population.stop(number, self.optimiser)
         if self.updates < self.held:
-            hold(self.population.policies)
+            hold(self.population.policies, self.optimiser)
         step()
         self.updates += 1
         return terms

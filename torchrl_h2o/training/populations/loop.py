@@ -29,7 +29,7 @@ from torchrl_h2o.training.loop import MakeLearner, Trainee
 from torchrl_h2o.training.populations.learner import PopulationLearner
 from torchrl_h2o.training.populations.replay import PopulationReplay
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed, write_metrics
-from torchrl_h2o.training.warm_start import HELD
+from torchrl_h2o.training.warm_start import held_updates
 
 SWEPT = {"seeds": "seed", "gaps": "gap", "mixings": "mixing"}
 
@@ -136,8 +136,8 @@ def train_population(
             pairs[own.gap] = trainees[name].make_pairs(real)
         trainees[name].learner.pairs = pairs[own.gap]
         trainees[name].clone_behaviour(real)
-    held = HELD if cfg.warm_start else 0
-    learner = PopulationLearner([trainee.learner for trainee in trainees.values()], replay, cfg.lr, cfg.tau, held)
+    learners = [trainee.learner for trainee in trainees.values()]
+    learner = PopulationLearner(learners, replay, cfg.lr, cfg.tau, held_updates(cfg))
     if replay.device.type != "cpu" and cfg.compiled is not False:  # on a CPU, compiled stacked networks are slower
         learner.use_cuda_graphs()
     budget = Budget.from_config(cfg)
