@@ -106,7 +106,8 @@ def warnings_of(
         options += ["keep=best_in_simulator"] * (has_simulator and cfg.keep == "last")
         remedy = f"set {' '.join(options)}" if options else "train with another seed, or record more data"
         found.append(
-            f"the policy is worse in reality than the data's behaviour, whose return is {usual:.0f}: do not use it; {remedy}"
+            f"the policy is worse in reality than the data's behaviour, whose return is {usual:.0f}: do not use it; "
+            f"{remedy}"
         )
     weight = rows[-1].get("ratio_of_sim") if rows and cfg.get("ratio", True) else None
     if weight is not None and weight < COLLAPSED:
