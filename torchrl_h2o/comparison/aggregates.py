@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 from rliable import library, metrics
 
-from torchrl_h2o.comparison.grids import OFFLINE, SIX
+from torchrl_h2o.comparison.grids import SIX
 from torchrl_h2o.comparison.scores import REFERENCES, Reference, Task, normalised
+from torchrl_h2o.options.train import OFFLINE
 
 BASE = "h2o_plus"
 

@@ -14,10 +14,10 @@ from omegaconf import DictConfig
 from torchrl_h2o.comparison.results_file import key_of
 from torchrl_h2o.effects import PAPER_GAPS
 from torchrl_h2o.options.nearest import did_you_mean
+from torchrl_h2o.options.train import OFFLINE
 from torchrl_h2o.training.methods import METHODS
 
 SIX = ("sac", "cql", "iql", "darc", "h2o", "h2o_plus")
-OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so the gap has no effect and one run counts for every gap
 MEDIUM, REPLAY = "halfcheetah/medium-v0", "halfcheetah/medium-replay-v0"
 ENVS = {"halfcheetah": "HalfCheetah", "walker2d": "Walker2d"}
 

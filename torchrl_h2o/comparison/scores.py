@@ -5,8 +5,8 @@ from typing import Any
 
 import pandas as pd
 
-from torchrl_h2o.comparison.grids import OFFLINE
 from torchrl_h2o.comparison.markdown import markdown_table
+from torchrl_h2o.options.train import OFFLINE
 
 Reference = tuple[float, float]  # returns with score 0 and score 100
 #: Returns with score 0 and score 100. For HalfCheetah and Walker2d: D4RL's random and expert policies (Fu et al., 2020,

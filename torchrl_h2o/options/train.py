@@ -23,6 +23,7 @@ from torchrl_h2o.options.types import (
 )
 
 Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
+OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so a gap has no effect and one run counts for every gap
 
 
 def _each_once(values: list) -> list:

@@ -17,7 +17,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
 
-from torchrl_h2o.comparison.grids import OFFLINE
+from torchrl_h2o.options.train import OFFLINE
 from torchrl_h2o.provenance import provenance
 from torchrl_h2o.training.environments import preprocessing_of, task_of
 from torchrl_h2o.training.learning_curve import Trained, draw_learning_curve
