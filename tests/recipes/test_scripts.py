@@ -71,3 +71,9 @@ def test_the_tutorial_on_simulators_finds_the_hidden_effect(tmp_path):
     assert "Your simulator lacks: damping of joints pivot + 0.1 N·m·s/rad" in printed
     assert (tmp_path / "out" / "report.html").stat().st_size > 1000
     assert (tmp_path / "out" / "log.csv").exists()
+
+
+def test_the_main_job_needs_no_package_of_the_extra_comparison():
+    blocked = "import sys; sys.modules.update(dict.fromkeys(['pandas', 'rliable', 'arch'])); import h2o_plus"
+    done = subprocess.run([sys.executable, "-c", blocked], cwd=ROOT / "recipes", capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
