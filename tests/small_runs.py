@@ -28,7 +28,8 @@ SMALL = [
     "discriminator_batch_size=[8,8]",
     "render=false",
     "threads=1",
-    "mend=false",  # the last three are the defaults of train.py
+    "overlap=false",  # this and what follows are the defaults of train.py
+    "mend=false",
     "warm_start=false",
     "keep=last",
 ]
