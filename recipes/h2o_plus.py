@@ -57,7 +57,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     start = time.perf_counter()
 
     # Task: the target dynamics (reality), and a simulator with the dynamics gap
-    task = Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, gap_fix=cfg.gap_fix)
+    task = Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength)
     task.make_simulator()  # fails before the data are loaded if an effect does not fit the model
 
     # Data: real transitions in TED, [T]; both streams have the same preprocessing of observations and rewards
@@ -98,9 +98,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
     qvalues = make_qvalue(
         observation_dim, action_dim, cfg.num_cells, layer_norm=cfg.layer_norm, ensemble=cfg.num_qvalue_nets
     )
-
     if cfg.warm_start:  # begins at the behaviour in the real data, and stays there while the critics learn its value
-        clone_behaviour(actor, action_spec, shown, cfg.seed)
+        clone_behaviour(actor, action_spec, replay, cfg.seed)
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     value_loss = make_value_loss(cfg, observation_dim)  # with V; expectile, sparse or exponential
@@ -144,6 +143,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
             replay.extend(simulated)
 
             # Update
+            held = held_updates(cfg) - epoch * cfg.updates_per_epoch
             for update in training.epoch_updates():
                 batch = replay.sample(cfg.batch_size)
                 pairs = pairs_replay.sample(cfg.discriminator_batch_size)
@@ -151,7 +151,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
                 training.check(losses)  # a loss that is not finite ends the run, and the last checkpoint stays
                 optimiser.zero_grad()
                 total_loss(losses).backward()
-                if epoch * cfg.updates_per_epoch + update < held_updates(cfg):
+                if update < held:
                     hold(actor.parameters(), optimiser)
                 optimiser.step()
                 targets.step()

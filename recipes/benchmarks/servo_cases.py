@@ -29,7 +29,6 @@ from torchrl_h2o.effects import (
     LoadFriction,
     ObservationDelay,
     Payload,
-    PseudoInertia,
     ServoDamping,
     ServoDeadBand,
     ServoStiffness,
@@ -57,7 +56,7 @@ KINDS: Mapping[str, tuple[tuple[type[Effect], ...], ...]] = {
     "gain": ((ServoStiffness,),),
     "lag": ((ActionLag, ActionDelay, ObservationDelay),),
     "dead": ((ServoDeadBand, GearPlay),),
-    "box": ((PseudoInertia, BodyCentreOfMass, BodyMass, BodyInertia, Payload),),
+    "box": ((BodyCentreOfMass, BodyMass, BodyInertia, Payload),),
 }
 #: ranges of the parameters of a servo that each cause changes; their logarithms are drawn uniformly
 RANGES: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -97,8 +96,8 @@ class ServoCase(JointCase):
 
     @property
     def words(self) -> str:
-        first = self.machine.servos[0]
-        told = ", ".join(f"{name} {getattr(first, name):.3g}" for name in RANGES[self.cause])
+        last = self.machine.servos[-1]
+        told = ", ".join(f"{name} {getattr(last, name):.3g}" for name in RANGES[self.cause])
         return f"{self.cause} ({told})" if told else self.cause
 
 

@@ -71,8 +71,8 @@ report.save(folder)
 print(f"report: {folder / 'report.html'}")
 
 # %% The corrected simulator. The effects found are of the same classes as those of dynamics gaps, so they can be added
-# to the simulator directly. For training, use TransformedEnv(env, DynamicsGap(*report.effects)), or the options
-# mend=false gap_fix=report.json of recipes/h2o_plus.py.
+# to the simulator directly. For training, use TransformedEnv(env, DynamicsGap(*report.effects)), or the option
+# mend=report.json of recipes/h2o_plus.py.
 corrected = simulator.with_effects(*report.effects)
 for name, model in {"before": simulator, "after": corrected}.items():
     error = np.abs(model.rollout(states[:-1], torque[:-1, None])[:, 0] - states[1:]).max(0)

@@ -36,7 +36,8 @@ from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
 from torchrl_h2o.residuals.report.errors import DimensionError, ErrorSummary
 from torchrl_h2o.residuals.report.mended_model import LeftOut, MendedModel
 from torchrl_h2o.residuals.report.words import effect_units, effect_words
-from torchrl_h2o.training.environments import make_simulator
+from torchrl_h2o.training.environments import make_simulator, task_of
+from torchrl_h2o.training.mending import find_missing_effects, prepare_mending
 
 ROOT = Path(__file__).parents[2]
 PENDULUM = """
@@ -259,7 +260,7 @@ def test_what_is_printed_is_short_and_has_units(capsys, tmp_path):
     printed = capsys.readouterr().out
     for part in ("Your simulator lacks: gravity × 0.5", "0.49 to 0.51", "rad", "0.031", "0.004", "report.html"):
         assert part in printed
-    assert "gap_fix=" in printed
+    assert "mend=" in printed
     assert len(printed.splitlines()) < 20
 
 
@@ -287,17 +288,19 @@ def test_units_and_effects_that_the_model_s_file_lacks_are_printed(capsys, tmp_p
 def test_a_report_mends_the_simulator_behind_its_own_gap(compose, tmp_path):
     path = report(Gravity(0.5)).save(tmp_path)
     broken = compose("gap=gravity", config="h2o_plus")
-    mended = compose("gap=gravity", f"gap_fix={path}", config="h2o_plus")
+    mended = compose("gap=gravity", f"mend={path}", config="h2o_plus")
+    prepare_mending(mended)
+    mended.mended = find_missing_effects(mended, task_of(mended), None, tmp_path / "run")
     assert mujoco_model(make_simulator(broken)).opt.gravity[2] == pytest.approx(-19.62)
     assert mujoco_model(make_simulator(mended)).opt.gravity[2] == mujoco_model(WheelLeggedEnv()).opt.gravity[2]
 
 
 def test_a_report_without_effects_and_a_file_that_is_none_are_refused(compose, tmp_path):
     path = report().save(tmp_path)
-    with pytest.raises(ValueError, match="contains no effects to add to the simulator; leave gap_fix out"):
-        make_simulator(compose(f"gap_fix={path}", config="h2o_plus"))
+    with pytest.raises(ValueError, match="contains no effects to add to the simulator; leave mend out"):
+        prepare_mending(compose(f"mend={path}", config="h2o_plus"))
     with pytest.raises(ValueError, match="cannot be read"):
-        make_simulator(compose(f"gap_fix={tmp_path / 'none.json'}", config="h2o_plus"))
+        prepare_mending(compose(f"mend={tmp_path / 'none.json'}", config="h2o_plus"))
 
 
 def test_the_files_are_written_within_the_minutes_and_the_audit_counts():
@@ -342,6 +345,14 @@ def test_training_runs_in_the_mended_simulator(tmp_path):
     small = ["updates=20", "updates_per_epoch=20", "steps_per_epoch=40", "eval_episodes=1", "final_episodes=1"]
     small += ["num_cells=[8,8]", "batch_size=[8,8]", "discriminator_batch_size=[8,8]", "render=false"]
     small += ["env.make.max_episode_steps=40", "env.recording.num_transitions=200", "threads=1", "n_steps=3"]
-    done = command(tmp_path, *small, "gap=gravity", "gap_fix=report.json", "hydra.run.dir=out", script="h2o_plus.py")
+    done = command(
+        tmp_path,
+        *small,
+        "gap=gravity",
+        "mend=report.json",
+        "warm_start=false",
+        "hydra.run.dir=out",
+        script="h2o_plus.py",
+    )
     assert done.returncode == 0, done.stdout
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["gap_fix"].endswith("report.json")
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["mend"].endswith("report.json")

@@ -93,7 +93,7 @@ def run(folder, *arguments, full=False):
         ("close_the_loop.py", ["simulator=nothing"], "ValueError: simulator=nothing: must be gymnasium"),
         ("close_the_loop.py", ["data=short.csv"], "DataError: short.csv, column 'v', row 1: the row has 1 columns"),
         ("evaluate.py", ["checkpoint=nowhere"], "ValueError: checkpoint=nowhere: it is not the folder of a run"),
-        ("h2o_plus.py", ["gap_fix=nowhere"], "ValueError: gap_fix=nowhere: there is no such file"),
+        ("h2o_plus.py", ["mend=nowhere"], "ValueError: mend=nowhere: there is no such file"),
         ("train.py", ["method=nothing"], "ValueError: method=nothing: must be"),
         ("paper.py", ["table=nothing"], "ValueError: table=nothing: must be"),
         ("report.py", ["group=[returns]"], "ValueError: no option group; did you mean groups?"),

@@ -57,7 +57,7 @@ VALUES = {
     "compiled=maybe": "compiled=maybe: must be auto, true or false",
     "seeds=[0,1] compiled=true": "compiled=true is for single runs: stacked networks are slower with it, leave it out",
     "num_cells=[9999]": "num_cells=[9999]: must be the sizes, up to 4096, of 1 to 20 layers, such as [256,256]",
-    "mend=first": "mend=first: must be true, false, posterior or null",
+    "mend=first": f"mend=first: {NOWHERE}",
     "baselines=[sca]": "baselines=[sca]: must be a list out of sac, cql, iql, td3_bc, darc, h2o, h2o_plus, rlpd, td3; "
     "did you mean sac?",
     "seeds=4": "seeds=4: must be null or a list of one or more integers from 0 to 4294967295, such as [0,1,2]",
@@ -75,7 +75,7 @@ VALUES = {
     f"mend=posterior num_worlds=10: steps_per_epoch=2020 must be a multiple of 50, {SHARED}",
     "columns=nowhere.yaml": "columns=nowhere.yaml: there is no such file, and the library's layouts are "
     "double_pendulum, simple_pendulum, wheel_legged_moving_forward, wheel_legged_standing_still",
-    "gap_fix=report.jsn": f"gap_fix=report.jsn: {NOWHERE}",
+    "mend=report.jsn": f"mend=report.jsn: {NOWHERE}",
     "resume=nowhere": f"resume=nowhere: {NOT_A_RUN}",
     "env.make.max_episode_steps=0": f"env.make.max_episode_steps=0: {COUNT} or null",
     "env=halfcheetah env.make.env_name=HalfCheeta-v5": "env.make.env_name=HalfCheeta-v5: Environment HalfCheeta "

@@ -53,7 +53,7 @@ def test_runs_that_end_at_the_same_time_all_get_their_rows(tmp_path):
     [
         ("data=/home/me/logs/a.txt", "data=logs/a.txt"),
         ("data=[/home/me/logs/a.txt,/home/me/logs/b.txt]", "data=[logs/a.txt,logs/b.txt]"),
-        ("gap_fix='/home/me/outputs/report.json'", "gap_fix='outputs/report.json'"),
+        ("mend='/home/me/outputs/report.json'", "mend='outputs/report.json'"),
         ("data=halfcheetah/medium-v0", "data=halfcheetah/medium-v0"),
     ],
 )

@@ -63,7 +63,7 @@ def test_a_baseline_is_trained_and_reported_beside_the_method(command, tmp_path)
 
 @pytest.mark.slow
 def test_the_loop_of_the_recipe_reaches_the_numbers_of_the_loop_of_train(command, tmp_path):
-    small = [*SMALL, *ROBOT, "keep=best_in_simulator"]
+    small = [*SMALL, *ROBOT, "keep=best_in_simulator", "warm_start=true"]
     run(command(*small, "hydra.run.dir=recipe"))
     run(command(*small, "hydra.run.dir=package", script="train.py"))
     assert trained(tmp_path / "recipe") == trained(tmp_path / "package")

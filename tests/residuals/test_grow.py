@@ -1,6 +1,7 @@
 """How a search chooses: what a candidate is estimated to gain, which sets are tried, and which of them is better."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -29,6 +30,7 @@ from torchrl_h2o.residuals.grow import (
     Candidates,
     choices,
     gains_beside,
+    grow,
     is_preferred,
     most_usual,
     on_best_elements,
@@ -132,6 +134,28 @@ def test_an_effect_that_is_there_acts_on_the_elements_with_the_best_score():
     delay = Found((entry_of(ActionDelay(0.1), CATALOGUE),), (ActionDelay(0.1),), np.full(20, 12.0))
     assert on_best_elements([of_one], [delay, of_all, of_one], nothing) is of_all
     assert on_best_elements([of_all], [delay, of_all, of_one], nothing) is of_all
+
+
+def test_a_search_puts_an_effect_on_the_elements_with_the_best_score_if_the_rows_for_selection_agree(monkeypatch):
+    """The one of all joints lacks evidence, as one of many that errors of noisy commands hide may do."""
+    nothing = Found((), (), np.zeros(20))
+    of_one, of_all, against = (
+        Found((entry_of(effect, CATALOGUE),), (effect,), np.full(20, mean))
+        for effect, mean in (
+            (JointFrictionLoss(0.1, "elbow"), 6.0),
+            (JointFrictionLoss(0.1), 9.0),
+            (JointFrictionLoss(0.1, "shoulder"), 12.0),
+        )
+    )
+    monkeypatch.setattr(Candidates, "of", lambda *args: None)
+    monkeypatch.setattr("torchrl_h2o.residuals.grow.with_one_more", lambda *args, **options: [of_one, of_all, against])
+    ground = SimpleNamespace(
+        adds=lambda one, less, among: one is of_one and less is nothing,
+        agrees=lambda one, less: one is not against,
+        fitted=lambda entries, effects: next(one for one in (of_one, of_all, against) if one.effects == effects),
+        leaves_little=lambda found: True,
+    )
+    assert grow(ground, nothing, [], lambda *args: None, {}) is of_all
 
 
 def test_the_estimated_gain_of_a_lead_counts_how_small_the_errors_become():

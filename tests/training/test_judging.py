@@ -9,7 +9,6 @@ from torchrl_h2o.training.returns import Evaluation
 PLAIN = {
     "env": {"make": {"max_episode_steps": 100}},
     "mend": None,
-    "gap_fix": None,
     "warm_start": False,
     "keep": "last",
 }
@@ -24,7 +23,7 @@ def said(result, behaviour, options=PLAIN, rows=()):
     ("options", "remedy"),
     [
         (PLAIN, "set mend=true warm_start=true keep=best_in_simulator"),
-        (PLAIN | {"gap_fix": "report.json"}, "set warm_start=true keep=best_in_simulator"),
+        (PLAIN | {"mend": "report.json"}, "set warm_start=true keep=best_in_simulator"),
         (PLAIN | {"method": "iql"}, "set warm_start=true"),
         (MENDED, "train with another seed"),
     ],

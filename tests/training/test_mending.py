@@ -146,7 +146,7 @@ def test_effects_that_the_report_does_not_recommend_are_left_out(pendulum, capsy
     ],
 )
 def test_a_report_that_advises_against_its_effects_is_named(compose, tmp_path, capsys, report, said):
-    cfg, _ = compose(f"gap_fix={report.save(tmp_path)}", config="h2o_plus")
+    cfg, _ = compose(f"mend={report.save(tmp_path)}", config="h2o_plus")
     prepare_mending(cfg)
     written = capsys.readouterr().out
     assert said in written
@@ -299,7 +299,6 @@ def test_each_world_of_the_collection_has_a_draw_and_evaluations_the_best_values
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["mend=true", f"gap_fix={__file__}"], "gap_fix with mend=false, or mend alone"),
         (["mend=posterior", "env.batched=false"], "is not batched: use mend=true"),
         (["mend=posterior", "num_worlds=12"], "a multiple of 12"),
     ],

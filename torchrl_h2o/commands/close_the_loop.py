@@ -185,7 +185,7 @@ def print_files(report: Report, directory: Path) -> None:
     if report.ended_in is not None and report.found:
         print(f"go on      close-the-loop ... start_from={folder}")
     if report.recommended:
-        print(f"train      python recipes/h2o_plus.py ... mend=false gap_fix={folder}/report.json")
+        print(f"train      python recipes/h2o_plus.py ... mend={folder}/report.json")
 
 
 def expanded(argument: str) -> list[str]:

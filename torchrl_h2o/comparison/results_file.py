@@ -73,7 +73,7 @@ def identity(cfg: DictConfig) -> dict[str, str]:
         "env": cfg.env.name if task is None else f"{cfg.env.name}/{task}",
         "data": _short(cfg.data),
         "data_seconds": "" if cfg.get("data_seconds") is None else f"{cfg.data_seconds:g}",
-        "mend": str(cfg.get("mend") or "").lower(),
+        "mend": _short(mend) if isinstance(mend := cfg.get("mend") or "", str) else str(mend).lower(),
         "gap": cfg.gap or "",
         "strength": "" if cfg.gap is None else str(float(_strength(cfg))),
         "seed": str(cfg.seed),

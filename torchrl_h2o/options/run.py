@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import gymnasium
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from torchrl_h2o.options.sources import AnyPath, Data, Layout, RunFolder
+from torchrl_h2o.options.sources import Data, Layout, Mend, RunFolder
 from torchrl_h2o.options.types import (
     MOST,
     Count,
@@ -94,8 +94,7 @@ class ExperimentOptions(Options):
     seed: Seed = option(0)
     gap: Gap | None = option(None, "dynamics gap of the paper for the simulator")
     gap_strength: float | None = option(None, "strength of the gap; null for the paper's")
-    gap_fix: AnyPath | None = option(None, "report.json of close-the-loop, whose effects the simulator gets as well")
-    mend: bool | Literal["posterior"] | None = option(None, "adds effects that the simulator lacks, or draws of them")
+    mend: Mend | None = option(None, "adds effects that the simulator lacks, draws of them, or those of a report")
     mended: dict[str, Any] | None = option(None, "these effects; written by the run")
     data: Data = option("recorded", "recorded, Minari name, D4RL file, robot's log or TED folder; several: [a,b]")
     columns: Layout | None = option(None, "YAML file that describes a log's columns, or a name of the library's")
@@ -205,13 +204,6 @@ class RunOptions(ExperimentOptions):
             )
 
     def _check_mending(self) -> None:
-        if not self.mend:
-            return
-        if self.gap_fix is not None:
-            raise ValueError(
-                f"gap_fix={self.gap_fix} mend={str(self.mend).lower()}: gap_fix takes the effects from a report, mend "
-                "searches for them in the run's own data; take one of them: gap_fix with mend=false, or mend alone"
-            )
         if self.mend == "posterior" and not self.env.batched:
             raise ValueError(
                 "mend=posterior gives each world of a batched simulator its own effects, and "

@@ -113,6 +113,18 @@ def require_folder(name: str) -> str:
     return name
 
 
+def require_mend(name: str) -> str:
+    """Requires ``posterior``, or the file or folder of a report.
+
+    Raises:
+        PydanticCustomError: if there is no such file or folder.
+    """
+    return name if name == "posterior" else require_path(name)
+
+
+Mend = (
+    bool | Annotated[str, AfterValidator(require_mend), Field(description="posterior or the report.json of a search")]
+)
 NewFolder = Annotated[str, AfterValidator(require_folder)]
 AnyPath = Annotated[str, AfterValidator(require_path)]
 RunFolder = Annotated[str, AfterValidator(require_run)]

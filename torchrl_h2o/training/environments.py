@@ -16,8 +16,7 @@ from torchrl_h2o.training.task import Task
 
 def task_of(cfg: DictConfig) -> Task:
     """Builds the task of a run; raises the errors of :meth:`Task.from_config`."""
-    found = {"gap_fix": cfg.gap_fix, "mended": cfg.mended}
-    return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, **found)
+    return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, mended=cfg.mended)
 
 
 def preprocessing_of(cfg: DictConfig) -> Preprocessing:

@@ -98,7 +98,7 @@ def warnings_of(
     """
     found, limit = [], cfg.env.make.get("max_episode_steps") or math.inf
     share = min(1.0, limit / behaviour.mean_length)
-    usual, is_mended = share * behaviour.mean, bool(cfg.mend or cfg.gap_fix)
+    usual, is_mended = share * behaviour.mean, bool(cfg.mend)
     if result.mean < usual - 2.0 * math.hypot(result.error, share * behaviour.error):
         has_simulator = cfg.get("method", "h2o_plus") not in OFFLINE
         options = ["mend=true"] * (has_simulator and not is_mended)
@@ -149,7 +149,6 @@ def run_settings(cfg: DictConfig, real: TensorDictBase) -> dict[str, Any]:
     return {
         "env": cfg.env.name,
         "gap": cfg.gap,
-        "gap_fix": cfg.gap_fix,
         "mend": cfg.mend,
         "warm_start": cfg.warm_start,
         "keep": cfg.keep,

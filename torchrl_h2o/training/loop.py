@@ -12,7 +12,6 @@ from typing import Any, cast
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch.optim.lr_scheduler import LinearLR
 from torchrl.collectors import BaseCollector
 from torchrl.data import TensorSpec
@@ -30,7 +29,7 @@ from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy
 from torchrl_h2o.training.run_folder import keeps_best
-from torchrl_h2o.training.warm_start import clone_behaviour, held_updates
+from torchrl_h2o.training.warm_start import held_updates
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
 
@@ -66,7 +65,6 @@ class Trainee:
         task, self._preprocessing = task_of(cfg), preprocessing_of(cfg)
         reality = task.make_reality(preprocessing=self._preprocessing)
         observation_dim = reality.observation_spec["observation"].shape[-1]
-        self._action_spec = reality.action_spec_unbatched
         with replay.device:
             action_spec = reality.action_spec_unbatched.to(replay.device)
             self.learner = make_learner(cfg, observation_dim, action_spec, replay)
@@ -103,16 +101,6 @@ class Trainee:
     def _copy_to_cpu(self) -> None:
         if self._actor is not self.learner.actor:
             self._actor.load_state_dict(self.learner.actor.state_dict())
-
-    def clone_behaviour(self, real: TensorDictBase) -> None:
-        """Fits the policy to the actions in the real data, ``[T]``, if ``warm_start`` is true."""
-        if self.cfg.warm_start:
-            shown = self._preprocessing.apply(real).to(self.learner.replay.device)
-            actor = cast(TensorDictModule, self.learner.actor)
-            clone_behaviour(actor, self._action_spec, shown, self.cfg.seed)
-            for loss in self.learner.losses.values():  # TD3's have a target of the policy, which was copied before
-                if (target := getattr(loss, "target_actor_network_params", None)) is not None:
-                    target.data.copy_(cast(Any, loss).actor_network_params.data)
 
     def begin_epoch(self, epoch: int) -> None:
         """Seeds torch and the simulator for the epoch, and collects the epoch's transitions."""
@@ -163,7 +151,6 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     replay = make_replay(cfg, real)
     trainee, budget = Trainee(method.make_learner, cfg, replay), Budget.from_config(cfg)
     learner = trainee.learner
-    trainee.clone_behaviour(real)
     if learner.trains_discriminators:
         learner.pairs = trainee.make_pairs(real)
     if replay.device.type == "cpu":
@@ -179,9 +166,9 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
     with closing(trainee):
         for epoch, evaluating in training.epochs():
             trainee.begin_epoch(epoch)
+            held = held_updates(cfg) - epoch * cfg.updates_per_epoch
             for update in training.epoch_updates():
-                is_held = epoch * cfg.updates_per_epoch + update < held_updates(cfg)
-                losses = learner.update(is_held)
+                losses = learner.update(is_held=update < held)
                 training.check(losses)
             schedule.step()
             if evaluating:

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 import torch
@@ -37,25 +37,38 @@ READ = (  # by the search, if the data have them
 
 
 def prepare_mending(cfg: DictConfig) -> None:
-    """Sets ``num_worlds`` to the number that ``mend=posterior`` needs, and reads the report of ``gap_fix``.
+    """Sets ``num_worlds`` to the number that ``mend=posterior`` needs, and reads the report that ``mend`` names.
 
     Writes a message if the number changes, or the report does not recommend its effects.
 
     Raises:
-        torchrl_h2o.data.DataError: if the report of ``gap_fix`` cannot be read.
+        ValueError: if the report has no effects.
+        torchrl_h2o.data.DataError: if it cannot be read.
     """
-    if cfg.gap_fix is not None and (against := Report.load(cfg.gap_fix).why_not_recommended()):
-        tqdm.write(f"gap_fix={cfg.gap_fix}: this report does not recommend its effects for training: {against}")
+    if names_report(cfg.mend):
+        report = Report.load(cfg.mend)
+        if not report.effects:
+            raise ValueError(
+                f"mend={cfg.mend}: this report contains no effects to add to the simulator; leave mend out"
+            )
+        if against := report.why_not_recommended():
+            tqdm.write(f"mend={cfg.mend}: this report does not recommend its effects for training: {against}")
     if cfg.mend == POSTERIOR and cfg.num_worlds < POSTERIOR_WORLDS:
         tqdm.write(f"mend={POSTERIOR}: num_worlds={POSTERIOR_WORLDS} instead of {cfg.num_worlds}, one draw per world")
         cfg.num_worlds = POSTERIOR_WORLDS
+
+
+def names_report(mend: bool | str | None) -> TypeGuard[str]:
+    """Whether the option ``mend`` names the report of an earlier search."""
+    return isinstance(mend, str) and mend != POSTERIOR
 
 
 def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, directory: Path) -> dict[str, Any] | None:
     """Closes the loop between the real data and the simulator if ``mend`` is set, and writes ``mended/report.json``.
 
     A run that is resumed reads the report in its folder. If the data cannot be searched, the run goes on, and the
-    report contains the reason and no effects. Effects that the report does not recommend are not used.
+    report contains the reason and no effects. Effects that the report does not recommend are not used. Where ``mend``
+    names an earlier report, its effects are used, without a search.
 
     Args:
         cfg: the run's configuration.
@@ -69,10 +82,15 @@ def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, dire
     """
     if not cfg.get("mend") or cfg.get("mended") is not None:
         return cfg.get("mended")
-    report = report_of_run(directory) or _search(task, real, cfg.data, directory / FOLDER)
-    unchanged = "" if report.recommended else " The run trains in the unchanged simulator."
-    tqdm.write(f"mend={str(cfg.mend).lower()}: {report.sentence()}{unchanged}")
-    if not report.recommended:
+    is_given = names_report(cfg.mend)
+    if is_given:
+        report = Report.load(cfg.mend)
+    else:
+        report = report_of_run(directory) or _search(task, real, cfg.data, directory / FOLDER)
+    is_used = report.recommended or is_given
+    unchanged = "" if is_used else " The run trains in the unchanged simulator."
+    tqdm.write(f"mend={cfg.mend if is_given else str(cfg.mend).lower()}: {report.sentence()}{unchanged}")
+    if not is_used:
         return None
     draws = _draws(report, task, cfg.num_worlds, cfg.seed) if cfg.mend == POSTERIOR else None
     return {"effects": _entries(report.effects), "worlds": draws and [_entries(effects) for effects in draws]}

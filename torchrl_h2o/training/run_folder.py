@@ -19,7 +19,7 @@ from torchrl_h2o.options.types import why_unavailable
 from torchrl_h2o.training.checkpoint import require_widths
 from torchrl_h2o.training.config_file import load_config, require_plain_files, save_config
 from torchrl_h2o.training.interrupts import interruptible
-from torchrl_h2o.training.mending import prepare_mending
+from torchrl_h2o.training.mending import names_report, prepare_mending
 from torchrl_h2o.training.targets import foreign_names
 from torchrl_h2o.whole_file import remove_partial
 
@@ -96,7 +96,7 @@ def _name_results(cfg: DictConfig, results: str | None) -> None:
 
 def resolve_paths(cfg: DictConfig) -> None:
     """Makes file names absolute, in place, because a run may be resumed from another working directory."""
-    for key in ("data", "columns", "gap_fix"):
+    for key in ("data", "columns", *(["mend"] if names_report(cfg.mend) else [])):
         if isinstance(cfg[key], ListConfig):
             cfg[key] = [_absolute(name) for name in cfg[key]]
         elif cfg[key] is not None:

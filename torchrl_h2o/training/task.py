@@ -14,7 +14,6 @@ from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 from torchrl_h2o.data.readers.sources import Source
 from torchrl_h2o.effects import Effect, effect_from_dict, paper_gap
 from torchrl_h2o.envs import BatchedMujocoEnv, DynamicsGap
-from torchrl_h2o.residuals import Report
 from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.real_data import first_seconds, read_real_data
 
@@ -30,8 +29,7 @@ class Task:
         config: the resolved ``env`` section of a configuration: ``name``, ``make`` (target and arguments of one env),
             ``seconds_per_step``, and optionally ``batched``, ``reward``, ``columns``, ``behaviour``, ``recording``.
         reality: effects of the target dynamics P.
-        simulator: effects of the simulator P̂, including the dynamics gap and the correction by ``gap_fix`` or
-            ``mend``, if any.
+        simulator: effects of the simulator P̂, including the dynamics gap and the correction by ``mend``, if any.
         gap: name of the paper's dynamics gap in the simulator, or None.
         worlds: effects of each world in which transitions are collected, with ``mend=posterior``; empty if all have
             those of the simulator.
@@ -50,7 +48,6 @@ class Task:
         *,
         gap: str | None = None,
         gap_strength: float | None = None,
-        gap_fix: str | None = None,
         mended: Mapping[str, Any] | None = None,
     ) -> Task:
         """Builds a task from a configuration.
@@ -59,18 +56,14 @@ class Task:
             env: the ``env`` section of the configuration.
             gap: name of one of the paper's dynamics gaps, for the simulator.
             gap_strength: strength of the gap. Defaults to the paper's value.
-            gap_fix: path of a ``report.json``, whose effects are added to the simulator after all others.
             mended: effects that the run has found with ``mend``, see :meth:`mended`.
 
         Raises:
-            ValueError: for an unknown gap, or a report without effects.
-            torchrl_h2o.data.DataError: if the report cannot be read.
+            ValueError: for an unknown gap.
         """
         simulator = [instantiate(effect) for effect in env.simulator]
         if gap is not None:
             simulator.append(paper_gap(gap, gap_strength))
-        if gap_fix is not None:
-            simulator.extend(_effects_of_report(gap_fix))
         reality = tuple(instantiate(effect) for effect in env.reality)
         config = cast(dict[str, Any], OmegaConf.to_container(env, resolve=True))
         return cls(config, reality, tuple(simulator), gap).mended(mended)
@@ -159,10 +152,3 @@ class Task:
         shown = [] if preprocessing is None else preprocessing.transforms()
         transforms: list[Any] = [DoubleToFloat(), *shown]  # TorchRL annotates each one as a list
         return TransformedEnv(env, Compose(*transforms))
-
-
-def _effects_of_report(path: str) -> tuple[Effect, ...]:
-    effects = Report.load(path).effects
-    if not effects:
-        raise ValueError(f"gap_fix={path}: this report contains no effects to add to the simulator; leave gap_fix out")
-    return effects

@@ -7,7 +7,6 @@ from typing import cast
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torch.optim.lr_scheduler import LinearLR
@@ -15,33 +14,36 @@ from torchrl.data import TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.objectives import BCLoss
 
+from torchrl_h2o.data import HybridReplayBuffer
+
 CLONED = 2000  # updates of behaviour cloning
 ROWS = 256  # transitions of each
 LR = 1e-3  # at the first of them; it falls to zero
+INSIDE = 0.01  # share of the actions' range within which an action is at its limit, which a tanh does not reach
 HELD = 1000  # first updates of a training in which the cloned policy stays as it is
-INSIDE = 1e-3  # share of their range by which actions at its ends are moved inside, because a tanh never reaches them
 
 
-def clone_behaviour(actor: TensorDictModule, action_spec: TensorSpec, real: TensorDictBase, seed: int) -> None:
+def clone_behaviour(actor: TensorDictModule, action_spec: TensorSpec, replay: HybridReplayBuffer, seed: int) -> None:
     """Fits a policy to the actions in real data, with TorchRL's loss.
 
     Args:
         actor: the policy.
-        action_spec: spec of the actions.
-        real: the measured transitions with the run's preprocessing, ``[T]``.
+        action_spec: spec of the actions. Actions at its limits are moved a little inside, because a few of them would
+            outweigh all others.
+        replay: the buffer with the real rows.
         seed: the run's seed.
     """
-    generator = torch.Generator().manual_seed(seed)
-    loss, shown = BCLoss(actor), real.select(*actor.in_keys, "action")
     space = cast(ContinuousBox, action_spec.space)
-    low, high = space.low.to(real.device), space.high.to(real.device)
-    edge = INSIDE * (high - low)
-    shown["action"] = shown["action"].clamp(low + edge, high - edge)
+    edge = INSIDE * (space.high - space.low)
+    low, high = (limit.to(replay.device) for limit in (space.low + edge, space.high - edge))
+    generator = torch.Generator(replay.device).manual_seed(seed)
+    loss = BCLoss(actor)
     optimiser = torch.optim.Adam(loss.parameters(), lr=LR)
     schedule = LinearLR(optimiser, 1.0, 0.0, total_iters=CLONED)
     for _ in range(CLONED):
-        chosen = torch.randint(len(shown), (min(ROWS, len(shown)),), generator=generator)
-        loss(shown[chosen])["loss_bc"].backward()
+        batch = replay.sample((ROWS, 0), generator=generator)
+        batch["action"] = batch["action"].clamp(low, high)
+        loss(batch)["loss_bc"].backward()
         optimiser.step()
         optimiser.zero_grad()
         schedule.step()

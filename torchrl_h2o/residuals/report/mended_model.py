@@ -13,7 +13,7 @@ from torchrl_h2o.residuals.simulation.simulation import Simulation
 
 FILE = "mended.xml"
 REMEDY = (
-    "Report.load(folder).mended(env) puts all effects into an env of the original model, and gap_fix=report.json does "
+    "Report.load(folder).mended(env) puts all effects into an env of the original model, and mend=report.json does "
     "it in a training; a simulation of mended.xml lacks only these: DynamicsGap(*report.mended_model.effects)"
 )
 

@@ -22,7 +22,7 @@ def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec,
     The loss draws its random actions from [-1, 1]. Actions are therefore scaled from their bounds to [-1, 1], and the
     loss trains a policy with that range which shares the actor's network.
     """
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     unit_spec = Bounded(-1.0, 1.0, action_spec.shape, device=action_spec.device)
     unit_space, space = cast(ContinuousBox, unit_spec.space), cast(ContinuousBox, action_spec.space)
     unit_actor = ProbabilisticActor(

@@ -14,7 +14,7 @@ from torchrl_h2o.training.ratio import make_ratio_loss
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's SAC loss on simulated rows with corrected rewards; real data train the discriminators only."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
     estimator = ratio_loss.estimator
     corrected = DynamicsRewardCorrection(estimator, scale=cfg.reward_scale, gamma=cfg.gamma)

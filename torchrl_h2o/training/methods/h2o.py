@@ -22,7 +22,7 @@ from torchrl_h2o.training.ratio import make_ratio_loss
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Build H2O, Eq. (1): a conservative term added to SAC on both streams."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
     estimator = ratio_loss.estimator
     num_real, _ = cfg.batch_size

@@ -22,7 +22,7 @@ from torchrl_h2o.training.ratio import make_ratio_loss
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Build H2O+: one loss, one optimiser, and two batches per update, the second for the discriminators."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     value_loss = make_value_loss(cfg, observation_dim)
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay, delayed=True)
 

@@ -14,7 +14,7 @@ from torchrl_h2o.training.loop import Method
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's loss on batches of real rows."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     value = make_value(observation_dim, cfg.num_cells)
     loss = IQLLoss(actor, qvalues, value, loss_function="l2", **cfg.iql)
     loss.make_value_estimator(gamma=cfg.gamma)

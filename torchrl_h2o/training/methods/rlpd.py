@@ -12,7 +12,7 @@ from torchrl_h2o.training.loop import Method
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Build SAC on both streams, with the target of Eq. (6)."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     loss = H2OPlusLoss(MixedBellmanLoss(actor, qvalues, mixing=0.0), target_entropy=cfg.target_entropy)
     loss.make_value_estimator(gamma=cfg.gamma)
     targets = SoftUpdate(loss, tau=cfg.tau)

@@ -18,7 +18,7 @@ from torchrl_h2o.training.loop import Method
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's loss on batches of real rows."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     loss = TD3BCLoss(actor, qvalues, action_spec=action_spec, loss_function="l2", **cfg.td3_bc)
     loss.make_value_estimator(gamma=cfg.gamma)
     loss.select_out_keys("loss_actor", "loss_qvalue", "bc_loss", "lmbd")  # the others are values of each row

@@ -18,7 +18,7 @@ from torchrl_h2o.training.ratio import make_ratio_loss
 
 def make_learner(cfg: DictConfig, observation_dim: int, action_spec: TensorSpec, replay: HybridReplayBuffer) -> Learner:
     """Builds TorchRL's TD3 loss, weighted row by row."""
-    actor, qvalues = make_networks(cfg, observation_dim, action_spec)
+    actor, qvalues = make_networks(cfg, observation_dim, action_spec, replay)
     ratio_loss = make_ratio_loss(cfg, observation_dim, action_spec.shape[-1], replay)
     estimator = ratio_loss.estimator
     td3 = TD3Loss(actor, qvalues, action_spec=action_spec, loss_function="l2", reduction="none")

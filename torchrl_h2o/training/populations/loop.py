@@ -135,7 +135,6 @@ def train_population(
         if own.gap not in pairs:
             pairs[own.gap] = trainees[name].make_pairs(real)
         trainees[name].learner.pairs = pairs[own.gap]
-        trainees[name].clone_behaviour(real)
     learners = [trainee.learner for trainee in trainees.values()]
     learner = PopulationLearner(learners, replay, cfg.lr, cfg.tau, held_updates(cfg))
     if replay.device.type != "cpu" and cfg.compiled is not False:  # on a CPU, compiled stacked networks are slower
