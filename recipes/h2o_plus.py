@@ -87,7 +87,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     # Environments: to collect, to evaluate during training, and to choose the best policy
     simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
     evaluator = evaluator_of(cfg, task, preprocessing)  # in reality; with overlap=true, beside the next updates
-    trials = task.make_simulator(cfg.trial_episodes, preprocessing) if keeps_best(cfg) else None
+    trials = task.make_training_simulator(cfg.trial_episodes, preprocessing) if keeps_best(cfg) else None
     observation_dim = simulator.observation_spec["observation"].shape[-1]
     action_spec = simulator.action_spec_unbatched
     action_dim = action_spec.shape[-1]

@@ -95,7 +95,7 @@ OTHERS = {
     "characters",
     ("train", "gamma=2 lr=0"): "gamma=2: must be a number from 0 to 1; lr=0: must be a number above 0",
     ("h2o_plus", "tau=0"): "tau=0: must be a number above 0 and at most 1",
-    ("h2o_plus", "num_worlds=3 steps_per_epoch=1000"): "num_worlds=3: steps_per_epoch=1000 must be a multiple of 3, "
+    ("h2o_plus", "num_worlds=30 steps_per_epoch=1000"): "num_worlds=30: steps_per_epoch=1000 must be a multiple of 30, "
     f"{SHARED}",
     ("h2o_plus", "num_worlds=2001"): f"num_worlds=2001: steps_per_epoch=2000 must be a multiple of 2001, {SHARED}",
     ("h2o_plus", "mend=posterior num_worlds=3 steps_per_epoch=1005"): "mend=posterior num_worlds=10: "

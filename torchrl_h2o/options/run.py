@@ -184,7 +184,7 @@ class RunOptions(ExperimentOptions):
     @property
     def _typed_streams(self) -> str:
         """The options that determine ``streams``, as typed on the command line."""
-        return f"{'mend=posterior ' * (self.mend == 'posterior')}num_worlds={self.worlds}"
+        return f"{'mend=posterior ' * (self.worlds > self.num_worlds)}num_worlds={self.worlds}"
 
     def _check_gap(self) -> None:
         if self.gap is None and self.gap_strength is not None:

@@ -83,7 +83,7 @@ class Trainee:
             self._rollouts = iter(self._collector)
             self.components["episodes"] = self._episodes = OngoingEpisodes(self._collector)
             if keeps_best(cfg):
-                trials = task.make_simulator(cfg.trial_episodes, self._preprocessing)
+                trials = task.make_training_simulator(cfg.trial_episodes, self._preprocessing)
                 self._best = BestPolicy(self._actor, trials, cfg.trial_episodes)
                 self.components["policy"] = self._best.policy
 

@@ -37,7 +37,7 @@ READ = (  # by the search, if the data have them
 
 
 def prepare_mending(cfg: DictConfig) -> None:
-    """Sets ``num_worlds`` to the number that ``mend=posterior`` needs, and reads the report that ``mend`` names.
+    """Sets the numbers of worlds and trials that ``mend=posterior`` needs, and reads the report that ``mend`` names.
 
     Writes a message if the number changes, or the report does not recommend its effects.
 
@@ -56,6 +56,8 @@ def prepare_mending(cfg: DictConfig) -> None:
     if cfg.mend == POSTERIOR and cfg.num_worlds < POSTERIOR_WORLDS:
         tqdm.write(f"mend={POSTERIOR}: num_worlds={POSTERIOR_WORLDS} instead of {cfg.num_worlds}, one draw per world")
         cfg.num_worlds = POSTERIOR_WORLDS
+    if cfg.mend == POSTERIOR:
+        cfg.trial_episodes = max(cfg.trial_episodes, cfg.num_worlds)
 
 
 def names_report(mend: bool | str | None) -> TypeGuard[str]:

@@ -46,6 +46,11 @@ class Evaluation:
         return self.std / len(self.returns) ** 0.5
 
     @property
+    def lower_bound(self) -> float:
+        """Mean return less two standard errors."""
+        return self.mean - 2.0 * self.error
+
+    @property
     def mean_length(self) -> float:
         return sum(self.lengths) / len(self.lengths)
 
@@ -144,7 +149,7 @@ def run_episode(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
 
 
 class BestPolicy:
-    """Stores the actor's parameters from the evaluation with the highest return in the simulator.
+    """Stores the actor's parameters from the evaluation in the simulator whose return has the highest lower bound.
 
     Args:
         actor: the trained policy; this class keeps a copy.
@@ -164,9 +169,9 @@ class BestPolicy:
             rows: metrics of the earlier evaluations, with ``return_trial``; those of versions before it are left out.
 
         Returns:
-            The mean return, as ``return_trial``.
+            The lower bound of the mean return, as ``return_trial``.
         """
-        return_trial = evaluate(self.simulator, actor, self.episodes, TRIAL_SEED).mean
+        return_trial = evaluate(self.simulator, actor, self.episodes, TRIAL_SEED).lower_bound
         if return_trial >= max((row["return_trial"] for row in rows if "return_trial" in row), default=-inf):
             self.policy.load_state_dict(actor.state_dict())
         return {"return_trial": return_trial}

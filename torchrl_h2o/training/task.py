@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import cycle, islice
 from typing import Any, cast
 
 from hydra.utils import instantiate
@@ -118,16 +119,15 @@ class Task:
         return self._make(self.simulator, num_worlds, preprocessing, kwargs)
 
     def make_training_simulator(self, num_worlds: int, preprocessing: Preprocessing | None = None) -> EnvBase:
-        """Builds the simulator in which transitions are collected.
+        """Builds the simulator in which transitions are collected and policies are tried.
 
-        With ``mend=posterior`` each world has its own effects; otherwise it equals :meth:`make_simulator`.
-
-        Raises:
-            ValueError: if there are effects for another number of worlds.
+        With ``mend=posterior`` each world has its own effects, and the next worlds repeat them if there are more worlds
+        than draws; otherwise it equals :meth:`make_simulator`.
         """
         if not self.worlds:
             return self.make_simulator(num_worlds, preprocessing)
-        env = BatchedMujocoEnv(instantiate(self.config["make"]), num_worlds, self.worlds)
+        effects = list(islice(cycle(self.worlds), num_worlds))
+        env = BatchedMujocoEnv(instantiate(self.config["make"]), num_worlds, effects)
         return self._transformed(env, preprocessing)
 
     def read_real_data(self, data: Source, columns: str | None = None, seconds: float | None = None) -> TensorDictBase:
