@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-import mujoco
 import numpy as np
 import torch
 from robot_cases import EFFECTS as ROBOT
@@ -16,18 +15,14 @@ from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 
 from torchrl_h2o.effects import (
     ActionDelay,
-    ActionGain,
-    Armature,
-    BodyMass,
     Effect,
-    GeomFriction,
-    JointDamping,
     JointFrictionLoss,
     Payload,
 )
 from torchrl_h2o.envs import BatchedMujocoEnv, mujoco_model
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.randomisation import usual_world
 from torchrl_h2o.training.returns import Evaluation
 
 World = tuple[Effect, ...]
@@ -120,31 +115,6 @@ SERIES: Mapping[str, Series] = MappingProxyType(
 )
 
 
-def usual_world(model: mujoco.MjModel, rng: np.random.Generator) -> World:
-    """Draws every mass, friction, damping, armature and actuator gain of a model within ± 20 %; zeros stay zero.
-
-    Args:
-        model: the model of the simulator.
-        rng: draws uniformly, each number by itself; inertia changes with the mass.
-    """
-    joints = [model.joint(i) for i in range(model.njnt)]
-    added = ((JointDamping, "damping"), (JointFrictionLoss, "frictionloss"), (Armature, "armature"))
-    scaled = (
-        *(BodyMass(bodies=model.body(i).name) for i in range(1, model.nbody)),
-        *(GeomFriction(geoms=model.geom(i).name) for i in range(model.ngeom) if model.geom_contype[i]),
-        *(ActionGain(actuators=i) for i in range(model.nu)),
-    )
-    return (
-        *(effect.with_parameters({"scale": 1.0 + rng.uniform(-USUAL, USUAL)}) for effect in scaled),
-        *(
-            kind(float(rng.uniform(-USUAL, USUAL) * getattr(joint, field)[0]), joint.name)
-            for joint in joints
-            for kind, field in added
-            if getattr(joint, field)[0]
-        ),
-    )
-
-
 def _measured(series: Series, report: Report, machines: Sequence[World], seed: int) -> Sequence[World]:
     # a draw that the model rejects, such as negative friction, is replaced by the best values
     return [w if series.accepts(w) else report.effects for w in report.sample(len(machines), seed=seed)]
@@ -152,7 +122,7 @@ def _measured(series: Series, report: Report, machines: Sequence[World], seed: i
 
 def _usual(series: Series, report: Report, machines: Sequence[World], seed: int) -> Sequence[World]:
     model, rng = mujoco_model(series.simulator()), np.random.default_rng(seed)
-    return [usual_world(model, rng) for _ in machines]
+    return [usual_world(model, rng, USUAL) for _ in machines]
 
 
 #: the worlds of a training, as many as machines are given, from a series, its report, machines of it and a seed

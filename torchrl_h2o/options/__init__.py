@@ -5,7 +5,7 @@ from torchrl_h2o.options.close_the_loop import CloseTheLoopOptions
 from torchrl_h2o.options.defaults import store_defaults
 from torchrl_h2o.options.evaluate import EvaluateOptions
 from torchrl_h2o.options.run import RunOptions
-from torchrl_h2o.options.train import AnyMethodOptions, TrainOptions
+from torchrl_h2o.options.train import AnyMethodOptions, SimToRealOptions, TrainOptions
 from torchrl_h2o.options.types import Options
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "EvaluateOptions",
     "Options",
     "RunOptions",
+    "SimToRealOptions",
     "TrainOptions",
     "check_options",
 ]
@@ -21,6 +22,7 @@ __all__ = [
 for _name, _model in {
     "run_options": RunOptions,
     "train_options": TrainOptions,
+    "sim_to_real_options": SimToRealOptions,
     "evaluate_options": EvaluateOptions,
     "close_the_loop_options": CloseTheLoopOptions,
 }.items():

@@ -155,3 +155,21 @@ class TrainOptions(AnyMethodOptions, RunOptions):
     def _check_collector(self) -> None:
         if self.collector.backend == "ray" and find_spec("ray") is None:
             raise ValueError("collector=ray needs Ray: pip install 'torchrl_h2o[ray]', here and where workers run")
+
+
+class SimToRealOptions(TrainOptions):
+    """Options of sim_to_real.py, with the relations between them."""
+
+    rounds: Few = option(5)
+    seconds: Positive = option(10.0, "longest run in reality of each round, s")
+    randomise: Share = option(0.0, "half width of the range of every number of the model in training, such as 0.2")
+
+    @model_validator(mode="after")
+    def _is_one_run(self) -> SimToRealOptions:
+        if self.baselines or self.is_population:
+            raise ValueError("sim_to_real.py makes one run: leave out baselines, seeds, gaps and mixings")
+        if self.randomise and self.mend:
+            raise ValueError(f"randomise={self.randomise:g} is for a simulator that is not mended: add mend=false")
+        if self.randomise and not self.env.batched:
+            raise ValueError(f"randomise needs a batched simulator, and env={self.env.name} is not: env.batched=true")
+        return self

@@ -16,7 +16,12 @@ from torchrl_h2o.training.task import Task
 
 def task_of(cfg: DictConfig) -> Task:
     """Builds the task of a run; raises the errors of :meth:`Task.from_config`."""
-    return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength, mended=cfg.mended)
+    return unmended_task_of(cfg).mended(cfg.mended)
+
+
+def unmended_task_of(cfg: DictConfig) -> Task:
+    """Builds the same task without what the run has found with ``mend``."""
+    return Task.from_config(cfg.env, gap=cfg.gap, gap_strength=cfg.gap_strength)
 
 
 def preprocessing_of(cfg: DictConfig) -> Preprocessing:

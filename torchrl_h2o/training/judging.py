@@ -120,7 +120,7 @@ def warnings_of(
 
 
 def best_trial(rows: Iterable[Mapping[str, Any]]) -> float | None:
-    """Returns the highest lower bound of the return in the simulator, by which ``keep=best_in_simulator`` chose the policy.
+    """Returns the highest lower bound of the return in the simulator, by which ``keep`` chose the policy.
 
     It is the highest of several bounds, so the policy's expected return there may still be lower.
 

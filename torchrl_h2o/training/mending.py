@@ -94,7 +94,7 @@ def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, dire
     tqdm.write(f"mend={cfg.mend if is_given else str(cfg.mend).lower()}: {report.sentence()}{unchanged}")
     if not is_used:
         return None
-    draws = _draws(report, task, cfg.num_worlds, cfg.seed) if cfg.mend == POSTERIOR else None
+    draws = draws_of(report, task, cfg.num_worlds, cfg.seed) if cfg.mend == POSTERIOR else None
     return {"effects": _entries(report.effects), "worlds": draws and [_entries(effects) for effects in draws]}
 
 
@@ -157,7 +157,7 @@ def search_key(task: Task, simulator: EnvBase, rows: TensorDictBase) -> str:
     return key_of([dict(task.config["make"]), effects, SEARCH], simulator, SEARCHES, data)
 
 
-def _draws(report: Report, task: Task, num_worlds: int, seed: int) -> list[tuple[Effect, ...]]:
+def draws_of(report: Report, task: Task, num_worlds: int, seed: int) -> list[tuple[Effect, ...]]:
     """One draw per world. A draw that the model rejects, such as negative damping, is replaced by the best values."""
     return [draw if _fits(task, draw) else report.effects for draw in report.sample(num_worlds, seed=seed)]
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import randomization
 import torch
-from machine_series import SERIES, WORLDS, usual_world
+from machine_series import SERIES, USUAL, WORLDS
 from motored_env import ReachingEnv
 from options import run_options
 from torch.nn.utils import parameters_to_vector
@@ -20,6 +20,7 @@ from torchrl_h2o.effects import ActionGain, JointDamping, JointFrictionLoss
 from torchrl_h2o.residuals import Report
 from torchrl_h2o.residuals.report.contents import DataSummary, FoundEffect
 from torchrl_h2o.training.preprocessing import Preprocessing
+from torchrl_h2o.training.randomisation import usual_world
 
 SMALL = ["logs=1", "rows=50", "worlds=2", "machines=2", "updates=2", "updates_per_epoch=2", "steps_per_epoch=40"]
 MACHINE = """
@@ -57,7 +58,7 @@ def world(spec, effects):
 def test_usual_worlds_differ_within_a_fifth_in_each_number_and_keep_zeros():
     spec, rng = mujoco.MjSpec.from_string(MACHINE), np.random.default_rng(0)
     plain = spec.compile()
-    drawn = [usual_world(plain, rng) for _ in range(50)]
+    drawn = [usual_world(plain, rng, USUAL) for _ in range(50)]
     models = [world(spec, effects) for effects in drawn]
     gains = [[effect.scale for effect in effects if isinstance(effect, ActionGain)] for effects in drawn]
     numbers = np.array(
