@@ -121,9 +121,7 @@ def what_is_lacking(cfg: DictConfig, real: TensorDictBase, log: TensorDictBase) 
     except FAILURES as error:
         return f"its log cannot be compared with the simulator ({error})"
     if report.verdict is None or report.verdict.kind == NOTHING_MISSING:
-        return "its log shows no difference from the simulator: " + (
-            report.conclusion or "this is a matter of the start"
-        )
+        return f"its log shows no difference from the simulator. {report.sentence()}"
     return f"the simulator lacks something, {report.verdict.where or '; '.join(report.verdict.reasons)}"
 
 
