@@ -26,10 +26,12 @@ import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.commands.one_line_errors import one_line_errors
 from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.comparison.results_file import run_row
+from torchrl_h2o.comparison.rounds import draw_rounds_of_methods, rounds_of
 from torchrl_h2o.training.config_file import load_config
 from torchrl_h2o.whole_file import write_text
 
 HERE = Path(__file__).parent
+MADE_BY = ("commit", "dirty", "versions", "cpu_s", "threads", "instruction_set")  # entries of provenance
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -49,6 +51,8 @@ def records_of(folder: Path) -> list[Record]:
         if report["unfinished"] or not report["made_by"]:
             raise ValueError(f"{folder}/report.json is not finished: end the run, or run it again")
         return [Record("machines", folder.resolve().name, report["made_by"], _values_of_report(report))]
+    if (folder / "rounds.json").exists():
+        return [_record_of_rounds(folder)]
     if (folder / "summary.json").exists():
         return [_record_of_training(folder)]
     if not (found := list(read_records(folder))):
@@ -79,11 +83,19 @@ def _record_of_training(folder: Path) -> Record:
     words = shlex.split(summary["command"])
     cfg.overrides = [word for word in words if "=" in word and not word.startswith("hydra")]
     values = run_row(cfg, summary) | {"compiled": str(cfg.compiled), "device": cfg.get("device", "cpu")}
-    made_by = {key: summary[key] for key in ("commit", "dirty", "versions", "cpu_s", "threads", "instruction_set")}
+    made_by = {key: summary[key] for key in MADE_BY}
     del values["commit"], values["versions"]
     settings = [str((values | made_by)[key]) for key in pages.SETTINGS]
     names = (values["method"], values["env"].replace("/", "-"), sha256(" ".join(settings).encode()).hexdigest()[:8])
     return Record("training", "_".join((*names, f"seed{values['seed']}")), made_by, values)
+
+
+def _record_of_rounds(folder: Path) -> Record:
+    values = json.loads((folder / "rounds.json").read_text())
+    made_by = {key: values.pop(key) for key in MADE_BY}
+    settings = sha256(json.dumps({key: values[key] for key in values if key not in ("rounds", "seed")}).encode())
+    names = (values["method"], values["env"].replace("/", "-"), settings.hexdigest()[:8], f"seed{values['seed']}")
+    return Record("sim_to_real", "_".join(names), made_by, values)
 
 
 def require_one_commit(table: str, records: Iterable[Record]) -> None:
@@ -147,6 +159,12 @@ def make(folder: Path, *, check: bool = False) -> list[str]:
     return changed
 
 
+def draw(folder: Path) -> None:
+    """Draw the figure of the rounds between simulator and reality from the stored records."""
+    if records := list(read_records(folder / "runs", "sim_to_real")):
+        draw_rounds_of_methods(folder / "sim_to_real.png", rounds_of(pages.frame(records)))
+
+
 def main(arguments: Sequence[str]) -> None:
     command, *folders = arguments or ("make",)
     if command not in ("make", "check", "store") or (command == "store") != bool(folders):
@@ -156,6 +174,8 @@ def main(arguments: Sequence[str]) -> None:
             print(f"stored     {record.save(HERE / 'runs').relative_to(HERE)}")
     if command != "store":
         changed = make(HERE, check=command == "check")
+        if command == "make":
+            draw(HERE)
         print(
             "\n".join([f"{'differs' if command == 'check' else 'wrote':<11}{name}" for name in changed]) or "no change"
         )

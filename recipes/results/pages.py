@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.comparison.results_file import IDENTITY
+from torchrl_h2o.comparison.rounds import rounds_of, rounds_tables
 from torchrl_h2o.comparison.seed_table import EPISODE, seed_tables
 from torchrl_h2o.comparison.series_tables import series_tables
 
@@ -300,6 +301,15 @@ def randomization_table(runs: Runs) -> str:
     return f"{series_tables(told, WORLDS, SCORES)}\n\nCommit {told['commit'].iloc[0]}."
 
 
+# Rounds between simulator and reality
+def rounds_table(runs: Runs) -> str:
+    """For each task, the return in reality of each method by round, and how many predictions held."""
+    if "sim_to_real" not in runs:
+        return NOT_RUN
+    told = runs["sim_to_real"]
+    return f"{rounds_tables(rounds_of(told))}\n\nCommit {told['commit'].iloc[0]}."
+
+
 # The overview
 def overview_table(runs: Runs) -> str:
     draws, trainings = _draws(runs), _trainings(runs)
@@ -319,6 +329,11 @@ def overview_table(runs: Runs) -> str:
             "randomization",
             "whether measured ranges help a policy",
             f"{len(runs['randomization'])} policies" if "randomization" in runs else NOT_RUN,
+        ],
+        [
+            "sim_to_real",
+            "rounds between simulator and reality",
+            f"{len(runs['sim_to_real'])} runs" if "sim_to_real" in runs else NOT_RUN,
         ],
     ]
     return markdown_table(
@@ -343,6 +358,7 @@ TABLES: dict[str, Callable[[Runs], str]] = {
     "coverage": coverage_table,
     "training": training_table,
     "by_seed": by_seed_table,
+    "rounds": rounds_table,
     "speed": speed_table,
     "ratio": ratio_table,
     "randomization": randomization_table,

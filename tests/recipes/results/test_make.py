@@ -56,6 +56,31 @@ def test_values_inside_intervals_are_summed_over_the_series_of_a_machine(folder)
     assert "| real | 1 | 4 of 5 | 2 of 4 [15, 85 %] | 3 of 4 [30, 95 %] |  | 2 | abc1234 |" in page
 
 
+def rounds(folder, seed, measured, **others):
+    """The folder of a finished sim_to_real.py, whose first return is inside the prediction, and its second is not."""
+    told = {"env": "robot", "gap": None, "method": "h2o_plus", "mend": "posterior", "randomise": 0.0, "seed": seed}
+    told["rounds"] = [
+        {"seconds": 2.5 + 10.0 * number, "measured": value, "inside": number == 0}
+        for number, value in enumerate(measured)
+    ]
+    (folder / str(seed)).mkdir(parents=True)
+    (folder / str(seed) / "rounds.json").write_text(json.dumps(told | MADE_BY | others))
+    return folder / str(seed)
+
+
+def test_rounds_of_several_seeds_become_a_line_and_a_figure(folder):
+    (folder / "page.md").write_text("<!-- table: rounds -->\n<!-- end -->\n")
+    for seed, measured in enumerate(((1.0, 50.0), (3.0, 60.0), (2.0, 70.0))):
+        saved(folder, *make.records_of(rounds(folder / "runs_of_sim_to_real", seed, measured)))
+    saved(folder, *make.records_of(rounds(folder / "sac", 0, (4.0, 5.0), method="sac", mend=False, randomise=0.2)))
+    make.make(folder)
+    make.draw(folder)
+    page = (folder / "page.md").read_text()
+    assert "| H2O+, mended | 2 | 60 | 12.5 | 3 of 6 | 3 |" in page
+    assert "| SAC, ± 20 % | 4 | 5 | 12.5 | 1 of 2 | 1 |" in page
+    assert (folder / "sim_to_real.png").stat().st_size > 10_000
+
+
 @pytest.mark.parametrize("other", [{"commit": "def5678"}, {"dirty": True}, {"dirty": None}])
 def test_rows_of_different_code_make_no_table(folder, other):
     saved(folder, drawn("slow", 4, ok=True), drawn("slow", 6, ok=True, **other))
