@@ -60,14 +60,14 @@ def go_round(cfg: DictConfig, folder: Path) -> None:
     logs, rounds = [first.set("log", torch.zeros(len(first), dtype=torch.int64))], []
     dt = cfg.env.seconds_per_step
     cfg.env.make.max_episode_steps = round(cfg.seconds / dt)
-    task = task_of(cfg)
+    task, report = task_of(cfg), None
 
     for number in range(1, cfg.rounds + 1):
         own, here, real = cfg.copy(), folder / f"round_{number}", torch.cat(logs)
         here.mkdir(exist_ok=True)
 
         # Close the loop on all logs so far; each simulated world gets its own draw of what they leave open
-        own.mended = find_missing_effects(own, task, real, here)
+        own.mended = find_missing_effects(own, task, real, here, known=report.effects if report else ())
         if cfg.randomise:
             model, rng = mujoco_model(task.make_simulator()), np.random.default_rng([cfg.seed, number])
             worlds = [usual_world(model, rng, cfg.randomise) for _ in range(cfg.num_worlds)]

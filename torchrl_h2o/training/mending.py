@@ -65,7 +65,9 @@ def names_report(mend: bool | str | None) -> TypeGuard[str]:
     return isinstance(mend, str) and mend != POSTERIOR
 
 
-def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, directory: Path) -> dict[str, Any] | None:
+def find_missing_effects(
+    cfg: DictConfig, task: Task, real: TensorDictBase, directory: Path, known: Sequence[Effect] = ()
+) -> dict[str, Any] | None:
     """Closes the loop between the real data and the simulator if ``mend`` is set, and writes ``mended/report.json``.
 
     A run that is resumed reads the report in its folder. If the data cannot be searched, the run goes on, and the
@@ -77,6 +79,7 @@ def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, dire
         task: the task without the effects.
         real: the measured transitions, ``[T]``, in physical units.
         directory: the run's folder.
+        known: effects from which the search begins, such as those found in fewer data.
 
     Returns:
         The effects for :meth:`Task.mended` and the entry ``mended`` of the configuration: ``effects``, and ``worlds``
@@ -88,7 +91,7 @@ def find_missing_effects(cfg: DictConfig, task: Task, real: TensorDictBase, dire
     if is_given:
         report = Report.load(cfg.mend)
     else:
-        report = report_of_run(directory) or _search(task, real, cfg.data, directory / FOLDER)
+        report = report_of_run(directory) or _search(task, real, cfg.data, directory / FOLDER, known)
     is_used = report.recommended or is_given
     unchanged = "" if is_used else " The run trains in the unchanged simulator."
     tqdm.write(f"mend={cfg.mend if is_given else str(cfg.mend).lower()}: {report.sentence()}{unchanged}")
@@ -103,7 +106,7 @@ def report_of_run(directory: Path) -> Report | None:
     return Report.load(directory / FOLDER) if (directory / FOLDER).exists() else None
 
 
-def _search(task: Task, real: TensorDictBase, data: Source, folder: Path) -> Report:
+def _search(task: Task, real: TensorDictBase, data: Source, folder: Path, known: Sequence[Effect]) -> Report:
     """Closes the loop, or reads the report of the same search from the cache, and copies its files into a folder."""
     source = Path(data).name if isinstance(data, str) and Path(data).exists() else words_of(data)
     rows, simulator = searched_rows(real), task.make_simulator()
@@ -111,10 +114,11 @@ def _search(task: Task, real: TensorDictBase, data: Source, folder: Path) -> Rep
 
     def search(cached_folder: Path) -> None:
         tqdm.write(f"mend: searching {chosen} for effects that the simulator lacks; this takes minutes")
-        write_whole(close_the_loop(simulator, rows, source=f"{source}, {chosen}", **SEARCH), cached_folder)
+        report = close_the_loop(simulator, rows, source=f"{source}, {chosen}", known=known, **SEARCH)
+        write_whole(report, cached_folder)
 
     try:
-        found = cached(cache_folder() / "mended" / search_key(task, simulator, rows), search)
+        found = cached(cache_folder() / "mended" / search_key(task, simulator, rows, known), search)
     except FAILURES as error:  # data that do not fit the simulator, or leave its equations singular
         reason = f"the search failed ({type(error).__name__}: {' '.join(str(error).split())})"
         report = Report(simulator=task.name, data=DataSummary(source, len(real), 0), conclusion=reason)
@@ -143,12 +147,12 @@ def searched_rows(real: TensorDictBase) -> TensorDictBase:
     return cast(TensorDictBase, torch.cat([real[start : start + BLOCK] for start in starts]))  # typed as a tensor
 
 
-def search_key(task: Task, simulator: EnvBase, rows: TensorDictBase) -> str:
-    """Identifies a search by the simulator and its effects, the data's values and the code.
+def search_key(task: Task, simulator: EnvBase, rows: TensorDictBase, known: Sequence[Effect] = ()) -> str:
+    """Identifies a search by the simulator and its effects, those it begins from, the data's values and the code.
 
     The effects count beside the simulator's model, which does not show those on actions, observations and forces.
     """
-    effects = [effect_to_dict(effect) for effect in task.simulator]
+    effects = [_entries(task.simulator), _entries(known)]
     data = [
         f"{key} {values.dtype} {tuple(values.shape)}".encode() + values.contiguous().numpy().tobytes()
         for key in READ
