@@ -11,9 +11,11 @@ from torchrl_h2o.objectives import (
     ExpectileValueLoss,
     H2OPlusLoss,
     MixedBellmanLoss,
+    RepresentationLoss,
     make_actor,
     make_dynamics_ratio_estimator,
     make_qvalue,
+    make_representation_deviation,
     make_value,
 )
 
@@ -63,6 +65,7 @@ class Parts:
         self.qvalues = [self._own(make_qvalue(OBSERVATION_DIM, ACTION_DIM, CELLS)) for _ in range(2)]
         self.value = self._own(make_value(OBSERVATION_DIM, CELLS))
         self.estimator = self._own(make_dynamics_ratio_estimator(OBSERVATION_DIM, ACTION_DIM, CELLS))
+        self.representation = self._own(make_representation_deviation(OBSERVATION_DIM, ACTION_DIM, CELLS))
 
     def _own(self, module: torch.nn.Module) -> torch.nn.Module:
         return _spread(module).to(self.dtype)
@@ -85,7 +88,7 @@ class Parts:
 
 def _split(kwargs: dict) -> tuple[dict, dict]:
     """Splits keyword arguments into those of H2OPlusLoss and those of its MixedBellmanLoss."""
-    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "target_entropy") if key in kwargs}
+    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "cloning", "target_entropy") if key in kwargs}
     return own, {key: value for key, value in kwargs.items() if key not in own}
 
 
@@ -104,6 +107,8 @@ LOSSES = {
     "ratio": lambda parts: DynamicsRatioLoss(parts.estimator),
     "bellman": lambda parts: parts.bellman(),
     "h2o_plus": lambda parts: parts.h2o_plus(),
+    "cloning": lambda parts: parts.sac(cloning=5.0),
+    "representation": lambda parts: RepresentationLoss(parts.representation),
     "conservative": lambda parts: ConservativeLoss(parts.sac()),
 }
 

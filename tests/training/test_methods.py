@@ -51,6 +51,7 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
 
 
 FAST = {"h2o_plus", "sac"}
+WITHOUT_CORRECTION = {"par": ["par.beta=0.0"]}  # it is counted for each step, see test_reward_correction.py
 
 
 @pytest.mark.parametrize(
@@ -59,7 +60,8 @@ FAST = {"h2o_plus", "sac"}
 )  # darc also counts its reward correction n times
 def test_the_discount_of_each_method_is_that_of_the_steps_of_a_row(compose, name):
     def loss_qvalue(gamma, steps):
-        cfg, real = compose(f"method={name}", f"gamma={gamma}", "n_steps=1")
+        chosen = WITHOUT_CORRECTION.get(name, [])
+        cfg, real = compose(f"method={name}", f"gamma={gamma}", "n_steps=1", *chosen)
         real = as_observed(cfg, real)
         replay = HybridReplayBuffer(real, 100, (8, 8))
         replay.extend(real[:50])
@@ -140,6 +142,16 @@ def test_darc_learns_from_corrected_rewards(compose):
     assert scale != 1.0
     # Δr of DARC's Eq. (1): log p_reality − log p_simulator, in the scale of the task's own reward
     torch.testing.assert_close(batch["next", "reward"].squeeze(-1), task_s.squeeze(-1) + scale * log_ratio)
+
+
+def test_par_lowers_simulated_rewards_by_the_deviation_alone(compose):
+    learner, (batch,) = parts("par", compose, "par.beta=2.0")
+    task_s = batch["next", "reward"].clone()
+    learner.terms_of(batch)
+    deviation = learner.losses["representation_loss"].representation(batch.clone())["representation_deviation"]
+    scale = compose("method=par", config="train")[0].reward_scale
+    expected = task_s.squeeze(-1) - 2.0 * scale * torch.where(batch["real"], 0.0, deviation)
+    torch.testing.assert_close(batch["next", "reward"].squeeze(-1), expected)
 
 
 def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):

@@ -1,4 +1,4 @@
-"""Losses of H2O+, and the additional terms of DARC and H2O. Needs only torch, tensordict and torchrl."""
+"""Losses of H2O+, and the additional terms of DARC, H2O and PAR. Needs only torch, tensordict and torchrl."""
 
 from torchrl_h2o.objectives.accelerated_cql import AcceleratedCQLLoss
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
@@ -11,9 +11,11 @@ from torchrl_h2o.objectives.networks import (
     make_actor,
     make_dynamics_ratio_estimator,
     make_qvalue,
+    make_representation_deviation,
     make_value,
 )
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss, fit_change_scale
+from torchrl_h2o.objectives.representation import RepresentationDeviation, RepresentationLoss
 from torchrl_h2o.objectives.reward_correction import DynamicsRewardCorrection
 from torchrl_h2o.objectives.value import (
     ExpectileValueLoss,
@@ -37,11 +39,14 @@ __all__ = [
     "ImportanceWeightedLoss",
     "InSampleValueLoss",
     "MixedBellmanLoss",
+    "RepresentationDeviation",
+    "RepresentationLoss",
     "SparseValueLoss",
     "fit_change_scale",
     "make_actor",
     "make_dynamics_ratio_estimator",
     "make_qvalue",
+    "make_representation_deviation",
     "make_value",
     "total_loss",
 ]

@@ -22,7 +22,7 @@ from torchrl_h2o.options.types import (
     option,
 )
 
-Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
+Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3", "par"]
 OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so a gap has no effect and one run counts for every gap
 
 
@@ -71,6 +71,13 @@ class TD3BCOptions(Options):
     alpha: Positive = option(2.5, "weight of Q over that of the distance to the data's actions")
 
 
+class PAROptions(Options):
+    """``par``: the penalty of simulated rewards and the term of behaviour cloning."""
+
+    beta: NotNegative = option(0.1, "penalty per unit of the representation deviation, in the task's reward")
+    cloning: Positive = option(5.0, "weight of Q over that of the distance to the real data's actions")
+
+
 class CollectorOptions(Options):
     """``collector``: where the simulators run."""
 
@@ -102,6 +109,7 @@ class AnyMethodOptions(ExperimentOptions):
     iql: IQLOptions = IQLOptions()
     cql: CQLOptions = CQLOptions()
     td3_bc: TD3BCOptions = TD3BCOptions()
+    par: PAROptions = PAROptions()
 
     results: str | None = option(
         None, "CSV file to which the run's results are appended; its curve goes to a second file"
