@@ -144,6 +144,24 @@ def test_darc_learns_from_corrected_rewards(compose):
     torch.testing.assert_close(batch["next", "reward"].squeeze(-1), task_s.squeeze(-1) + scale * log_ratio)
 
 
+def test_rebrac_s_penalty_reads_the_next_actions_of_the_data_and_without_it_td3_bc_is_torchrl_s(compose):
+    found = []
+    for penalty in (0.0, 2.0):
+        learner, batches = parts("td3_bc", compose, f"td3_bc.critic_penalty={penalty}")
+        assert (("next", "action") in learner.replay.keys) == (penalty > 0)
+        if penalty:
+            (batch,) = batches = learner.sample()
+            assert batch["next", "action"].abs().max() <= 3.0
+        found.append(learner.terms_of(*batches)["loss_qvalue"])
+    assert found[0] != found[1]
+
+
+@pytest.mark.slow
+def test_rebrac_goes_on_where_it_stopped(compose, tmp_path, monkeypatch):
+    cfg, real = compose("td3_bc.critic_penalty=1.0")
+    assert_resumed_equals_whole(METHODS["td3_bc"], cfg, real, tmp_path, monkeypatch)
+
+
 def test_par_lowers_simulated_rewards_by_the_deviation_alone(compose):
     learner, (batch,) = parts("par", compose, "par.beta=2.0")
     task_s = batch["next", "reward"].clone()

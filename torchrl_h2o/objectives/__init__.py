@@ -1,4 +1,4 @@
-"""Losses of H2O+, and the additional terms of DARC, H2O and PAR. Needs only torch, tensordict and torchrl."""
+"""Losses of H2O+, and the additional terms of DARC, H2O, PAR and ReBRAC. Needs only torch, tensordict and torchrl."""
 
 from torchrl_h2o.objectives.accelerated_cql import AcceleratedCQLLoss
 from torchrl_h2o.objectives.bellman import MixedBellmanLoss
@@ -15,6 +15,7 @@ from torchrl_h2o.objectives.networks import (
     make_value,
 )
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator, DynamicsRatioLoss, fit_change_scale
+from torchrl_h2o.objectives.rebrac import ReBRACLoss
 from torchrl_h2o.objectives.representation import RepresentationDeviation, RepresentationLoss
 from torchrl_h2o.objectives.reward_correction import DynamicsRewardCorrection
 from torchrl_h2o.objectives.value import (
@@ -39,6 +40,7 @@ __all__ = [
     "ImportanceWeightedLoss",
     "InSampleValueLoss",
     "MixedBellmanLoss",
+    "ReBRACLoss",
     "RepresentationDeviation",
     "RepresentationLoss",
     "SparseValueLoss",

@@ -69,6 +69,7 @@ class TD3BCOptions(Options):
     model_config = ConfigDict(extra="allow")
 
     alpha: Positive = option(2.5, "weight of Q over that of the distance to the data's actions")
+    critic_penalty: NotNegative = option(0.0, "ReBRAC's beta_2: weight of that distance in the target of Q")
 
 
 class PAROptions(Options):
