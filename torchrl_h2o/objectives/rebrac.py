@@ -52,6 +52,7 @@ class ReBRACLoss(TD3BCLoss):
         >>> loss(batch)["loss_qvalue"].backward()
     """
 
+    out_keys = TD3BCLoss.out_keys  # select_out_keys needs those of the class itself
     critic_penalty = 0.0
 
     def __init__(self, *args, critic_penalty: float = 0.0, **kwargs) -> None:

@@ -22,7 +22,7 @@ from torchrl_h2o.options.types import (
     option,
 )
 
-Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3", "par"]
+Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3", "par", "dara"]
 OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so a gap has no effect and one run counts for every gap
 
 
@@ -79,6 +79,13 @@ class PAROptions(Options):
     cloning: Positive = option(5.0, "weight of Q over that of the distance to the real data's actions")
 
 
+class DARAOptions(Options):
+    """``dara``: the correction of simulated rewards."""
+
+    eta: NotNegative = option(0.1, "weight of the log dynamics ratio, in the task's reward per nat")
+    clip: Positive = option(10.0, "bound of the log dynamics ratio, nats")
+
+
 class CollectorOptions(Options):
     """``collector``: where the simulators run."""
 
@@ -111,6 +118,7 @@ class AnyMethodOptions(ExperimentOptions):
     cql: CQLOptions = CQLOptions()
     td3_bc: TD3BCOptions = TD3BCOptions()
     par: PAROptions = PAROptions()
+    dara: DARAOptions = DARAOptions()
 
     results: str | None = option(
         None, "CSV file to which the run's results are appended; its curve goes to a second file"

@@ -1,6 +1,7 @@
 """The six methods of the paper's comparison and further ones, by name."""
 
 from torchrl_h2o.training.methods.cql import CQL
+from torchrl_h2o.training.methods.dara import DARA
 from torchrl_h2o.training.methods.darc import DARC
 from torchrl_h2o.training.methods.h2o import H2O
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
@@ -22,4 +23,5 @@ METHODS = {
     "rlpd": RLPD,  # both; not in the paper
     "td3": WEIGHTED_TD3,
     "par": PAR,
+    "dara": DARA,
 }
