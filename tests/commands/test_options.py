@@ -222,7 +222,7 @@ def test_help_has_a_line_for_every_option_with_its_default_value_its_meaning_and
         "batch_size=[128,128]: real, simulated (two integers of at least 1, [real,simulated], such as [128,128])"
         in lines
     )
-    groups = {"env", "collector", "h2o", "iql", "cql", "td3_bc", "par", "dara"}
+    groups = {"env", "collector", "h2o", "iql", "cql", "td3_bc", "par", "dara", "vgdf"}
     assert {line.partition(":")[0].partition("=")[0] for line in lines} == TrainOptions.model_fields.keys() - groups
 
 

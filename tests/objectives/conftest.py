@@ -7,12 +7,14 @@ from torchrl.data import Bounded
 
 from torchrl_h2o.objectives import (
     ConservativeLoss,
+    DynamicsModelLoss,
     DynamicsRatioLoss,
     ExpectileValueLoss,
     H2OPlusLoss,
     MixedBellmanLoss,
     RepresentationLoss,
     make_actor,
+    make_dynamics_model,
     make_dynamics_ratio_estimator,
     make_qvalue,
     make_representation_deviation,
@@ -66,6 +68,9 @@ class Parts:
         self.value = self._own(make_value(OBSERVATION_DIM, CELLS))
         self.estimator = self._own(make_dynamics_ratio_estimator(OBSERVATION_DIM, ACTION_DIM, CELLS))
         self.representation = self._own(make_representation_deviation(OBSERVATION_DIM, ACTION_DIM, CELLS))
+        self.models = [
+            self._own(model) for model in make_dynamics_model(OBSERVATION_DIM, ACTION_DIM, CELLS, ensemble=3)
+        ]
 
     def _own(self, module: torch.nn.Module) -> torch.nn.Module:
         return _spread(module).to(self.dtype)
@@ -109,6 +114,7 @@ LOSSES = {
     "h2o_plus": lambda parts: parts.h2o_plus(),
     "cloning": lambda parts: parts.sac(cloning=5.0),
     "representation": lambda parts: RepresentationLoss(parts.representation),
+    "dynamics": lambda parts: DynamicsModelLoss(parts.models),
     "conservative": lambda parts: ConservativeLoss(parts.sac()),
 }
 

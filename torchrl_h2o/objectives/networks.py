@@ -253,6 +253,38 @@ def make_dynamics_ratio_estimator(
     return DynamicsRatioEstimator(sa, sas, next_observation=next_observation, **kwargs)
 
 
+def make_dynamics_model(
+    observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN, *, ensemble: int = 7
+) -> list[TensorDictModule]:
+    """Build models of the change of the observation for :class:`~torchrl_h2o.objectives.DynamicsModelLoss`.
+
+    Args:
+        observation_dim (int): size of ``observation``.
+        action_dim (int): size of ``action``.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Keyword Args:
+        ensemble (int, optional): number of models with independent initial parameters. Defaults to 7.
+
+    Returns:
+        Networks that write ``change`` ``[*B, 2 observation_dim]``.
+
+    Raises:
+        ValueError: if ``ensemble`` is below 2, because the spread of one model is not defined.
+
+    Examples:
+        >>> import torch
+        >>> make_dynamics_model(4, 1)[0](observation=torch.zeros(5, 4), action=torch.zeros(5, 1)).shape
+        torch.Size([5, 8])
+    """
+    if ensemble < 2:
+        raise ValueError(f"ensemble is {ensemble}: the spread of the predictions needs at least two models.")
+    sizes = observation_dim + action_dim, 2 * observation_dim, num_cells
+    return [
+        TensorDictModule(_mlp(*sizes), in_keys=["observation", "action"], out_keys=["change"]) for _ in range(ensemble)
+    ]
+
+
 class _MeanAbsoluteNorm(nn.Module):
     """Divides a vector by the mean of its absolute values, so that a representation cannot shrink to zero."""
 

@@ -22,7 +22,7 @@ from torchrl_h2o.options.types import (
     option,
 )
 
-Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3", "par", "dara"]
+Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3", "par", "dara", "vgdf"]
 OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so a gap has no effect and one run counts for every gap
 
 
@@ -86,6 +86,13 @@ class DARAOptions(Options):
     clip: Positive = option(10.0, "bound of the log dynamics ratio, nats")
 
 
+class VGDFOptions(Options):
+    """``vgdf``: the filter of simulated rows."""
+
+    share: Annotated[float, Field(gt=0, le=1)] = option(0.25, "share of a batch's simulated rows that Q learns from")
+    num_models: Annotated[int, Field(ge=2, le=100)] = option(7, "models of the real dynamics")
+
+
 class CollectorOptions(Options):
     """``collector``: where the simulators run."""
 
@@ -119,6 +126,7 @@ class AnyMethodOptions(ExperimentOptions):
     td3_bc: TD3BCOptions = TD3BCOptions()
     par: PAROptions = PAROptions()
     dara: DARAOptions = DARAOptions()
+    vgdf: VGDFOptions = VGDFOptions()
 
     results: str | None = option(
         None, "CSV file to which the run's results are appended; its curve goes to a second file"

@@ -10,6 +10,7 @@ from torchrl_h2o.training.methods.par import PAR
 from torchrl_h2o.training.methods.rlpd import RLPD
 from torchrl_h2o.training.methods.sac import SAC
 from torchrl_h2o.training.methods.td3_bc import TD3_BC
+from torchrl_h2o.training.methods.vgdf import VGDF
 from torchrl_h2o.training.methods.weighted_td3 import WEIGHTED_TD3
 
 METHODS = {
@@ -24,4 +25,5 @@ METHODS = {
     "td3": WEIGHTED_TD3,
     "par": PAR,
     "dara": DARA,
+    "vgdf": VGDF,
 }
