@@ -59,6 +59,10 @@ VALUES = {
     "num_cells=[9999]": "num_cells=[9999]: must be the sizes, up to 4096, of 1 to 20 layers, such as [256,256]",
     "mend=first": f"mend=first: {NOWHERE}",
     "baselines=[sca]": f"baselines=[sca]: must be a list out of {METHOD_NAMES}; did you mean sac?",
+    "par.beta=-1": "par.beta=-1: must be a number of at least 0",
+    "dara.clip=0": "dara.clip=0: must be a number above 0",
+    "vgdf.share=0": "vgdf.share=0: must be a number above 0 and at most 1",
+    "td3_bc.critic_penalty=-1": "td3_bc.critic_penalty=-1: must be a number of at least 0",
     "seeds=4": "seeds=4: must be null or a list of one or more integers from 0 to 4294967295, such as [0,1,2]",
     "seeds=[1,1]": "seeds=[1,1]: 1 is in the population twice; name each value once",
     "seeds=[0,1] method=sac": "method=sac baselines=[]: a population trains h2o_plus alone; use --multirun for other "
