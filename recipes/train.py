@@ -1,6 +1,6 @@
 """Trains any method of the comparison on the same data, simulator and budget, and evaluates it in reality.
 
-python recipes/train.py method=iql           # or sac, cql, td3_bc, darc, h2o, h2o_plus, rlpd, td3
+python recipes/train.py method=iql           # or sac, cql, td3_bc, darc, h2o, h2o_plus, rlpd, td3, par, dara, vgdf
 python recipes/train.py method=h2o_plus baselines=[sac]                    # both, in one table and picture
 python recipes/train.py method=darc env=halfcheetah gap=gravity data=halfcheetah/medium-replay-v0
 python recipes/train.py seeds=[0,1,2,3,4] gaps=[gravity,friction]          # ten runs of H2O+ at once, stacked

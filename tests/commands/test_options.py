@@ -32,6 +32,7 @@ NOWHERE = "there is no such file or folder"
 SHARED = "because all worlds share the steps equally"
 NOT_A_RUN = "it is not the folder of a run, which has a config.yaml"
 
+METHOD_NAMES = ", ".join(METHODS)
 VALUES = {
     "updates=0": f"updates=0: {COUNT}",
     "updates_per_epoch=0": f"updates_per_epoch=0: {COUNT}",
@@ -43,8 +44,7 @@ VALUES = {
     "gamma=1.5": "gamma=1.5: must be a number from 0 to 1",
     "num_cells=[]": "num_cells=[]: must be the sizes, up to 4096, of 1 to 20 layers, such as [256,256]",
     "device=gpu": "device=gpu: must be cpu or cuda",
-    "method=h2oplus": "method=h2oplus: must be sac, cql, iql, td3_bc, darc, h2o, h2o_plus, rlpd or td3; did you mean "
-    "h2o_plus?",
+    "method=h2oplus": f"method=h2oplus: must be {' or '.join(METHOD_NAMES.rsplit(', ', 1))}; did you mean h2o_plus?",
     "gap=gravty": f"gap=gravty: must be {GAPS} or null; did you mean gravity?",
     "data=halfcheetah/medium-repaly-v0": "data=halfcheetah/medium-repaly-v0: there is no such data set on this "
     "machine; did you mean halfcheetah/medium-replay-v0?",
@@ -58,8 +58,11 @@ VALUES = {
     "seeds=[0,1] compiled=true": "compiled=true is for single runs: stacked networks are slower with it, leave it out",
     "num_cells=[9999]": "num_cells=[9999]: must be the sizes, up to 4096, of 1 to 20 layers, such as [256,256]",
     "mend=first": f"mend=first: {NOWHERE}",
-    "baselines=[sca]": "baselines=[sca]: must be a list out of sac, cql, iql, td3_bc, darc, h2o, h2o_plus, rlpd, td3; "
-    "did you mean sac?",
+    "baselines=[sca]": f"baselines=[sca]: must be a list out of {METHOD_NAMES}; did you mean sac?",
+    "par.beta=-1": "par.beta=-1: must be a number of at least 0",
+    "dara.clip=0": "dara.clip=0: must be a number above 0",
+    "vgdf.share=0": "vgdf.share=0: must be a number above 0 and at most 1",
+    "td3_bc.critic_penalty=-1": "td3_bc.critic_penalty=-1: must be a number of at least 0",
     "seeds=4": "seeds=4: must be null or a list of one or more integers from 0 to 4294967295, such as [0,1,2]",
     "seeds=[1,1]": "seeds=[1,1]: 1 is in the population twice; name each value once",
     "seeds=[0,1] method=sac": "method=sac baselines=[]: a population trains h2o_plus alone; use --multirun for other "
@@ -122,7 +125,7 @@ OTHERS = {
     (
         "paper",
         "table=returns methods=[h2oplus]",
-    ): "methods=[h2oplus]: choose sac, cql, iql, td3_bc, darc, h2o, h2o_plus, rlpd, td3; did you mean h2o_plus?",
+    ): f"methods=[h2oplus]: choose {METHOD_NAMES}; did you mean h2o_plus?",
     ("paper", "table=returns device=gpu"): "device=gpu: must be cpu or cuda",
     ("report", "groups=[retuns]"): "retuns: there is no outputs/results/retuns.csv; did you mean returns?",
     ("report", "+references.mine=[0]"): "references={mine: [0]}: must be the returns that score 0 and 100 for each "
@@ -223,7 +226,7 @@ def test_help_has_a_line_for_every_option_with_its_default_value_its_meaning_and
         "batch_size=[128,128]: real, simulated (two integers of at least 1, [real,simulated], such as [128,128])"
         in lines
     )
-    groups = {"env", "collector", "h2o", "iql", "cql", "td3_bc"}
+    groups = {"env", "collector", "h2o", "iql", "cql", "td3_bc", "par", "dara", "vgdf"}
     assert {line.partition(":")[0].partition("=")[0] for line in lines} == TrainOptions.model_fields.keys() - groups
 
 

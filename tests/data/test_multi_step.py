@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from tests.data.recordings import assert_same
-from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.data import HybridReplayBuffer, with_next_actions
 from torchrl_h2o.data.multi_step import OngoingMultiStep
 
 GAMMA = 0.9
@@ -115,3 +115,16 @@ def test_rows_that_wait_are_part_of_a_checkpoint(tmp_path, way):
         each.extend(run([False] * 4, start=105)[None])
     assert_same(other.storage[:], replay.storage[:])
     assert len(other.storage) == 6
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_next_action_is_the_one_in_the_state_that_the_target_reads_and_rows_without_one_are_left_out(n):
+    ends = [False, False, False, True, False, False, True, False, False]  # the second run is truncated
+    data = run(ends, terminated=[False, False, False, True, False, False, False, False, False])
+    rows = data if n == 1 else OngoingMultiStep(n, GAMMA).whole(data)
+    kept = with_next_actions(rows)
+    goes_on = ~kept["next", "terminated"].flatten()
+    # in ``run`` the action in a state has the state's number
+    torch.testing.assert_close(kept["next", "action"][goes_on], kept["next", "observation"][goes_on])
+    assert kept["action"].flatten().tolist() == ([0, 1, 2, 3, 4, 5, 7] if n == 1 else [0, 1, 2, 3])
+    assert ("next", "action") not in rows.keys(True)

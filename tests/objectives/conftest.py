@@ -7,13 +7,17 @@ from torchrl.data import Bounded
 
 from torchrl_h2o.objectives import (
     ConservativeLoss,
+    DynamicsModelLoss,
     DynamicsRatioLoss,
     ExpectileValueLoss,
     H2OPlusLoss,
     MixedBellmanLoss,
+    RepresentationLoss,
     make_actor,
+    make_dynamics_model,
     make_dynamics_ratio_estimator,
     make_qvalue,
+    make_representation_deviation,
     make_value,
 )
 
@@ -63,6 +67,10 @@ class Parts:
         self.qvalues = [self._own(make_qvalue(OBSERVATION_DIM, ACTION_DIM, CELLS)) for _ in range(2)]
         self.value = self._own(make_value(OBSERVATION_DIM, CELLS))
         self.estimator = self._own(make_dynamics_ratio_estimator(OBSERVATION_DIM, ACTION_DIM, CELLS))
+        self.representation = self._own(make_representation_deviation(OBSERVATION_DIM, ACTION_DIM, CELLS))
+        self.models = [
+            self._own(model) for model in make_dynamics_model(OBSERVATION_DIM, ACTION_DIM, CELLS, ensemble=3)
+        ]
 
     def _own(self, module: torch.nn.Module) -> torch.nn.Module:
         return _spread(module).to(self.dtype)
@@ -85,7 +93,7 @@ class Parts:
 
 def _split(kwargs: dict) -> tuple[dict, dict]:
     """Splits keyword arguments into those of H2OPlusLoss and those of its MixedBellmanLoss."""
-    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "target_entropy") if key in kwargs}
+    own = {key: kwargs[key] for key in ("weighted", "fixed_alpha", "cloning", "target_entropy") if key in kwargs}
     return own, {key: value for key, value in kwargs.items() if key not in own}
 
 
@@ -104,6 +112,9 @@ LOSSES = {
     "ratio": lambda parts: DynamicsRatioLoss(parts.estimator),
     "bellman": lambda parts: parts.bellman(),
     "h2o_plus": lambda parts: parts.h2o_plus(),
+    "cloning": lambda parts: parts.sac(cloning=5.0),
+    "representation": lambda parts: RepresentationLoss(parts.representation),
+    "dynamics": lambda parts: DynamicsModelLoss(parts.models),
     "conservative": lambda parts: ConservativeLoss(parts.sac()),
 }
 

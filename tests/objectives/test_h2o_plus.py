@@ -121,12 +121,29 @@ def test_actor_and_alpha_losses_are_equation_10(parts, batch):
         terms[row["real"]].append(0.3 * expected_log_prob - q)
         entropies[row["real"]].append(expected_log_prob)
     torch.manual_seed(4)
-    got, sampled = loss.actor_loss(batch, loss._rows(batch))
+    got, sampled = loss.actor_terms(batch, loss._rows(batch))
     expected = (reference.mean(terms[True]) + reference.mean(terms[False])) / 2
-    assert got.item() == pytest.approx(expected, rel=1e-5)
+    assert got["loss_actor"].item() == pytest.approx(expected, rel=1e-5)
     mean_log_prob = (reference.mean(entropies[True]) + reference.mean(entropies[False])) / 2
     expected_alpha = -loss.log_alpha.item() * (mean_log_prob - ACTION_DIM)
     assert loss.alpha_loss(sampled, loss._rows(batch)).item() == pytest.approx(expected_alpha, rel=1e-5)
+
+
+def test_cloning_weighs_the_policy_s_loss_by_q_and_adds_its_distance_from_the_real_actions(batch):
+    found = []
+    for cloning in (None, 5.0):
+        loss = Parts().sac(cloning=cloning)
+        torch.manual_seed(4)
+        found.append(loss.actor_terms(batch, loss._rows(batch))[0])
+    torch.manual_seed(4)
+    action, _ = loss.bellman_loss.sample_action(batch)
+    states = batch.copy().set("action", action)
+    size = loss.bellman_loss.qvalues(states, loss.qvalue_network_params).amin(0).abs()
+    size = (size[batch["real"]].mean() + size[~batch["real"]].mean()) / 2
+    torch.testing.assert_close(found[1]["loss_actor"], 5.0 / size * found[0]["loss_actor"])
+    torch.testing.assert_close(found[1]["loss_cloning"], (action - batch["action"])[batch["real"]].square().mean())
+    with pytest.raises(ValueError, match="cloning must be positive"):
+        Parts().sac(cloning=0.0)
 
 
 def test_alpha_grows_while_the_entropy_is_below_its_target(parts, batch):
@@ -140,7 +157,7 @@ def test_the_logged_entropy_is_minus_the_mean_log_probability(parts, batch):
     loss = parts.h2o_plus(ratio=False)
     torch.manual_seed(3)
     loss.bellman_loss.mixed_target(batch)
-    _, log_prob = loss.actor_loss(batch, loss._rows(batch))
+    _, log_prob = loss.actor_terms(batch, loss._rows(batch))
     torch.manual_seed(3)
     expected = -(log_prob[batch["real"]].mean() + log_prob[~batch["real"]].mean()) / 2
     torch.testing.assert_close(loss(batch)["entropy"], expected)

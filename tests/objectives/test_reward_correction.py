@@ -44,6 +44,24 @@ def test_simulated_steps_are_paid_the_log_ratio_too_and_real_ones_are_not(parts,
     assert corrected["next", "reward"].squeeze(-1).tolist() == pytest.approx(expected, rel=1e-10)
 
 
+def test_a_clip_bounds_the_measure_before_it_is_scaled(parts, batch):
+    measure = [log_ratio_of(parts.estimator, row) for row in reference.rows(batch)]
+    expected = [
+        row["reward"] + (0.0 if row["real"] else 0.5 * min(max(u, -0.1), 0.1))
+        for row, u in zip(reference.rows(batch), measure, strict=True)
+    ]
+    assert max(map(abs, measure)) > 0.1
+    corrected = DynamicsRewardCorrection(parts.estimator, scale=0.5, clip=0.1)(batch)
+    assert corrected["next", "reward"].squeeze(-1).tolist() == pytest.approx(expected, rel=1e-10)
+
+
+def test_any_module_that_measures_the_gap_corrects_rewards(parts, batch):
+    plain = batch["next", "reward"].squeeze(-1).clone()
+    corrected = DynamicsRewardCorrection(parts.representation, scale=-2.0)(batch)["next", "reward"].squeeze(-1)
+    deviation = parts.representation(batch)["representation_deviation"]
+    torch.testing.assert_close(corrected, plain - 2.0 * torch.where(batch["real"], 0.0, deviation))
+
+
 def test_without_a_mark_every_step_is_simulated(parts, batch):
     expected = [row["reward"] + log_ratio_of(parts.estimator, row) for row in reference.rows(batch)]
     corrected = DynamicsRewardCorrection(parts.estimator)(batch.exclude("real"))

@@ -14,11 +14,13 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from tests.objectives.conftest import ACTION_DIM, CELLS, OBSERVATION_DIM, Parts, make_batch
 from torchrl_h2o.objectives import (
+    DynamicsModelLoss,
     DynamicsRatioLoss,
     ExpectileValueLoss,
     ExponentialValueLoss,
     H2OPlusLoss,
     MixedBellmanLoss,
+    RepresentationLoss,
     make_actor,
 )
 
@@ -31,6 +33,9 @@ LOSSES = {
     "h2o_plus": lambda parts: parts.h2o_plus(),
     "h2o_plus_delayed_ratio": lambda parts: parts.h2o_plus(delay_estimator=True),
     "without_value": lambda parts: parts.sac(),
+    "cloning": lambda parts: parts.sac(cloning=5.0),
+    "representation": lambda parts: RepresentationLoss(parts.representation),
+    "dynamics": lambda parts: DynamicsModelLoss(parts.models),
 }
 losses = pytest.mark.parametrize("name", LOSSES)
 

@@ -12,7 +12,7 @@ from torchrl.data import Bounded
 from torchrl_h2o.data import HybridReplayBuffer
 from torchrl_h2o.objectives import total_loss
 from torchrl_h2o.training.compiling import PAYS_FROM, OneGraph, compiled, maybe_compiled
-from torchrl_h2o.training.methods import h2o, h2o_plus, weighted_td3
+from torchrl_h2o.training.methods import h2o, h2o_plus, par, vgdf, weighted_td3
 
 
 def learner_of(cfg, real, make_learner=h2o_plus.make_learner):
@@ -50,7 +50,7 @@ def test_compiled_updates_are_the_updates_of_losses_as_they_are(compose):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="compiling needs a C++ compiler")
-@pytest.mark.parametrize("method", [h2o, weighted_td3], ids=["h2o", "weighted_td3"])
+@pytest.mark.parametrize("method", [h2o, weighted_td3, par, vgdf], ids=["h2o", "weighted_td3", "par", "vgdf"])
 def test_terms_of_several_losses_are_compiled_with_their_gradients(compose, method):
     cfg, real = compose("compiled=true", config="train")
     expected = updated(learner_of(cfg, real, method.make_learner))

@@ -51,6 +51,10 @@ def test_each_method_moves_its_policy_and_training_on_is_training_in_one_go(comp
 
 
 FAST = {"h2o_plus", "sac"}
+WITHOUT_CORRECTION = {
+    "par": ["par.beta=0.0"],
+    "dara": ["dara.eta=0.0"],
+}  # it is counted for each step, see test_reward_correction.py
 
 
 @pytest.mark.parametrize(
@@ -59,7 +63,8 @@ FAST = {"h2o_plus", "sac"}
 )  # darc also counts its reward correction n times
 def test_the_discount_of_each_method_is_that_of_the_steps_of_a_row(compose, name):
     def loss_qvalue(gamma, steps):
-        cfg, real = compose(f"method={name}", f"gamma={gamma}", "n_steps=1")
+        chosen = WITHOUT_CORRECTION.get(name, [])
+        cfg, real = compose(f"method={name}", f"gamma={gamma}", "n_steps=1", *chosen)
         real = as_observed(cfg, real)
         replay = HybridReplayBuffer(real, 100, (8, 8))
         replay.extend(real[:50])
@@ -93,7 +98,9 @@ def test_each_method_sees_the_data_that_the_paper_gives_it(compose, tmp_path, na
     policy_s, *discriminators = sizes[0]
     expected = {"sac": (0, 16), "darc": (0, 16), "cql": (16, 0), "iql": (16, 0), "td3_bc": (16, 0)}
     assert tuple(policy_s) == expected.get(name, (8, 8))
-    assert [tuple(size) for size in discriminators] == ([(8, 8)] if name in ("darc", "h2o", "h2o_plus", "td3") else [])
+    assert [tuple(size) for size in discriminators] == (
+        [(8, 8)] if name in ("darc", "dara", "h2o", "h2o_plus", "td3") else []
+    )
 
 
 def recorded(sizes):
@@ -140,6 +147,46 @@ def test_darc_learns_from_corrected_rewards(compose):
     assert scale != 1.0
     # Δr of DARC's Eq. (1): log p_reality − log p_simulator, in the scale of the task's own reward
     torch.testing.assert_close(batch["next", "reward"].squeeze(-1), task_s.squeeze(-1) + scale * log_ratio)
+
+
+def test_dara_corrects_simulated_rewards_by_the_clipped_ratio_and_trains_on_both_streams(compose):
+    learner, (batch, pairs) = parts("dara", compose, "dara.eta=2.0", "dara.clip=0.01")
+    task_s = batch["next", "reward"].clone()
+    terms = learner.terms_of(batch, pairs)
+    log_ratio = learner.losses["ratio_loss"].estimator(batch.clone())["log_dynamics_ratio"].clamp(-0.01, 0.01)
+    assert (log_ratio.abs() == 0.01).any()
+    scale = 2.0 * compose("method=dara", config="train")[0].reward_scale
+    expected = task_s.squeeze(-1) + scale * torch.where(batch["real"], 0.0, log_ratio)
+    torch.testing.assert_close(batch["next", "reward"].squeeze(-1), expected)
+    assert {"loss_actor", "loss_qvalue", "loss_value", "loss_ratio_sa"} <= set(terms)
+
+
+def test_rebrac_s_penalty_reads_the_next_actions_of_the_data_and_without_it_td3_bc_is_torchrl_s(compose):
+    found = []
+    for penalty in (0.0, 2.0):
+        learner, batches = parts("td3_bc", compose, f"td3_bc.critic_penalty={penalty}")
+        assert (("next", "action") in learner.replay.keys) == (penalty > 0)
+        if penalty:
+            (batch,) = batches = learner.sample()
+            assert batch["next", "action"].abs().max() <= 3.0
+        found.append(learner.terms_of(*batches)["loss_qvalue"])
+    assert found[0] != found[1]
+
+
+@pytest.mark.slow
+def test_rebrac_goes_on_where_it_stopped(compose, tmp_path, monkeypatch):
+    cfg, real = compose("td3_bc.critic_penalty=1.0")
+    assert_resumed_equals_whole(METHODS["td3_bc"], cfg, real, tmp_path, monkeypatch)
+
+
+def test_par_lowers_simulated_rewards_by_the_deviation_alone(compose):
+    learner, (batch,) = parts("par", compose, "par.beta=2.0")
+    task_s = batch["next", "reward"].clone()
+    learner.terms_of(batch)
+    deviation = learner.losses["representation_loss"].representation(batch.clone())["representation_deviation"]
+    scale = compose("method=par", config="train")[0].reward_scale
+    expected = task_s.squeeze(-1) - 2.0 * scale * torch.where(batch["real"], 0.0, deviation)
+    torch.testing.assert_close(batch["next", "reward"].squeeze(-1), expected)
 
 
 def test_h2o_weighs_simulated_rows_alone_and_adds_its_term(compose):

@@ -43,7 +43,7 @@ def mean_difference(pairs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["h2o_plus", "h2o", "darc", "td3"])
+@pytest.mark.parametrize("name", ["h2o_plus", "h2o", "darc", "dara", "td3"])
 def test_methods_train_and_resume_with_pairs(compose, tmp_path, name, monkeypatch):
     cfg, real = compose("updates=60", "ratio_estimator=pairs", config="train")
     _, training = assert_resumed_equals_whole(METHODS[name], cfg, real, tmp_path, monkeypatch)

@@ -6,6 +6,7 @@ selects the reader.
 
 from torchrl_h2o.data.audit import Audit, Finding, audit
 from torchrl_h2o.data.hybrid_replay import HybridReplayBuffer
+from torchrl_h2o.data.multi_step import with_next_actions
 from torchrl_h2o.data.paired_transitions import PairedTransitions
 from torchrl_h2o.data.readers.d4rl import read_d4rl
 from torchrl_h2o.data.readers.error import DataError
@@ -35,6 +36,7 @@ __all__ = [
     "read_robot_log",
     "read_ted",
     "sources_of",
+    "with_next_actions",
     "write_minari",
     "write_ted",
 ]

@@ -34,6 +34,36 @@ def original_key(key: NestedKey) -> NestedKey:
     return unravel_key((*path, f"original_{name}"))
 
 
+def with_next_actions(rows: TensorDictBase) -> TensorDictBase:
+    """Add the action that follows in the data, ``("next", "action")``; leave out rows after which there is none.
+
+    A terminated row keeps its own action there, because no target reads the action after it.
+
+    Args:
+        rows: transitions in time order, ``[T]``; with ``steps_to_next_obs``, the action is that many steps later.
+
+    Returns:
+        The rows ``[T']`` that are terminated, or neither end a run nor are the last ones of the data.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> ends = torch.tensor([[False], [True], [False], [False]])
+        >>> rows = TensorDict(action=torch.arange(4.0)[:, None], batch_size=4,
+        ...                   next=TensorDict(done=ends, terminated=ends & False, batch_size=4))
+        >>> with_next_actions(rows)["next", "action"].flatten().tolist()
+        [1.0, 3.0]
+    """
+    place = torch.arange(len(rows), device=rows.device)
+    steps = rows.get(STEPS, None)
+    later = place + (1 if steps is None else cast(torch.Tensor, steps).flatten())
+    done, terminated = (cast(torch.Tensor, rows.get(("next", key))).flatten() for key in ("done", "terminated"))
+    known = ~done & (later < len(rows))
+    action = cast(torch.Tensor, rows.get("action"))
+    extended = rows.copy().set(("next", "action"), action[torch.where(known, later, place)])
+    return cast(TensorDictBase, extended[known | terminated])
+
+
 def _is_next_state(key: NestedKey) -> bool:
     return not isinstance(key, str) and key[0] == "next" and key[-1] not in _NOT_STATES
 

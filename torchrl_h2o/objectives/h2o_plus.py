@@ -43,12 +43,16 @@ class H2OPlusLoss(LossWrapper):
         weighted (bool, optional): whether the ratio weights the simulated rows. With ``False`` the discriminators are
             still trained, but the weight is 1. Defaults to ``True``.
         fixed_alpha (bool, optional): whether β stays constant. Defaults to ``False``.
+        cloning (float, optional): ν of a term that keeps the policy near the actions of the real data. ``loss_actor``
+            is then multiplied by :math:`\nu/\overline{|Q|}`, with the batch's mean of |Q| at the policy's actions, and
+            ``loss_cloning`` is :math:`E_{𝒟}[(a_\pi-a)^2]`, the mean over the action's dimensions, in its squared unit.
+            A smaller ν is nearer to the data. Defaults to ``None``: no such term.
         target_entropy (float or "auto", optional): in nats. ``"auto"``, the default, is -dim(A), from the actor's
             spec; of several agents, -dim(A) of one agent.
 
     Raises:
-        ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if their reductions differ, or if the target
-            entropy is "auto" and the actor has no action spec.
+        ValueError: if ``bellman_loss`` and ``value_loss`` do not share V, if their reductions differ, if the target
+            entropy is "auto" and the actor has no action spec, or if ν is not positive.
 
     ``loss(batch)`` trains the discriminators on the same batch. ``loss(batch, pairs)`` trains them on the second batch,
     as the authors do (``batch`` with 128 + 128 rows, ``pairs`` with 256 + 256). Reads the inputs of its parts. Returns
@@ -107,13 +111,17 @@ class H2OPlusLoss(LossWrapper):
         *,
         weighted: bool = True,
         fixed_alpha: bool = False,
+        cloning: float | None = None,
         target_entropy: float | str = "auto",
     ) -> None:
+        if cloning is not None and not cloning > 0:
+            raise ValueError(f"cloning must be positive, or None for no such term, not {cloning}.")
         _check_shared_value(bellman_loss, value_loss)
         super().__init__(bellman_loss, reduction=bellman_loss.reduction)
         self.value_loss = value_loss
         self.ratio_loss = ratio_loss
         self.weighted = weighted
+        self.cloning = cloning
         for part in self._parts:
             if part.reduction != self.reduction:
                 raise ValueError(
@@ -203,6 +211,8 @@ class H2OPlusLoss(LossWrapper):
         if self.value_loss is not None:
             yield "loss_value"
         yield "loss_alpha"
+        if self.cloning is not None:
+            yield "loss_cloning"
         if self.ratio_loss is not None:
             yield from self.ratio_loss.out_keys
             if self.weighted:
@@ -226,9 +236,9 @@ class H2OPlusLoss(LossWrapper):
         loss_qvalue = bellman.qvalue_loss(batch, rows)
         tensordict.set(self.tensor_keys.priority, batch.get(self.tensor_keys.priority))
         value_terms = self._value_terms(batch, rows)
-        loss_actor, log_prob = self.actor_loss(batch, rows)
+        actor_terms, log_prob = self.actor_terms(batch, rows)
         terms = {
-            "loss_actor": loss_actor,
+            **actor_terms,
             "loss_qvalue": loss_qvalue,
             **value_terms,
             "loss_alpha": self.alpha_loss(log_prob, rows),
@@ -285,14 +295,21 @@ class H2OPlusLoss(LossWrapper):
         batch.set(value_loss.tensor_keys.state_action_value, qvalue)
         return {"loss_value": value_loss.value_loss(batch, rows)}
 
-    def actor_loss(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, Tensor]:
-        """Compute the reduced loss of Eq. (10), and log π(a|s) of the sampled actions as a constant, ``[*B]``."""
-        bellman, states = self.bellman_loss, tensordict.copy()
+    def actor_terms(self, tensordict: TensorDictBase, rows: Rows) -> tuple[dict[str, Tensor], Tensor]:
+        """Compute the policy's reduced losses, and log π(a|s) of the sampled actions as a constant, ``[*B]``."""
+        bellman, states, key = self.bellman_loss, tensordict.copy(), self.tensor_keys.action
         action, log_prob = bellman.sample_action(states)
-        states.set(self.tensor_keys.action, action)
+        states.set(key, action)
         qvalue = bellman.qvalues(states, self.qvalue_network_params, frozen=True).amin(0)
-        terms = self.alpha * log_prob - qvalue  # Eq. (10)
-        return self._union_expectation(terms, rows), log_prob.detach()
+        terms = {"loss_actor": self._union_expectation(self.alpha * log_prob - qvalue, rows)}  # Eq. (10)
+        if self.cloning is not None:
+            size = self._union_expectation(qvalue.detach().abs(), rows, "mean", prioritised=False)
+            distance = (action - tensordict.get(key)).square().mean(-1)
+            terms = {
+                "loss_actor": self.cloning / size * terms["loss_actor"],
+                "loss_cloning": self._expectation(distance, rows, "real"),
+            }
+        return terms, log_prob.detach()
 
     def alpha_loss(self, log_prob: Tensor, rows: Rows) -> Tensor:
         """Compute SAC's reduced loss of β; a gradient step raises β while the entropy is below its target."""

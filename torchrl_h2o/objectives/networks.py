@@ -14,6 +14,7 @@ from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 
 from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
+from torchrl_h2o.objectives.representation import RepresentationDeviation
 
 HIDDEN = (256, 256)
 
@@ -250,3 +251,77 @@ def make_dynamics_ratio_estimator(
         network = _mlp(sas_dim, 2, num_cells)
     sas = TensorDictModule(network, in_keys=keys, out_keys=["sas_logits"])
     return DynamicsRatioEstimator(sa, sas, next_observation=next_observation, **kwargs)
+
+
+def make_dynamics_model(
+    observation_dim: int, action_dim: int, num_cells: Sequence[int] = HIDDEN, *, ensemble: int = 7
+) -> list[TensorDictModule]:
+    """Build models of the change of the observation for :class:`~torchrl_h2o.objectives.DynamicsModelLoss`.
+
+    Args:
+        observation_dim (int): size of ``observation``.
+        action_dim (int): size of ``action``.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Keyword Args:
+        ensemble (int, optional): number of models with independent initial parameters. Defaults to 7.
+
+    Returns:
+        Networks that write ``change`` ``[*B, 2 observation_dim]``.
+
+    Raises:
+        ValueError: if ``ensemble`` is below 2, because the spread of one model is not defined.
+
+    Examples:
+        >>> import torch
+        >>> make_dynamics_model(4, 1)[0](observation=torch.zeros(5, 4), action=torch.zeros(5, 1)).shape
+        torch.Size([5, 8])
+    """
+    if ensemble < 2:
+        raise ValueError(f"ensemble is {ensemble}: the spread of the predictions needs at least two models.")
+    sizes = observation_dim + action_dim, 2 * observation_dim, num_cells
+    return [
+        TensorDictModule(_mlp(*sizes), in_keys=["observation", "action"], out_keys=["change"]) for _ in range(ensemble)
+    ]
+
+
+class _MeanAbsoluteNorm(nn.Module):
+    """Divides a vector by the mean of its absolute values, so that a representation cannot shrink to zero."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x / x.abs().mean(-1, keepdim=True).clamp_min(1e-8)
+
+
+def make_representation_deviation(
+    observation_dim: int,
+    action_dim: int,
+    num_cells: Sequence[int] = HIDDEN,
+    *,
+    next_observation: NestedKey = ("next", "observation"),
+) -> RepresentationDeviation:
+    """Build the encoders of PAR: perceptrons with ELU, and a representation as wide as the last hidden layer.
+
+    Args:
+        observation_dim (int): size of ``observation``.
+        action_dim (int): size of ``action``.
+        num_cells (sequence of int, optional): hidden layers. Defaults to ``(256, 256)``.
+
+    Keyword Args:
+        next_observation (NestedKey, optional): the entry of the one-step next state s'; see
+            :func:`make_dynamics_ratio_estimator`. Defaults to ``("next", "observation")``.
+
+    Source:
+        The published code of PAR (Lyu et al., 2024, https://arxiv.org/abs/2405.15369).
+
+    Examples:
+        >>> make_representation_deviation(17, 6).in_keys
+        ['observation', 'action', ('next', 'observation')]
+    """
+    width, hidden = num_cells[-1], {"num_cells": list(num_cells), "activation_class": nn.ELU}
+    encoder = nn.Sequential(MLP(observation_dim, width, **hidden), _MeanAbsoluteNorm())
+    predictor = MLP(width + action_dim, width, **hidden)
+    return RepresentationDeviation(
+        TensorDictModule(encoder, in_keys=["observation"], out_keys=["representation"]),
+        TensorDictModule(predictor, in_keys=["representation", "action"], out_keys=["next_representation"]),
+        next_keys=[next_observation],
+    )

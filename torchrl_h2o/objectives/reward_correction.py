@@ -1,4 +1,4 @@
-"""DARC's reward correction: lower the reward of simulated steps that are unlikely in reality."""
+"""Reward corrections of DARC, DARA and PAR: lower the reward of simulated steps that are unlikely in reality."""
 
 from __future__ import annotations
 
@@ -7,23 +7,28 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 
 from torchrl_h2o.objectives.batch_checks import one_per_row, require_boolean
-from torchrl_h2o.objectives.ratio import DynamicsRatioEstimator
 
 
 class DynamicsRewardCorrection(TensorDictModuleBase):
-    r"""Add the log dynamics ratio to the reward of simulated transitions: :math:`r+\log\frac{P}{\hat P}(s'|s,a)`.
+    r"""Add a measure u of the dynamics gap to the reward of simulated transitions.
 
-    Together with TorchRL's ``SACLoss`` this gives DARC. Call the module on a batch, or make it the transform of a
-    replay buffer, ``ReplayBuffer(..., transform=correction)``; each sample is then corrected with the current
-    discriminators.
+    .. math::
+        r+c\,u(s,a,s'),\qquad u=\log\tfrac{P}{\hat P}(s'|s,a)\text{ of an estimator of the dynamics ratio}
+
+    The log ratio with TorchRL's ``SACLoss`` gives DARC; on both streams, clipped and with a smaller c, DARA. A
+    :class:`RepresentationDeviation` and a negative c give the reward of PAR. Call the module on a batch, or make it the
+    transform of a replay buffer, ``ReplayBuffer(..., transform=correction)``; each sample is then corrected with the
+    current networks.
 
     Args:
-        estimator (DynamicsRatioEstimator): trained by a :class:`DynamicsRatioLoss`. Its log ratio is bounded by
+        estimator (TensorDictModule): reads a transition and writes u, ``[*B]``, as its first entry, for example a
+            :class:`DynamicsRatioEstimator` trained by a :class:`DynamicsRatioLoss`, whose log ratio is bounded by
             ``logit_bound``, not by ``clamp``.
-        scale (float, optional): reward per nat of the log ratio. If the loss receives rewards multiplied by c, use
-            ``scale=c``. Defaults to 1.0.
+        scale (float, optional): c, reward per unit of u (of the log ratio, nats). If the loss receives rewards
+            multiplied by a factor, multiply c by it, too. Defaults to 1.0.
 
     Keyword Args:
+        clip (float, optional): bound of :math:`|u|`, in its unit. Defaults to ``None``: no bound.
         gamma (float, optional): discount factor of n-step rewards. Only the first of the n transitions is available, so
             its correction is counted for all of them: it is multiplied by :math:`1+\gamma+\dots+\gamma^{m-1}`, with m =
             ``steps_to_next_obs``. Exact for one step. Defaults to 0.99.
@@ -37,8 +42,9 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
         KeyError: if a transition lacks the estimator's inputs or the reward.
 
     Source:
-        The correction Δr: DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916). The ratio: H2O+ (Niu et
-        al., 2023, https://arxiv.org/abs/2309.12716), Eq. (9).
+        The correction Δr: DARC (Eysenbach et al., 2020, https://arxiv.org/abs/2006.13916). Its clip: DARA (Liu et al.,
+        2022, https://arxiv.org/abs/2203.06662). The ratio: H2O+ (Niu et al., 2023, https://arxiv.org/abs/2309.12716),
+        Eq. (9).
 
     Examples:
         >>> import torch
@@ -60,9 +66,10 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
 
     def __init__(
         self,
-        estimator: DynamicsRatioEstimator,
+        estimator: TensorDictModuleBase,
         scale: float = 1.0,
         *,
+        clip: float | None = None,
         gamma: float = 0.99,
         reward: NestedKey = ("next", "reward"),
         real: NestedKey = "real",
@@ -71,6 +78,7 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
         super().__init__()
         self.estimator = estimator
         self.scale = scale
+        self.clip = clip
         self.gamma = gamma
         self.steps_to_next_obs = steps_to_next_obs
         self.reward, self.real = reward, real
@@ -81,7 +89,8 @@ class DynamicsRewardCorrection(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         name = "DynamicsRewardCorrection"
         estimated = self.estimator(tensordict.select(*self.estimator.in_keys))
-        correction = self.scale * estimated.get(self.estimator.out_keys[0])
+        measure = estimated.get(self.estimator.out_keys[0])
+        correction = self.scale * (measure if self.clip is None else measure.clamp(-self.clip, self.clip))
         steps = tensordict.get(self.steps_to_next_obs, None)
         if steps is not None:
             steps = one_per_row(steps, correction.shape, self.steps_to_next_obs, name).to(correction.dtype)

@@ -22,7 +22,7 @@ from torchrl_h2o.options.types import (
     option,
 )
 
-Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3"]
+Method = Literal["sac", "cql", "iql", "td3_bc", "darc", "h2o", "h2o_plus", "rlpd", "td3", "par", "dara", "vgdf"]
 OFFLINE = ("cql", "iql", "td3_bc")  # they use no simulator, so a gap has no effect and one run counts for every gap
 
 
@@ -69,6 +69,28 @@ class TD3BCOptions(Options):
     model_config = ConfigDict(extra="allow")
 
     alpha: Positive = option(2.5, "weight of Q over that of the distance to the data's actions")
+    critic_penalty: NotNegative = option(0.0, "ReBRAC's beta_2: weight of that distance in the target of Q")
+
+
+class PAROptions(Options):
+    """``par``: the penalty of simulated rewards and the term of behaviour cloning."""
+
+    beta: NotNegative = option(0.1, "penalty per unit of the representation deviation, in the task's reward")
+    cloning: Positive = option(5.0, "weight of Q over that of the distance to the real data's actions")
+
+
+class DARAOptions(Options):
+    """``dara``: the correction of simulated rewards."""
+
+    eta: NotNegative = option(0.1, "weight of the log dynamics ratio, in the task's reward per nat")
+    clip: Positive = option(10.0, "bound of the log dynamics ratio, nats")
+
+
+class VGDFOptions(Options):
+    """``vgdf``: the filter of simulated rows."""
+
+    share: Annotated[float, Field(gt=0, le=1)] = option(0.25, "share of a batch's simulated rows that Q learns from")
+    num_models: Annotated[int, Field(ge=2, le=100)] = option(7, "models of the real dynamics")
 
 
 class CollectorOptions(Options):
@@ -102,6 +124,9 @@ class AnyMethodOptions(ExperimentOptions):
     iql: IQLOptions = IQLOptions()
     cql: CQLOptions = CQLOptions()
     td3_bc: TD3BCOptions = TD3BCOptions()
+    par: PAROptions = PAROptions()
+    dara: DARAOptions = DARAOptions()
+    vgdf: VGDFOptions = VGDFOptions()
 
     results: str | None = option(
         None, "CSV file to which the run's results are appended; its curve goes to a second file"

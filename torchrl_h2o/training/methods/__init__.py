@@ -1,13 +1,16 @@
-"""The six methods of the paper's comparison and three further ones, by name."""
+"""The six methods of the paper's comparison and further ones, by name."""
 
 from torchrl_h2o.training.methods.cql import CQL
+from torchrl_h2o.training.methods.dara import DARA
 from torchrl_h2o.training.methods.darc import DARC
 from torchrl_h2o.training.methods.h2o import H2O
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
 from torchrl_h2o.training.methods.iql import IQL
+from torchrl_h2o.training.methods.par import PAR
 from torchrl_h2o.training.methods.rlpd import RLPD
 from torchrl_h2o.training.methods.sac import SAC
 from torchrl_h2o.training.methods.td3_bc import TD3_BC
+from torchrl_h2o.training.methods.vgdf import VGDF
 from torchrl_h2o.training.methods.weighted_td3 import WEIGHTED_TD3
 
 METHODS = {
@@ -20,4 +23,7 @@ METHODS = {
     "h2o_plus": H2O_PLUS,
     "rlpd": RLPD,  # both; not in the paper
     "td3": WEIGHTED_TD3,
+    "par": PAR,
+    "dara": DARA,
+    "vgdf": VGDF,
 }
