@@ -86,8 +86,8 @@ VALUES = {
 }
 OTHERS = {
     ("train", "update=100"): "no option update; did you mean updates?",
-    ("train", "env=halfcheeta"): "env=halfcheeta: must be halfcheetah, walker2d, wheel_legged, wheel_legged_forward or "
-    "wheel_legged_poor; did you mean halfcheetah?",
+    ("train", "env=halfcheeta"): "env=halfcheeta: must be halfcheetah, walker2d, wheel_legged, wheel_legged_forward, "
+    "wheel_legged_poor or wheel_legged_undeclared; did you mean halfcheetah?",
     ("train", "data=standing_stil.txt"): f"data=standing_stil.txt: {NOWHERE}; did you mean standing_still.txt?",
     ("train", "preset=papr"): "preset=papr: must be paper; did you mean paper?",
     ("train", "collector=multisync"): "collector=multisync: must be multi_sync, ray or sync; did you mean multi_sync?",
