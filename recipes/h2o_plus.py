@@ -29,7 +29,7 @@ from torchrl_h2o.options import RunOptions
 from torchrl_h2o.training.collection import simulated_transitions
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.divergence import DivergenceError
-from torchrl_h2o.training.environments import sim_capacity_of
+from torchrl_h2o.training.environments import keeps_best, sim_capacity_of
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.film import try_to_film
 from torchrl_h2o.training.judging import judge, run_settings, table_of_run, write_failure
@@ -40,9 +40,9 @@ from torchrl_h2o.training.preprocessing import Preprocessing
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs, make_ratio_loss
 from torchrl_h2o.training.returns import BestPolicy
-from torchrl_h2o.training.run_folder import claimed, keeps_best, open_run, resumable, save_config
+from torchrl_h2o.training.run_folder import claimed, open_run, resumable, save_config
 from torchrl_h2o.training.task import Task
-from torchrl_h2o.training.warm_start import clone_behaviour, held_updates, hold
+from torchrl_h2o.training.warm_start import begin, held_updates, hold
 
 
 @hydra_main("config", "h2o_plus", RunOptions)
@@ -98,8 +98,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
     qvalues = make_qvalue(
         observation_dim, action_dim, cfg.num_cells, layer_norm=cfg.layer_norm, ensemble=cfg.num_qvalue_nets
     )
-    if cfg.warm_start:  # begins at the behaviour in the real data, and stays there while the critics learn its value
-        clone_behaviour(actor, action_spec, replay, cfg.seed)
+    begin(cfg, actor, action_spec, replay)  # with warm_start, at the behaviour in the real data or an earlier policy
 
     # Losses: Eq. (4) trains V, Eqs. (7) and (8) Q, Eq. (9) the discriminators, Eq. (10) the policy
     value_loss = make_value_loss(cfg, observation_dim)  # with V; expectile, sparse or exponential
@@ -163,7 +162,7 @@ def train(cfg: DictConfig, folder: Path) -> None:
                     evaluator,
                     actor,
                     epoch,
-                    **({} if best is None else best.consider(actor, training.rows)),
+                    **({} if best is None else best.consider(actor)),
                     ratio_of_sim=float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean()),
                     **{name: term.item() for name, term in losses.items()},
                 )

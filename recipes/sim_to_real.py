@@ -60,6 +60,7 @@ def go_round(cfg: DictConfig, folder: Path) -> None:
     logs, rounds = [first.set("log", torch.zeros(len(first), dtype=torch.int64))], []
     dt = cfg.env.seconds_per_step
     cfg.env.make.max_episode_steps = round(cfg.seconds / dt)
+    measure_observation_norm(cfg, first)
     task, report = task_of(cfg), None
 
     for number in range(1, cfg.rounds + 1):
@@ -73,8 +74,9 @@ def go_round(cfg: DictConfig, folder: Path) -> None:
             worlds = [usual_world(model, rng, cfg.randomise) for _ in range(cfg.num_worlds)]
             own.mended = {"effects": [], "worlds": [list(map(effect_to_dict, world)) for world in worlds]}
 
-        # Train there
-        measure_observation_norm(own, real)
+        # Train there, from the last round's policy on
+        if number > 1 and cfg.warm_start:
+            own.warm_start = str(folder / f"round_{number - 1}")
         save_config(own, here)
         policy, _ = train(METHODS[own.method], own, real, here)
 

@@ -3,6 +3,7 @@
 import signal
 
 import pytest
+import torch
 
 from tests.small_runs import interrupt_at, trained
 from torchrl_h2o.data import write_ted
@@ -12,7 +13,7 @@ from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
 from torchrl_h2o.training.methods.sac import SAC
 from torchrl_h2o.training.progress import Training
-from torchrl_h2o.training.returns import TRIAL_SEED, evaluate
+from torchrl_h2o.training.returns import TRIAL_SEED, BestPolicy, Evaluation, evaluate
 from torchrl_h2o.training.trained_policy import load_policy
 
 
@@ -36,7 +37,7 @@ def test_backbone_mixing_and_ratio_reach_the_losses(compose, tmp_path):
 
 @pytest.mark.slow
 def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_path, monkeypatch):
-    cfg, real = compose("updates=100", "keep=best_in_simulator", "trial_episodes=2", "lr=0.01", "seed=2")
+    cfg, real = compose("updates=100", "keep=best_in_simulator", "trial_episodes=2", "lr=0.01", "seed=7")
     policy, training = train(H2O_PLUS, cfg, real, tmp_path / "whole")
     promised = [row["return_trial"] for row in training.rows]
     assert max(promised) > promised[-1]
@@ -50,6 +51,25 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
     monkeypatch.undo()
     train(H2O_PLUS, cfg, real, tmp_path / "parts")
     assert trained(tmp_path / "parts") == trained(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("returns", "kept"), [((5.0, 3.0, 4.0), 0), ((5.0, 7.0, 6.0), 1), ((5.0, 4.0, 8.0), 2)])
+def test_the_policy_is_never_worse_in_the_simulator_than_where_the_training_began(monkeypatch, returns, kept):
+    policies = [torch.nn.Linear(1, 1) for _ in returns]
+    of_policy = {float(one.weight.detach()): value for one, value in zip(policies, returns, strict=True)}
+    monkeypatch.setattr(
+        "torchrl_h2o.training.returns.evaluate",
+        lambda env, policy, episodes, seed: Evaluation([of_policy[float(policy.weight.detach())]], [1]),
+    )
+    best = BestPolicy(policies[0], None, 1)
+    assert [best.consider(one)["return_trial"] for one in policies[1:]] == list(returns[1:])
+    assert best.policy.weight == policies[kept].weight
+
+
+def test_a_policy_is_judged_by_the_lower_bound_of_its_return():
+    steady, lucky = Evaluation([10.0, 10.0, 10.0, 10.0], [1] * 4), Evaluation([0.0, 20.0, 20.0, 4.0], [1] * 4)
+    assert lucky.mean > steady.mean
+    assert lucky.lower_bound < steady.lower_bound == 10.0
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.small_runs import assert_resumed_equals_whole
-from torchrl_h2o.training import learner, loop, warm_start
+from torchrl_h2o.training import loop, warm_start
+from torchrl_h2o.training.config_file import save_config
 from torchrl_h2o.training.environments import as_observed, make_reality, make_replay
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.loop import train
@@ -15,6 +16,7 @@ from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.populations.job import run_population
 from torchrl_h2o.training.populations.loop import members_of
 from torchrl_h2o.training.trained_policy import load_policy
+from torchrl_h2o.training.warm_start import prepare_warm_start
 
 LONGER = "env.recording.num_transitions=2000"
 OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in sorted(METHODS) if name != "sac"]
@@ -29,7 +31,7 @@ def clones(monkeypatch):
         clone(actor, *args)
         found.append(deepcopy(list(actor.parameters())))
 
-    monkeypatch.setattr(learner, "clone_behaviour", cloning)
+    monkeypatch.setattr(warm_start, "clone_behaviour", cloning)
     return found
 
 
@@ -106,6 +108,26 @@ def test_commands_at_and_beyond_the_limits_of_the_motor_do_not_outweigh_the_othe
     actor = METHODS["sac"].make_learner(cfg, 4, spec, make_replay(cfg, real)).actor
     real["action"] = real["action"].clamp(spec.space.low, spec.space.high)
     assert unlike(actor, cfg, real) < 0.75
+
+
+def test_a_training_begins_at_the_policy_of_an_earlier_run_with_its_normalisation(compose, tmp_path, clones):
+    earlier, real = compose("warm_start=true", "updates=20", "method=sac", config="train")
+    policy, _ = train(METHODS["sac"], earlier, real, tmp_path)
+    save_config(earlier, tmp_path)
+    clones.clear()
+    cfg, real = compose(f"warm_start={tmp_path}", config="train")
+    cfg.observation_norm = None
+    prepare_warm_start(cfg)
+    assert cfg.observation_norm == earlier.observation_norm
+    for name in ("sac", "td3_bc"):
+        begun = (
+            METHODS[name].make_learner(cfg, 4, make_reality(cfg).action_spec_unbatched, make_replay(cfg, real)).actor
+        )
+        assert are_equal(begun.parameters(), policy.parameters())
+    assert not clones
+    cfg.num_cells = [9]
+    with pytest.raises(ValueError, match="its policy has other inputs or layers"):
+        METHODS["sac"].make_learner(cfg, 4, make_reality(cfg).action_spec_unbatched, make_replay(cfg, real))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import gymnasium
 from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from torchrl_h2o.options.sources import Data, Layout, Mend, RunFolder
+from torchrl_h2o.options.sources import Data, Layout, Mend, RunFolder, WarmStart
 from torchrl_h2o.options.types import (
     MOST,
     Count,
@@ -99,7 +99,7 @@ class ExperimentOptions(Options):
     data: Data = option("recorded", "recorded, Minari name, D4RL file, robot's log or TED folder; several: [a,b]")
     columns: Layout | None = option(None, "YAML file that describes a log's columns, or a name of the library's")
     data_seconds: Positive | None = option(None, "only the first seconds of the real data, s; null uses all")
-    warm_start: bool = option(False, "begins at the behaviour in the data, and holds the policy for 1,000 updates")
+    warm_start: WarmStart = option(False, "begins at the data's behaviour, or a run's policy, held for 1,000 updates")
 
     # H2O+
     backbone: Literal["expectile", "sparse", "exponential"] = option("expectile", "value loss: IQL's, SQL's or EQL's")

@@ -128,6 +128,7 @@ Mend = (
 NewFolder = Annotated[str, AfterValidator(require_folder)]
 AnyPath = Annotated[str, AfterValidator(require_path)]
 RunFolder = Annotated[str, AfterValidator(require_run)]
+WarmStart = bool | Annotated[str, AfterValidator(require_run), Field(description="the folder of a run")]
 Layout = Annotated[str, AfterValidator(require_layout)]
 DataSource = Annotated[
     str, AfterValidator(require_data), Field(description="a file, a folder or the name of a data set")

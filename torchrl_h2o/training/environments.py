@@ -83,3 +83,8 @@ def make_replay(cfg: DictConfig, real: TensorDictBase) -> HybridReplayBuffer:
         gamma=cfg.gamma,
         device=cfg.get("device", "cpu"),  # not an option of h2o_plus.py
     )
+
+
+def keeps_best(cfg: DictConfig) -> bool:
+    """Whether the run returns the policy that was best in the simulator instead of the last one."""
+    return cfg.keep == "best_in_simulator"

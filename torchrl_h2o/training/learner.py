@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from torchrl_h2o.data import HybridReplayBuffer, PairedTransitions
 from torchrl_h2o.objectives import make_actor, make_qvalue, total_loss
 from torchrl_h2o.training.cuda_graph import as_cuda_graph
-from torchrl_h2o.training.warm_start import clone_behaviour, hold
+from torchrl_h2o.training.warm_start import begin, hold
 
 
 @dataclass
@@ -109,14 +109,13 @@ def make_networks(
 ) -> tuple[ProbabilisticActor, list[TensorDictModule]]:
     """Builds the policy and the Q networks. Their initial weights depend on the run's seed, not on the method.
 
-    With ``warm_start``, the policy is fitted to the actions in the replay buffer's real rows.
+    With ``warm_start``, the policy is then that of the replay buffer's real rows, or of an earlier run.
     """
     torch.manual_seed(cfg.seed)
     actor = make_actor(observation_dim, action_spec, cfg.num_cells)
     options = {"layer_norm": cfg.layer_norm, "ensemble": cfg.num_qvalue_nets}
     qvalues = make_qvalue(observation_dim, action_spec.shape[-1], cfg.num_cells, **options)
-    if cfg.warm_start:
-        clone_behaviour(actor, action_spec, replay, cfg.seed)
+    begin(cfg, actor, action_spec, replay)
     return actor, qvalues
 
 

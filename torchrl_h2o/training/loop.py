@@ -21,14 +21,13 @@ from torchrl_h2o.objectives import make_actor
 from torchrl_h2o.training.collection import collecting
 from torchrl_h2o.training.compiling import maybe_compiled
 from torchrl_h2o.training.cuda_graph import fit_to_device
-from torchrl_h2o.training.environments import make_replay, preprocessing_of, task_of
+from torchrl_h2o.training.environments import keeps_best, make_replay, preprocessing_of, task_of
 from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.learner import Learner
 from torchrl_h2o.training.ongoing_episodes import OngoingEpisodes
 from torchrl_h2o.training.progress import Budget, Training, epoch_seed
 from torchrl_h2o.training.ratio import make_pairs
 from torchrl_h2o.training.returns import BestPolicy
-from torchrl_h2o.training.run_folder import keeps_best
 from torchrl_h2o.training.warm_start import held_updates
 
 MakeLearner = Callable[[DictConfig, int, TensorSpec, HybridReplayBuffer], Learner]
@@ -119,16 +118,13 @@ class Trainee:
         simulated["next", "reward"] = self._preprocessing.reward(simulated["next", "reward"])
         self.learner.replay.extend(simulated)
 
-    def look(self, rows: list[dict]) -> dict[str, float]:
+    def look(self) -> dict[str, float]:
         """Metrics of the current networks; with ``keep=best_in_simulator``, stores the policy if it is the best so far.
-
-        Args:
-            rows: metrics of the earlier evaluations.
 
         Returns:
             Metrics by name, without those of an evaluation in ``reality``.
         """
-        best = {} if self._best is None else self._best.consider(self.actor, rows)
+        best = {} if self._best is None else self._best.consider(self.actor)
         return {**best, **self.learner.figures(*self.learner.batches)}
 
     def close(self) -> None:
@@ -173,6 +169,6 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
             schedule.step()
             if evaluating:
                 figures = {name: loss.item() for name, loss in losses.items()}
-                figures = {**trainee.look(training.rows), **figures}
+                figures = {**trainee.look(), **figures}
                 training.evaluate(trainee.evaluator, trainee.actor, epoch, **figures)
     return trainee.policy, training

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from math import inf
 from typing import NamedTuple
 
 import torch
@@ -151,8 +150,10 @@ def run_episode(env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
 class BestPolicy:
     """Stores the actor's parameters from the evaluation in the simulator whose return has the highest lower bound.
 
+    The first of them are those at which the training begins, so the policy is never worse there than these.
+
     Args:
-        actor: the trained policy; this class keeps a copy.
+        actor: the policy that is to be trained; this class keeps a copy.
         simulator: the environment of the evaluations.
         episodes: number of episodes per evaluation.
     """
@@ -160,18 +161,23 @@ class BestPolicy:
     def __init__(self, actor: torch.nn.Module, simulator: EnvBase, episodes: int) -> None:
         self.policy = deepcopy(actor)
         self.simulator, self.episodes = simulator, episodes
+        self._highest: float | None = None
 
-    def consider(self, actor: torch.nn.Module, rows: list[dict]) -> dict[str, float]:
-        """Evaluates the actor in the simulator and stores it if no earlier evaluation was better.
+    def consider(self, actor: torch.nn.Module) -> dict[str, float]:
+        """Evaluates the actor in the simulator and stores it if no earlier one was better.
 
         Args:
             actor: the policy with its current parameters.
-            rows: metrics of the earlier evaluations, with ``return_trial``; those of versions before it are left out.
 
         Returns:
             The lower bound of the mean return, as ``return_trial``.
         """
-        return_trial = evaluate(self.simulator, actor, self.episodes, TRIAL_SEED).lower_bound
-        if return_trial >= max((row["return_trial"] for row in rows if "return_trial" in row), default=-inf):
+        if self._highest is None:  # at the first evaluation, also of a resumed training
+            self._highest = self._lower_bound(self.policy)
+        if (return_trial := self._lower_bound(actor)) >= self._highest:
+            self._highest = return_trial
             self.policy.load_state_dict(actor.state_dict())
         return {"return_trial": return_trial}
+
+    def _lower_bound(self, policy: torch.nn.Module) -> float:
+        return evaluate(self.simulator, policy, self.episodes, TRIAL_SEED).lower_bound

@@ -21,6 +21,7 @@ from torchrl_h2o.training.config_file import load_config, require_plain_files, s
 from torchrl_h2o.training.interrupts import interruptible
 from torchrl_h2o.training.mending import names_report, prepare_mending
 from torchrl_h2o.training.targets import foreign_names
+from torchrl_h2o.training.warm_start import names_run, prepare_warm_start
 from torchrl_h2o.whole_file import remove_partial
 
 CHANGEABLE = ("overlap", "device")  # options that may change when a run is resumed
@@ -68,6 +69,7 @@ def open_run(cfg: DictConfig, *, go_on: bool = False) -> tuple[DictConfig, Path]
         cfg = load_config(directory, trust=cfg.get("trust"), typed=cfg)
     else:
         prepare_mending(cfg)
+        prepare_warm_start(cfg)
         resolve_paths(cfg)
         save_config(cfg, directory)
     for checkpoint in sorted((directory / "checkpoints").glob("*.pt")):
@@ -96,7 +98,8 @@ def _name_results(cfg: DictConfig, results: str | None) -> None:
 
 def resolve_paths(cfg: DictConfig) -> None:
     """Makes file names absolute, in place, because a run may be resumed from another working directory."""
-    for key in ("data", "columns", *(["mend"] if names_report(cfg.mend) else [])):
+    named = {"mend": names_report(cfg.mend), "warm_start": names_run(cfg.warm_start)}
+    for key in ("data", "columns", *(name for name, is_path in named.items() if is_path)):
         if isinstance(cfg[key], ListConfig):
             cfg[key] = [_absolute(name) for name in cfg[key]]
         elif cfg[key] is not None:
@@ -141,8 +144,3 @@ def resumable(directory: Path) -> Iterator[None]:
         names = foreign_names(load_config(directory, trust=True)) if (directory / "config.yaml").exists() else []
         trust = f" 'trust=[{','.join(names)}]'" if names else ""
         sys.exit(f"\ninterrupted; go on with: python {sys.argv[0]} resume={os.path.relpath(directory)}{trust}")
-
-
-def keeps_best(cfg: DictConfig) -> bool:
-    """Whether the run returns the policy that was best in the simulator instead of the last one."""
-    return cfg.keep == "best_in_simulator"

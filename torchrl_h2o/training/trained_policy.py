@@ -8,8 +8,7 @@ from omegaconf import DictConfig
 from torchrl_h2o.data import DataError
 from torchrl_h2o.objectives import make_actor
 from torchrl_h2o.training.checkpoint import checkpoint_file, load_checkpoint, read_checkpoint, require_widths
-from torchrl_h2o.training.environments import make_reality
-from torchrl_h2o.training.run_folder import keeps_best
+from torchrl_h2o.training.environments import keeps_best, make_reality
 
 
 def load_policy(cfg: DictConfig, directory: str | Path, method: str = "H2O+") -> torch.nn.Module:

@@ -1,9 +1,9 @@
-"""The option ``warm_start``: a training begins at the behaviour in the real data, and its critics learn that first."""
+"""The option ``warm_start``: a training begins at the data's behaviour or an earlier policy, and critics learn it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import cast
+from typing import TypeGuard, cast
 
 import torch
 from omegaconf import DictConfig
@@ -15,12 +15,54 @@ from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.objectives import BCLoss
 
 from torchrl_h2o.data import HybridReplayBuffer
+from torchrl_h2o.training.config_file import load_config
+from torchrl_h2o.training.trained_policy import load_policy
 
 CLONED = 2000  # updates of behaviour cloning
 ROWS = 256  # transitions of each
 LR = 1e-3  # at the first of them; it falls to zero
 INSIDE = 0.01  # share of the actions' range within which an action is at its limit, which a tanh does not reach
 HELD = 1000  # first updates of a training in which the cloned policy stays as it is
+
+
+def begin(cfg: DictConfig, actor: TensorDictModule, action_spec: TensorSpec, replay: HybridReplayBuffer) -> None:
+    """Sets a policy to where ``warm_start`` begins: the behaviour in the real data, or the policy of an earlier run.
+
+    Args:
+        cfg: the run's configuration.
+        actor: the policy.
+        action_spec: spec of the actions.
+        replay: the buffer with the real rows.
+
+    Raises:
+        ValueError: if the earlier policy has other inputs or layers.
+    """
+    if not names_run(cfg.warm_start):
+        if cfg.warm_start:
+            clone_behaviour(actor, action_spec, replay, cfg.seed)
+        return
+    from torchrl_h2o.training.methods import METHODS  # the methods import this module
+
+    earlier = load_config(cfg.warm_start, typed=cfg)
+    policy = load_policy(earlier, cfg.warm_start, METHODS[earlier.method].title)
+    try:
+        actor.load_state_dict(policy.state_dict())
+    except RuntimeError:
+        raise ValueError(
+            f"warm_start={cfg.warm_start}: its policy has other inputs or layers; set env, num_cells, frames and "
+            "action_history as in that run"
+        ) from None
+
+
+def names_run(warm_start: bool | str) -> TypeGuard[str]:
+    """Whether the option ``warm_start`` names an earlier run."""
+    return isinstance(warm_start, str)
+
+
+def prepare_warm_start(cfg: DictConfig) -> None:
+    """Takes the normalisation of the observations from the run whose policy ``warm_start`` names."""
+    if names_run(cfg.warm_start):
+        cfg.observation_norm = load_config(cfg.warm_start, typed=cfg).observation_norm
 
 
 def clone_behaviour(actor: TensorDictModule, action_spec: TensorSpec, replay: HybridReplayBuffer, seed: int) -> None:

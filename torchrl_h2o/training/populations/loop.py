@@ -172,7 +172,7 @@ def train_population(
                     trainee.learner.batches = learner.batches_of(number)
                     losses = {key: term[number].item() for key, term in terms.items()}
                     trainee.evaluator.start(trainee.actor)
-                    figures = {**trainee.evaluator.result().metrics(), **trainee.look(training.rows_of(name)), **losses}
+                    figures = {**trainee.evaluator.result().metrics(), **trainee.look(), **losses}
                     training.log_member(epoch, name, **figures)
     return {name: _outcome(name, trainee, training) for name, trainee in trainees.items()}
 
