@@ -26,7 +26,14 @@ from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.joint_units import joint_names, quantity_name
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload, PseudoInertia
 from torchrl_h2o.effects.model.compilation import compile_model
-from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
+from torchrl_h2o.effects.model.geom import (
+    CapsuleLength,
+    ContactSoftness,
+    GeomFriction,
+    GeomLength,
+    GeomSize,
+    RollingResistance,
+)
 from torchrl_h2o.effects.model.joint import (
     Armature,
     JointDamping,
@@ -36,7 +43,7 @@ from torchrl_h2o.effects.model.joint import (
     JointSpring,
     JointStiffness,
 )
-from torchrl_h2o.effects.model.link import LinkLength
+from torchrl_h2o.effects.model.link import LinkLength, LinkTurn
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoDamping, ServoStiffness
 from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.noise_balance import balanced
@@ -64,6 +71,7 @@ __all__ = [
     "BodyCentreOfMass",
     "BodyInertia",
     "BodyMass",
+    "CapsuleLength",
     "CatalogueEntry",
     "ContactSoftness",
     "Effect",
@@ -85,6 +93,7 @@ __all__ = [
     "JointStiffness",
     "LinearDrag",
     "LinkLength",
+    "LinkTurn",
     "LoadFriction",
     "ModelEffect",
     "Names",
