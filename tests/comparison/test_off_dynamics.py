@@ -93,7 +93,7 @@ def test_scores_stand_by_file_and_method_and_the_mended_simulator_is_counted():
     (line,) = [line for line in text.splitlines() if line.startswith(f"| {FIRST}")]
     assert "| 90.0 ± 7.1 (2) | 40.0 (1) |" in line
     assert "beats the best of the others in 1 of 2 files; H2O+ in the mended simulator alone in 1." in text
-    assert "scores 80 or more in 1 of 2 files with half of the gravity" in text
+    assert "The better one scores 80 or more in 1 of 2 files with half of the gravity" in text
     assert "online source, offline target" in text
 
 

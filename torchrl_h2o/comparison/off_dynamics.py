@@ -73,7 +73,7 @@ def _count(complete: pd.DataFrame) -> str:
     best, others = complete[mended].max(axis=1), complete.drop(columns=mended).max(axis=1)
     lines = [f"The better of {' and '.join(map(title_of, mended))} beats the best of the others in"]
     lines += [f"{(best > others).sum()} of {len(complete)} files; H2O+ in the mended simulator alone in"]
-    lines += [f"{(complete['h2o_plus' + MENDED] > others).sum()}. It scores {ASKED:g} or more in"]
+    lines += [f"{(complete['h2o_plus' + MENDED] > others).sum()}. The better one scores {ASKED:g} or more in"]
     halved = best[[GRAVITY in str(file) for file in best.index]]
     return " ".join([*lines, f"{(halved >= ASKED).sum()} of {len(halved)} files with half of the gravity."])
 
