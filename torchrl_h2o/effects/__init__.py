@@ -25,6 +25,7 @@ from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
 from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.joint_units import joint_names, quantity_name
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload, PseudoInertia
+from torchrl_h2o.effects.model.capsules import EarlierCapsules
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.geom import (
     CapsuleLength,
@@ -74,6 +75,7 @@ __all__ = [
     "CapsuleLength",
     "CatalogueEntry",
     "ContactSoftness",
+    "EarlierCapsules",
     "Effect",
     "Episode",
     "ForceEffect",
