@@ -17,6 +17,7 @@ from torchrl_h2o.effects import (
     BodyMass,
     CapsuleLength,
     ContactSoftness,
+    EarlierCapsules,
     GeomFriction,
     GeomLength,
     GeomSize,
@@ -57,7 +58,7 @@ EVERYWHERE = [
     CapsuleLength(),
     Timestep(),
 ]
-CHEETAH_ONLY = [GeomLength(), JointStiffness(), JointRest(), JointRange()]
+CHEETAH_ONLY = [EarlierCapsules(), GeomLength(), JointStiffness(), JointRest(), JointRange()]
 
 
 @given(
@@ -210,6 +211,26 @@ def test_a_capsule_becomes_longer_about_its_centre_and_keeps_its_radius():
     for name in ("torso", "bfoot"):  # the first is given by its ends
         np.testing.assert_allclose(found.geom(name).size[:2], before.geom(name).size[:2] * [1.0, 2.0])
         np.testing.assert_allclose(found.geom(name).pos, before.geom(name).pos, atol=1e-9)
+
+
+def test_capsules_weigh_as_cylinders_that_are_longer_by_a_radius():
+    """Also two on one body: the same model with cylinders in their place has the same inertials."""
+    leg = """<mujoco><compiler {total}/><worldbody><body name="leg"><joint/><geom type="{kind}" size="0.05 {thigh}"/>
+      <geom type="{kind}" size="0.02 {shin}" pos="0.1 0 -0.3" euler="0 40 0"/>
+      <geom size="0.1" pos="0 0 0.3"/></body><body name="arm"><joint/><geom size="0.2"/></body></worldbody></mujoco>"""
+    for total in ("", 'settotalmass="3"'):
+        capsules = leg.format(kind="capsule", thigh=0.2, shin=0.1, total=total)
+        cylinders = leg.format(kind="cylinder", thigh=0.225, shin=0.11, total=total)
+        found, expected = compile_model(spec(capsules), [EarlierCapsules(1.0)]), compile_model(spec(cylinders))
+        for field in ("body_mass", "body_ipos", "body_inertia"):
+            same = np.sort(getattr(found, field)), np.sort(getattr(expected, field))  # the axes' order is free
+            np.testing.assert_allclose(*same, atol=1e-9, err_msg=field)
+    half = compile_model(spec(leg.format(kind="capsule", thigh=0.2, shin=0.1, total="")), [EarlierCapsules(0.5)])
+    exact = compile_model(spec(leg.format(kind="capsule", thigh=0.2, shin=0.1, total="")))
+    cylinders = compile_model(spec(leg.format(kind="cylinder", thigh=0.225, shin=0.11, total="")))
+    np.testing.assert_allclose(half.body_mass, (exact.body_mass + cylinders.body_mass) / 2)
+    with pytest.raises(ValueError, match="no body has a capsule"):
+        compile_model(spec(leg.format(kind="cylinder", thigh=0.225, shin=0.11, total="")), [EarlierCapsules(1.0)])
 
 
 def test_an_exact_name_is_no_pattern():

@@ -31,8 +31,8 @@ def test_the_changed_task_predicts_the_file_and_the_unmodified_one_does_not(shar
     real = task.read_real_data(cfg.data)[:1000]
     unmodified, changed = map(Simulation.from_env, (task.make_simulator(), task.make_reality()))
     before, after = (np.array(off_dynamics.errors(simulation, real)) for simulation in (unmodified, changed))
-    assert after[1] < 0.4 * before[1]  # m/s, of z
-    assert (after <= 1.1 * before).all()
+    assert after.max() < 2e-5  # m/s and rad/s: the data are in single precision
+    assert before[1] > 0.01  # m/s, of z
     told = off_dynamics.differences(rules_of(gymnasium.make(cfg.env.make.env_name).unwrapped), changed, real)
-    assert told["reward_error"] < 0.01
+    assert told["reward_error"] < 1e-4
     assert told["other_terminations"] == 0

@@ -14,7 +14,6 @@ from torchrl_h2o.effects.catalogue.mechanism import Mechanism
 from torchrl_h2o.effects.force.drag import JointForce, LinearDrag, QuadraticDrag
 from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload
-from torchrl_h2o.effects.model.capsules import EarlierCapsules
 from torchrl_h2o.effects.model.compilation import compile_model
 from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
 from torchrl_h2o.effects.model.joint import (
@@ -60,7 +59,6 @@ def body_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:
     yield from entries_of(Payload, "bodies", carrying, lambda chosen: _loads(mechanism, chosen[0] + 1))
     links = named_choices(paths, [b - 1 for b in range(1, model.nbody) if mechanism.is_link(b)])
     yield from entries_of(LinkLength, "bodies", links, lambda _: each("scale", *LENGTHS))
-    yield CatalogueEntry(EarlierCapsules(), each("share", 1.0))
 
 
 def joint_entries(mechanism: Mechanism) -> Iterator[CatalogueEntry]:

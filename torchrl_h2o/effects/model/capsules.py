@@ -51,11 +51,9 @@ class EarlierCapsules(ModelEffect):
             return
         model, total = compile_unscaled(spec), spec.compiler.settotalmass
         new = {i: self._changed(spec, model, i, own) for i, own in capsules.items()}
-        others = model.body_mass.sum() - model.body_mass[list(new)].sum()
-        scale = total / (others + sum(one.mass for one in new.values())) if total > 0.0 else 1.0
+        spec.compiler.settotalmass = -1.0  # the compiler scales all bodies to the total afterwards
         for i, one in new.items():
-            scaled = Inertial(scale * one.mass, one.centre, scale * one.inertia)
-            edit_inertials(spec, [spec.bodies[i]], lambda _, scaled=scaled: scaled)
+            edit_inertials(spec, [spec.bodies[i]], lambda _, one=one: one)
         spec.compiler.settotalmass = total
 
     def _changed(self, spec: mujoco.MjSpec, model: mujoco.MjModel, body: int, capsules: list) -> Inertial:
