@@ -13,6 +13,7 @@ import yaml
 from scipy.stats import binomtest
 
 from torchrl_h2o.comparison import off_dynamics
+from torchrl_h2o.comparison.grids import OFF_DYNAMICS_FILES
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.comparison.results_file import IDENTITY
@@ -381,7 +382,7 @@ def _mended_right(runs: Runs) -> str:
     if "off_dynamics" not in runs:
         return NOT_RUN
     told = runs["off_dynamics"]
-    return f"{told['recommended'].sum()} of {len(told)} simulators mended"
+    return f"{told['recommended'].sum()} of {len(told)} simulators mended, {len(OFF_DYNAMICS_FILES)} files"
 
 
 TABLES: dict[str, Callable[[Runs], str]] = {

@@ -17,7 +17,7 @@ Scores in the changed task, 0 for a random policy and 100 for the expert of the 
 deviation over seeds (number of seeds). In the mended simulator, the effects that close_the_loop found in the same file
 are added before training; the run begins at the behaviour in the data and keeps the policy that is best there. The
 other methods are as published. SAC reads no data, so one run per change and seed stands in the rows of all three
-files.
+files. An empty cell was not run.
 
 The published numbers of other methods for these files are of another setting: their source is offline data of the
 unmodified task, and they have no simulator that they could adjust. Of ODRL's settings, "online source, offline target"
