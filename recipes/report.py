@@ -22,7 +22,7 @@ from torchrl_h2o.comparison.results_file import RESULTS, read_rows, require_grou
 from torchrl_h2o.comparison.robot_figures import draw_robot
 from torchrl_h2o.comparison.robot_trajectories import robot_results
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
-from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_seeds
+from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_off_dynamics, report_seeds
 
 
 @hydra_main("config", "report", ReportOptions)
@@ -41,6 +41,9 @@ def main(cfg: DictConfig) -> None:
                 continue
             if group == "data_size":
                 report_data_size(rows, to, cfg.reps)
+                continue
+            if group == "off_dynamics":
+                report_off_dynamics(rows, to)
                 continue
             report(group, rows, results, to, references, paper, cfg.reps)
         except MixedRunsError as error:

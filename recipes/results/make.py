@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
 from torchrl_h2o.commands.one_line_errors import one_line_errors
+from torchrl_h2o.comparison.grids import OFF_DYNAMICS_FILES, env_of_file
 from torchrl_h2o.comparison.records import Record, read_records
 from torchrl_h2o.comparison.results_file import run_row
 from torchrl_h2o.comparison.rounds import draw_rounds_of_methods, rounds_of
@@ -87,7 +88,8 @@ def _record_of_training(folder: Path) -> Record:
     del values["commit"], values["versions"]
     settings = [str((values | made_by)[key]) for key in pages.SETTINGS]
     names = (values["method"], values["env"].replace("/", "-"), sha256(" ".join(settings).encode()).hexdigest()[:8])
-    return Record("training", "_".join((*names, f"seed{values['seed']}")), made_by, values)
+    table = "off_dynamics_runs" if values["env"] in map(env_of_file, OFF_DYNAMICS_FILES) else "training"
+    return Record(table, "_".join((*names, f"seed{values['seed']}")), made_by, values)
 
 
 def _record_of_rounds(folder: Path) -> Record:

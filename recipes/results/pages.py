@@ -7,10 +7,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
 from scipy.stats import binomtest
 
+from torchrl_h2o.comparison import off_dynamics
+from torchrl_h2o.comparison.grids import OFF_DYNAMICS_FILES
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.records import Record
 from torchrl_h2o.comparison.results_file import IDENTITY
@@ -20,6 +23,7 @@ from torchrl_h2o.comparison.series_tables import series_tables
 
 HERE = Path(__file__).parent
 NOT_RUN = "not run on this code"
+LONG = 200  # characters of a change that a table cannot show
 CLOSE = 0.25  # relative error up to which a value counts as right
 #: values that make a training another line of the table
 SETTINGS = [*(key for key in IDENTITY if key != "seed"), "compiled", "device", "instruction_set"]
@@ -310,6 +314,46 @@ def rounds_table(runs: Runs) -> str:
     return f"{rounds_tables(rounds_of(told))}\n\nCommit {told['commit'].iloc[0]}."
 
 
+# A benchmark of others
+def off_dynamics_table(runs: Runs) -> str:
+    """A line for each file: what was found in it, and the scores of the methods."""
+    if "off_dynamics" not in runs:
+        return NOT_RUN
+    searches, trainings = runs["off_dynamics"], runs.get("off_dynamics_runs", pd.DataFrame({"env": [], "updates": []}))
+    found = {
+        row["file"]: {
+            "change": row["change"] if len(row["change"]) < LONG else "thighs, shins and back foot",
+            "cause found": row["found"],
+            "verdict": verdict({"effects": row["found"], "severe": [], "other_sets": 0, "ended_in": None, **row}),
+        }
+        for row in searches.to_dict("records")
+    }
+    commits = f"Searches of commit {searches['commit'].iloc[0]}"
+    if len(trainings):
+        updates = int(trainings["updates"].iloc[0])
+        commits += f", trainings of {trainings['commit'].iloc[0]} after {updates:,} updates"
+    return f"{off_dynamics.markdown(off_dynamics.points_of(trainings), found)}\n\n{commits}."
+
+
+def off_dynamics_errors_table(runs: Runs) -> str:
+    """A line for each file: errors one step ahead, and whether rewards and falls are those of Gymnasium's task."""
+    if "off_dynamics" not in runs:
+        return NOT_RUN
+    tasks = ("unmodified", "mended", "changed")
+    head = ["file", *(f"z, m/s, {task}" for task in tasks), *(f"joints, rad/s, {task}" for task in tasks)]
+    rows = [
+        [
+            run["file"],
+            *(number(run[task][1]) for task in tasks),
+            *(number(float(np.median(run[task][3:]))) for task in tasks),
+            number(run["reward_error"]),
+            str(run["other_terminations"]),
+        ]
+        for run in runs["off_dynamics"].to_dict("records")
+    ]
+    return markdown_table([*head, "reward", "other falls, rows"], rows)
+
+
 # The overview
 def overview_table(runs: Runs) -> str:
     draws, trainings = _draws(runs), _trainings(runs)
@@ -335,6 +379,7 @@ def overview_table(runs: Runs) -> str:
             "rounds between simulator and reality",
             f"{len(runs['sim_to_real'])} runs" if "sim_to_real" in runs else NOT_RUN,
         ],
+        ["off_dynamics", "a benchmark of others", _mended_right(runs)],
     ]
     return markdown_table(
         ["page", "what is in it", "now"], [[f"[{page}.md]({page}.md)", *rest] for page, *rest in rows]
@@ -346,6 +391,13 @@ def _covered(runs: Runs) -> str:
         return NOT_RUN
     told = runs["coverage"]
     return f"{share(told['truths_inside'].sum(), told['truths'].sum())} true values inside"
+
+
+def _mended_right(runs: Runs) -> str:
+    if "off_dynamics" not in runs:
+        return NOT_RUN
+    told = runs["off_dynamics"]
+    return f"{told['recommended'].sum()} of {len(told)} simulators mended, {len(OFF_DYNAMICS_FILES)} files"
 
 
 TABLES: dict[str, Callable[[Runs], str]] = {
@@ -362,4 +414,6 @@ TABLES: dict[str, Callable[[Runs], str]] = {
     "speed": speed_table,
     "ratio": ratio_table,
     "randomization": randomization_table,
+    "off_dynamics": off_dynamics_table,
+    "off_dynamics_errors": off_dynamics_errors_table,
 }

@@ -86,8 +86,9 @@ VALUES = {
 }
 OTHERS = {
     ("train", "update=100"): "no option update; did you mean updates?",
-    ("train", "env=halfcheeta"): "env=halfcheeta: must be halfcheetah, walker2d, wheel_legged, wheel_legged_forward, "
-    "wheel_legged_poor or wheel_legged_undeclared; did you mean halfcheetah?",
+    ("train", "env=halfcheeta"): "env=halfcheeta: must be halfcheetah, halfcheetah_gravity, halfcheetah_kinematic, "
+    "halfcheetah_morph, walker2d, walker2d_gravity, walker2d_kinematic, walker2d_morph, wheel_legged, "
+    "wheel_legged_forward, wheel_legged_poor or wheel_legged_undeclared; did you mean halfcheetah?",
     ("train", "data=standing_stil.txt"): f"data=standing_stil.txt: {NOWHERE}; did you mean standing_still.txt?",
     ("train", "preset=papr"): "preset=papr: must be paper; did you mean paper?",
     ("train", "collector=multisync"): "collector=multisync: must be multi_sync, ray or sync; did you mean multi_sync?",
@@ -119,7 +120,10 @@ OTHERS = {
     ("torchrl_h2o.commands.close_the_loop", "held_out=0"): "held_out=0: must be a share of the rows above 0 and below "
     "1, or the names of logs, such as [c.csv]",
     ("torchrl_h2o.commands.close_the_loop", "audit=maybe"): "audit=maybe: must be true, false or warn",
-    ("paper", "table=retuns"): "table=retuns: must be returns, mixing, gaps, methods or null; did you mean returns?",
+    (
+        "paper",
+        "table=retuns",
+    ): "table=retuns: must be returns, mixing, gaps, methods, off_dynamics or null; did you mean returns?",
     ("paper", "figure=backbone"): "figure=backbone: must be backbones, wheel_legged, data_size or null; did you mean "
     "backbones?",
     (

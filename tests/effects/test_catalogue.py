@@ -318,3 +318,8 @@ def test_a_limb_ends_before_its_frames_without_mass():
     </mujoco>"""
     entries = catalogue(mujoco.MjSpec.from_string(xml), num_observations=3, dt=0.02)
     assert {entry.effect.bodies for entry in entries if isinstance(entry.effect, Payload)} == {"base", "lower"}
+
+
+def test_an_earlier_version_of_mujoco_is_offered_where_all_inertias_follow_from_the_geoms():
+    assert "EarlierCapsules" in names_of("Walker2d")
+    assert "EarlierCapsules" not in names_of("wheel_legged")

@@ -15,7 +15,9 @@ from torchrl_h2o.effects import (
     BodyCentreOfMass,
     BodyInertia,
     BodyMass,
+    CapsuleLength,
     ContactSoftness,
+    EarlierCapsules,
     GeomFriction,
     GeomLength,
     GeomSize,
@@ -28,6 +30,7 @@ from torchrl_h2o.effects import (
     JointSpring,
     JointStiffness,
     LinkLength,
+    LinkTurn,
     Payload,
     RollingResistance,
     ServoStiffness,
@@ -51,9 +54,11 @@ EVERYWHERE = [
     JointSpring(),
     ContactSoftness(),
     LinkLength(),
+    LinkTurn(),
+    CapsuleLength(),
     Timestep(),
 ]
-CHEETAH_ONLY = [GeomLength(), JointStiffness(), JointRest(), JointRange()]
+CHEETAH_ONLY = [EarlierCapsules(), GeomLength(), JointStiffness(), JointRest(), JointRange()]
 
 
 @given(
@@ -158,6 +163,8 @@ def test_a_pattern_with_a_slash_names_the_body_too():
         (JointStiffness(2.0), "no joint of slider, hinge has a stiffness that could be scaled"),
         (JointRange(2.0), "no joint of slider, hinge has a range that could be scaled"),
         (GeomLength(2.0, geoms="box"), "no geom of box is given by its two ends"),
+        (CapsuleLength(2.0, geoms="box"), "no geom of box is a capsule or a cylinder"),
+        (LinkTurn(0.1, bodies="cart"), "body 'cart' has no hinge to turn about"),
     ],
 )
 def test_what_the_model_does_not_have_is_named_with_what_it_has(effect, complaint):
@@ -181,6 +188,49 @@ def test_the_length_of_a_link_moves_what_it_carries():
     found = compile_model(spec(shifted), [LinkLength(1.2, bodies="upper")])
     for field in ("body_pos", "body_mass", "body_ipos", "body_inertia", "jnt_pos", "geom_size", "site_pos"):
         np.testing.assert_allclose(getattr(found, field), getattr(expected, field), atol=1e-9, err_msg=field)
+
+
+def test_a_link_turns_about_its_joint_with_what_it_carries():
+    """A quarter turn about y: what hung below the shoulder, at 0.1 m, lies beside it; the lower body does not turn."""
+    before = compile_model(spec(ARM.format(end=-0.4, lower=-0.5)))
+    found = compile_model(spec(ARM.format(end=-0.4, lower=-0.5)), [LinkTurn(-math.pi / 2.0, bodies="upper")])
+    np.testing.assert_allclose(found.site_pos[0], [0.5, 0.0, 0.1], atol=1e-9)
+    np.testing.assert_allclose(found.geom_pos[0], [0.25, 0.0, 0.1], atol=1e-9)
+    elbow = 0.3 * np.array([math.cos(math.radians(30.0)), 0.0, -math.sin(math.radians(30.0))])  # in the lower body
+    x, _, z = before.body_pos[2] + elbow - [0.0, 0.0, 0.1]
+    np.testing.assert_allclose(found.body_pos[2] + elbow - [0.0, 0.0, 0.1], [-z, 0.0, x], atol=1e-9)
+    np.testing.assert_array_equal(found.body_quat[2], before.body_quat[2])
+    np.testing.assert_allclose(found.body_mass, before.body_mass)
+    cheetah = compile_model(spec("HalfCheetah"), [LinkTurn(0.3, bodies="bshin"), LinkTurn(-0.3, bodies="bshin")])
+    np.testing.assert_allclose(cheetah.geom_quat, compile_model(spec("HalfCheetah")).geom_quat, atol=1e-9)
+
+
+def test_a_capsule_becomes_longer_about_its_centre_and_keeps_its_radius():
+    before = compile_model(spec("HalfCheetah"))
+    found = compile_model(spec("HalfCheetah"), [CapsuleLength(2.0, geoms=("torso", "bfoot"))])
+    for name in ("torso", "bfoot"):  # the first is given by its ends
+        np.testing.assert_allclose(found.geom(name).size[:2], before.geom(name).size[:2] * [1.0, 2.0])
+        np.testing.assert_allclose(found.geom(name).pos, before.geom(name).pos, atol=1e-9)
+
+
+def test_capsules_weigh_as_cylinders_that_are_longer_by_a_radius():
+    """Also two on one body: the same model with cylinders in their place has the same inertials."""
+    leg = """<mujoco><compiler {total}/><worldbody><body name="leg"><joint/><geom type="{kind}" size="0.05 {thigh}"/>
+      <geom type="{kind}" size="0.02 {shin}" pos="0.1 0 -0.3" euler="0 40 0"/>
+      <geom size="0.1" pos="0 0 0.3"/></body><body name="arm"><joint/><geom size="0.2"/></body></worldbody></mujoco>"""
+    for total in ("", 'settotalmass="3"'):
+        capsules = leg.format(kind="capsule", thigh=0.2, shin=0.1, total=total)
+        cylinders = leg.format(kind="cylinder", thigh=0.225, shin=0.11, total=total)
+        found, expected = compile_model(spec(capsules), [EarlierCapsules(1.0)]), compile_model(spec(cylinders))
+        for field in ("body_mass", "body_ipos", "body_inertia"):
+            same = np.sort(getattr(found, field)), np.sort(getattr(expected, field))  # the axes' order is free
+            np.testing.assert_allclose(*same, atol=1e-9, err_msg=field)
+    half = compile_model(spec(leg.format(kind="capsule", thigh=0.2, shin=0.1, total="")), [EarlierCapsules(0.5)])
+    exact = compile_model(spec(leg.format(kind="capsule", thigh=0.2, shin=0.1, total="")))
+    cylinders = compile_model(spec(leg.format(kind="cylinder", thigh=0.225, shin=0.11, total="")))
+    np.testing.assert_allclose(half.body_mass, (exact.body_mass + cylinders.body_mass) / 2)
+    with pytest.raises(ValueError, match="no body has a capsule"):
+        compile_model(spec(leg.format(kind="cylinder", thigh=0.225, shin=0.11, total="")), [EarlierCapsules(1.0)])
 
 
 def test_an_exact_name_is_no_pattern():

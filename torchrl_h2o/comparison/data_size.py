@@ -24,12 +24,13 @@ _SAC = {
 _SIMULATOR = {"true": ", mended simulator", "posterior": ", posterior", "": ""}  # by the option mend
 
 
-def _title(name: str) -> str:
+def title_of(name: str) -> str:
+    """Return the title of a name in :data:`DATA_SIZE_METHODS`, such as "IQL" or "SAC, mended simulator"."""
     method, suffix = split_suffix(name)
     return METHODS[method].title.removesuffix(" in the simulator") + _SIMULATOR[MEND[suffix]]
 
 
-TITLES = {name: _title(name) for name in DATA_SIZE_METHODS}  # in tables and figures
+TITLES = {name: title_of(name) for name in DATA_SIZE_METHODS}  # in tables and figures
 NOTES = """\
 A cell: return in reality, mean ± standard deviation over seeds; seconds balanced of 30 s; when moving forward, mean \
 speed (target 0.2 m/s); number of seeds.

@@ -162,6 +162,70 @@ class DataSizeGrid:
         return chosen + ([f"mend={MEND[suffix]}"] if suffix else [])
 
 
+#: files of the benchmark of others and methods, the most informative first, because runs are in this order
+OFF_DYNAMICS_FILES = tuple(
+    f"{env}_{change}_{quality}"
+    for change in ("gravity_0.5", "kinematic", "morph")
+    for quality in ("expert", "medium", "medium_expert")
+    for env in ("walker2d", "halfcheetah")
+)
+OFF_DYNAMICS_METHODS = (f"h2o_plus{MENDED}", f"sac{MENDED}", "h2o_plus", "sac", "iql", "td3_bc", "h2o")
+
+
+@dataclass(frozen=True)
+class OffDynamicsGrid:
+    """Runs with the target data of OTDF, whose dynamics differ from the unmodified task, in which policies are trained.
+
+    Methods are as published. Those in the mended simulator have the options of ``recipes/h2o_plus.py``. SAC in the
+    unmodified task reads no data, so it is run once per change.
+
+    Args:
+        folder: folder with the files.
+        methods: names in :data:`OFF_DYNAMICS_METHODS`.
+        tasks: names in :data:`OFF_DYNAMICS_FILES`.
+
+    Example:
+        >>> grid = OffDynamicsGrid("data", ("sac_mended",), ("walker2d_morph_medium",))
+        >>> print(*next(grid.runs((0,)))[:4])
+        method=sac env=walker2d_morph data=data/walker2d_morph_medium.hdf5 mend=true
+
+    Source: J. Lyu et al., "Cross-Domain Offline Policy Adaptation with Optimal Transport and Dataset Constraint", ICLR
+    2025; the files are in github.com/dmksjfl/OTDF.
+    """
+
+    folder: str
+    methods: tuple[str, ...] = OFF_DYNAMICS_METHODS
+    tasks: tuple[str, ...] = OFF_DYNAMICS_FILES
+
+    def runs(self, seeds: tuple[int, ...]) -> Iterator[list[str]]:
+        """Yield the overrides of each run. The first seed's runs come first, file by file.
+
+        Args:
+            seeds: seeds of the runs.
+        """
+        for seed in seeds:
+            runs = [(*self._run(file, method), f"seed={seed}") for file in self.tasks for method in self.methods]
+            yield from map(list, dict.fromkeys(runs))
+
+    def _run(self, file: str, method: str) -> list[str]:
+        name, suffix = split_suffix(method)
+        env = env_of_file(file)
+        if method == "sac":
+            file = next(one for one in OFF_DYNAMICS_FILES if env_of_file(one) == env)
+        chosen = [f"method={name}", f"env={env}", f"data={self.folder}/{file}.hdf5"]
+        return chosen + ([f"mend={MEND[suffix]}", "warm_start=true", "keep=best_in_simulator"] if suffix else [])
+
+
+def env_of_file(file: str) -> str:
+    """Return the environment in config/env/ of a file in :data:`OFF_DYNAMICS_FILES`.
+
+    Example:
+        >>> env_of_file("walker2d_gravity_0.5_medium")
+        'walker2d_gravity'
+    """
+    return "_".join(file.split("_")[:2])
+
+
 WITHOUT_RATIO = ("mixing=0.1", "ratio=false")
 TABLES = {
     "returns": Grid(SIX, (REPLAY, MEDIUM, "walker2d/medium-replay-v0"), tuple(PAPER_GAPS)),
@@ -171,6 +235,7 @@ TABLES = {
     ),
     "gaps": Grid(("h2o", "h2o_plus"), (REPLAY,), strengths=(1.25, 1.5, 2.0, 3.0)),
     "methods": Grid(SIX),  # not in the paper: for tasks of your own
+    "off_dynamics": OffDynamicsGrid("."),  # not in the paper; folder_of_data=... gives the folder
 }
 FIGURES = {
     "backbones": Grid(
@@ -188,15 +253,20 @@ def group_name(cfg: DictConfig) -> str:
     return cfg.table if cfg.figure is None else cfg.figure
 
 
-def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid:
+def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid | OffDynamicsGrid:
     """Build the requested grid. Options on the command line replace the paper's values.
 
     Raises:
         ValueError: for an unknown value, or an option that has no effect on these runs.
     """
     name = group_name(cfg)
-    if isinstance((TABLES | FIGURES)[name], DataSizeGrid):
+    grid = (TABLES | FIGURES)[name]
+    if isinstance(grid, DataSizeGrid):
         return chosen_data_sizes(cfg)
+    if isinstance(grid, OffDynamicsGrid):
+        return chosen_off_dynamics(cfg)
+    if cfg.folder_of_data is not None:
+        raise ValueError(f"{name} has no folder of data: leave out folder_of_data, or take table=off_dynamics")
     if idle := [key for key in ("sizes", "log") if cfg[key] is not None]:
         raise ValueError(f"only figure=data_size has amounts of real data: leave out {' and '.join(idle)}")
     lists = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
@@ -208,7 +278,7 @@ def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid:
             raise ValueError(
                 f"datasets=[{data}]: its name must contain {' or '.join(ENVS)}; for other environments see tasks=[...]"
             )
-    grid = Grid(**(vars((TABLES | FIGURES)[name]) | chosen))
+    grid = Grid(**(vars(grid) | chosen))
     if not grid.datasets and not grid.tasks:
         raise ValueError(f"{name} has no environment yet: name tasks=[...], files in recipes/config/env/")
     if not grid.datasets and (idle := [key for key in ("gaps", "strengths") if key in chosen]):
@@ -222,19 +292,43 @@ def chosen_data_sizes(cfg: DictConfig) -> DataSizeGrid:
     Raises:
         ValueError: for an unknown value, or a selection that this figure does not have.
     """
-    if idle := [key for key in ("datasets", "gaps", "strengths") if cfg[key] is not None]:
+    if idle := [key for key in ("datasets", "gaps", "strengths", "folder_of_data") if cfg[key] is not None]:
         raise ValueError(f"data_size has no data sets and gaps, so {' and '.join(idle)} would have no effect")
-    chosen = {}
-    for key, known in {"methods": DATA_SIZE_METHODS, "tasks": tuple(DATA_SIZE_TASKS), "sizes": SIZES}.items():
-        if cfg[key] is None:
-            continue
-        for unknown in set(cfg[key]) - set(known):
-            names = list(map(str, known))
-            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}{did_you_mean(unknown, names)}")
-        chosen[key] = tuple(cfg[key])
+    chosen = _selected(cfg, {"methods": DATA_SIZE_METHODS, "tasks": tuple(DATA_SIZE_TASKS), "sizes": SIZES})
     if cfg.log is None and LOG in chosen.get("tasks", ()):
         raise ValueError("tasks=[log] needs the file of the real robot's log: log=standing_still.txt")
     return DataSizeGrid(**chosen, log=None if cfg.log is None else str(Path(cfg.log).resolve()))
+
+
+def chosen_off_dynamics(cfg: DictConfig) -> OffDynamicsGrid:
+    """Build the grid with the selections ``methods`` and ``tasks``, and ``folder_of_data``, of the command line.
+
+    Raises:
+        ValueError: for an unknown value, a selection that this table does not have, or no folder.
+    """
+    if idle := [key for key in ("datasets", "gaps", "strengths", "sizes", "log") if cfg[key] is not None]:
+        raise ValueError(f"off_dynamics has the files of a folder, so {' and '.join(idle)} would have no effect")
+    chosen = _selected(cfg, {"methods": OFF_DYNAMICS_METHODS, "tasks": OFF_DYNAMICS_FILES})
+    if cfg.folder_of_data is None:
+        raise ValueError("off_dynamics needs the folder datasets/ of github.com/dmksjfl/OTDF: folder_of_data=datasets")
+    folder = Path(cfg.folder_of_data).resolve()
+    grid = OffDynamicsGrid(str(folder), **chosen)
+    if missing := [file for file in grid.tasks if not (folder / f"{file}.hdf5").is_file()]:
+        raise ValueError(f"folder_of_data={cfg.folder_of_data}: it has no {missing[0]}.hdf5; choose with tasks=[...]")
+    return grid
+
+
+def _selected(cfg: DictConfig, known: dict[str, tuple]) -> dict[str, tuple]:
+    """The selections of the command line, each of known values; ValueError for others."""
+    chosen = {}
+    for key, values in known.items():
+        if cfg[key] is None:
+            continue
+        for unknown in set(cfg[key]) - set(values):
+            names = list(map(str, values))
+            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}{did_you_mean(unknown, names)}")
+        chosen[key] = tuple(cfg[key])
+    return chosen
 
 
 def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:

@@ -28,6 +28,7 @@ class PaperOptions(AnyMethodOptions):
     tasks: Names | None
     sizes: Annotated[list[Positive], Field(min_length=1, examples=[[2.5, 83]])] | None
     log: AnyPath | None
+    folder_of_data: AnyPath | None
     seeds: Seeds = option([0, 1, 2, 3, 4])
     retries: Annotated[int, Field(ge=0)]
     folder: str | None

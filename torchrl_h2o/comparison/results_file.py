@@ -61,6 +61,7 @@ TOLD = {
 }
 #: overrides of paper.py that choose runs
 GRID = {"table", "figure", "methods", "gaps", "strengths", "datasets", "tasks", "sizes", "log", "seeds", "retries"}
+GRID |= {"folder_of_data"}
 CURVE = ("at", "return_mean", "return_std", "seconds")
 
 

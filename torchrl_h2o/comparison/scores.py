@@ -10,12 +10,19 @@ from torchrl_h2o.options.train import OFFLINE
 
 Reference = tuple[float, float]  # returns with score 0 and score 100
 #: Returns with score 0 and score 100. For HalfCheetah and Walker2d: D4RL's random and expert policies (Fu et al., 2020,
-#: arXiv 2004.07219). For the robot: 0, and the return of 30 s without a fault.
+#: arXiv 2004.07219). For the robot: 0, and the return of 30 s without a fault. For the changed tasks: random and
+#: expert policies in them, of Lyu et al. (ICLR 2025), info.py in github.com/dmksjfl/OTDF.
 REFERENCES = {
     "HalfCheetah-v5": (-280.178953, 12135.0),
     "Walker2d-v5": (1.629008, 4592.3),
     "wheel_legged/standing_still": (0.0, 180_000.0),
     "wheel_legged/moving_forward": (0.0, 90_000.0),
+    "halfcheetah_gravity": (-280.178953, 9509.15),
+    "halfcheetah_kinematic": (-280.178953, 7065.03),
+    "halfcheetah_morph": (-280.178953, 9713.59),
+    "walker2d_gravity": (10.079455, 5194.713),
+    "walker2d_kinematic": (10.079455, 3257.51),
+    "walker2d_morph": (10.079455, 4398.43),
 }
 Task = tuple[str, ...]
 #: columns in which the variants of H2O+ differ in the ablations, and their labels in tables

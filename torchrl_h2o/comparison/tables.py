@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from torchrl_h2o.comparison import data_size
+from torchrl_h2o.comparison import data_size, off_dynamics
 from torchrl_h2o.comparison.aggregates import BASE, Scores, common_scores, improvements, interquartile_means
 from torchrl_h2o.comparison.data_size_figure import draw_data_size
 from torchrl_h2o.comparison.figures import draw_aggregates, draw_curves
@@ -101,6 +101,20 @@ def report_data_size(runs: pd.DataFrame, to: Path, reps: int) -> None:
     budgets = " or ".join(f"{updates:,}" for updates in sorted(map(int, runs["updates"].unique())))
     _write(to, "data_size", f"{data_size.markdown(points)}\nAfter {budgets} updates, with the last policy.\n")
     draw_data_size(to / "data_size.png", points, reps)
+
+
+def report_off_dynamics(runs: pd.DataFrame, to: Path) -> None:
+    """Write off_dynamics.md, and print it.
+
+    Args:
+        runs: rows of the results file of ``table=off_dynamics``; any part of the grid.
+        to: folder to write to.
+
+    Raises:
+        MixedRunsError: if two runs differ in settings that the table does not show.
+    """
+    after = f"After {int(runs['updates'].iloc[0]):,} updates."
+    _write(to, "off_dynamics", f"{off_dynamics.markdown(off_dynamics.points_of(runs))}\n\n{after}\n")
 
 
 def report_seeds(results: Path, group: str, to: Path, at: Sequence[int]) -> None:

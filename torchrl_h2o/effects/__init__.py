@@ -25,8 +25,16 @@ from torchrl_h2o.effects.gear.friction import LoadFriction, StribeckFriction
 from torchrl_h2o.effects.gear.play import GearPlay
 from torchrl_h2o.effects.joint_units import joint_names, quantity_name
 from torchrl_h2o.effects.model.body import BodyCentreOfMass, BodyInertia, BodyMass, Payload, PseudoInertia
+from torchrl_h2o.effects.model.capsules import EarlierCapsules
 from torchrl_h2o.effects.model.compilation import compile_model
-from torchrl_h2o.effects.model.geom import ContactSoftness, GeomFriction, GeomLength, GeomSize, RollingResistance
+from torchrl_h2o.effects.model.geom import (
+    CapsuleLength,
+    ContactSoftness,
+    GeomFriction,
+    GeomLength,
+    GeomSize,
+    RollingResistance,
+)
 from torchrl_h2o.effects.model.joint import (
     Armature,
     JointDamping,
@@ -36,7 +44,7 @@ from torchrl_h2o.effects.model.joint import (
     JointSpring,
     JointStiffness,
 )
-from torchrl_h2o.effects.model.link import LinkLength
+from torchrl_h2o.effects.model.link import LinkLength, LinkTurn
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoDamping, ServoStiffness
 from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
 from torchrl_h2o.effects.noise_balance import balanced
@@ -64,8 +72,10 @@ __all__ = [
     "BodyCentreOfMass",
     "BodyInertia",
     "BodyMass",
+    "CapsuleLength",
     "CatalogueEntry",
     "ContactSoftness",
+    "EarlierCapsules",
     "Effect",
     "Episode",
     "ForceEffect",
@@ -85,6 +95,7 @@ __all__ = [
     "JointStiffness",
     "LinearDrag",
     "LinkLength",
+    "LinkTurn",
     "LoadFriction",
     "ModelEffect",
     "Names",

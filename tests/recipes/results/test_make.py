@@ -156,3 +156,22 @@ def test_the_families_of_the_page_are_those_of_the_benchmark():
     told = {name: family["draws"] for name, family in make.pages.drawn_families().items()}
     assert told == {name: family.size for name, family in FAMILIES.items()}
     assert all(draw < told[name] for name, family in make.pages.drawn_families().items() for draw in family["chose"])
+
+
+def test_the_files_of_a_benchmark_of_others_stand_with_what_was_found_and_what_it_leaves(folder):
+    tables = [f"<!-- table: {name} -->\n<!-- end -->\n" for name in ("off_dynamics", "off_dynamics_errors")]
+    (folder / "page.md").write_text("".join(tables))
+    near, far = [0.001] * 9, [0.25] * 9
+    told = {"file": "walker2d_gravity_0.5_expert", "change": "gravity × 0.5", "found": "gravity × 0.49"}
+    told |= {"verdict": "explained_in_part", "recommended": True, "unmodified": far, "mended": near, "changed": near}
+    told |= {"reward_error": 0.002, "other_terminations": 2}
+    other = told | {"file": "walker2d_morph_medium", "found": "body mass × 2", "recommended": False}
+    saved(folder, *(Record("off_dynamics", one["file"], MADE_BY, one) for one in (told, other)))
+    make.make(folder)
+    page = (folder / "page.md").read_text()
+    assert "| walker2d_gravity_0.5_expert | gravity × 0.5 | gravity × 0.49 | explained in part |  |" in page
+    assert "| body mass × 2 | explained in part; not recommended |" in page
+    assert "| walker2d_gravity_0.5_expert | 0.25 | 0.001 | 0.001 | 0.25 | 0.001 | 0.001 | 0.002 | 2 |" in page
+    assert "Searches of commit abc1234." in page
+    assert "in 0 of 0 files" in page
+    assert "1 of 2 simulators mended" in make.tables_of(list(read_records(folder / "runs")))["overview"]

@@ -27,6 +27,7 @@ from torchrl_h2o.effects.catalogue.model_entries import (
 from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.force.servo import ServoDeadBand, TorqueSpeedLine
 from torchrl_h2o.effects.gear.play import GearPlay
+from torchrl_h2o.effects.model.capsules import EarlierCapsules
 from torchrl_h2o.effects.model.compilation import compile_model, saved_model
 from torchrl_h2o.effects.model.servo import ActuatorTimeConstant, ServoDamping, ServoStiffness, is_filter, is_servo
 from torchrl_h2o.effects.model.world import Gravity, GravityTilt, Timestep
@@ -77,6 +78,7 @@ def catalogue(
     entries = [
         *_world_entries(mechanism),
         *body_entries(mechanism),
+        *_version_entries(spec),
         *joint_entries(mechanism),
         *geom_entries(mechanism, spec),
         *force_entries(mechanism),
@@ -182,6 +184,15 @@ def _observation_entries(num: int, dt: float, velocities: tuple[int, ...]) -> It
     yield from entries_of(ObservationBias, "entries", single, lambda _: each("bias", 0.1, -0.1))
     yield from entries_of(ObservationDelay, "entries", late, lambda _: each("delay", 0.3 * dt, dt, 2.0 * dt))
     yield from entries_of(ObservationNoise, "entries", together, lambda _: each("std", 0.01, 0.1))
+
+
+def _version_entries(spec: mujoco.MjSpec) -> Iterator[CatalogueEntry]:
+    """Yields what an earlier version of MuJoCo computed otherwise, if all inertias of a model follow from its geoms.
+
+    That is so in Gym's tasks, whose data may be of an earlier version, and not in the model of a machine.
+    """
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE:
+        yield CatalogueEntry(EarlierCapsules(), each("share", 0.5, 1.0))
 
 
 def _changes_something(entry: CatalogueEntry, spec: mujoco.MjSpec, unchanged: bytes) -> bool:

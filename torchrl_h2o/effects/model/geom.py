@@ -11,6 +11,8 @@ from torchrl_h2o.effects.effect import ModelEffect
 from torchrl_h2o.effects.parameter import parameter
 from torchrl_h2o.effects.selection import Names
 
+LONG = (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)  # their second size is half their length
+
 
 @dataclass(frozen=True)
 class GeomFriction(ModelEffect):
@@ -101,6 +103,40 @@ class GeomLength(ModelEffect):
             raise ValueError(f"no geom of {names} is given by its two ends (fromto); use GeomSize")
         for geom in spanned:
             geom.fromto *= self.scale
+
+
+@dataclass(frozen=True)
+class CapsuleLength(ModelEffect):
+    """Scales the length of capsules and cylinders about their centre, without the caps; the radius stays.
+
+    Args:
+        scale: factor on the length.
+        geoms: name patterns of the geoms; geoms of other shapes are skipped.
+
+    Raises:
+        ValueError: when put into a model that has no such capsule or cylinder.
+
+    Examples:
+        >>> CapsuleLength(0.5, geoms="foot").describe()
+        'capsule length of geoms foot × 0.5'
+    """
+
+    wording: ClassVar[str] = "capsule length of {geoms} × {scale}"
+    scale: float = parameter(unit="1", bounds=(0.01, 10.0), neutral=1.0)
+    geoms: Names = "*"
+
+    def edit(self, spec: mujoco.MjSpec) -> None:
+        named = selection.geoms(spec, self.geoms)
+        chosen = [geom for geom in named if geom.type in LONG]
+        if not chosen:
+            raise ValueError(f"no geom of {', '.join(geom.name for geom in named)} is a capsule or a cylinder")
+        for geom in () if self.is_neutral else chosen:
+            if np.isnan(geom.fromto[0]):
+                geom.size[1] *= self.scale
+            else:
+                centre = (geom.fromto[:3] + geom.fromto[3:]) / 2.0
+                half = self.scale * (geom.fromto[3:] - centre)
+                geom.fromto = np.append(centre - half, centre + half)
 
 
 @dataclass(frozen=True)
