@@ -26,6 +26,7 @@ from torchrl_h2o.effects import (
     Armature,
     BodyMass,
     CatalogueEntry,
+    EarlierCapsules,
     Effect,
     JointDamping,
     JointFrictionLoss,
@@ -100,8 +101,8 @@ def several(number: int, rng: np.random.Generator) -> Case:
     """Draw two or three visible catalogue effects of different classes."""
     system = SYSTEMS_OF_SEVERAL[number % len(SYSTEMS_OF_SEVERAL)]
     simulation, measured = plain(system, int(rng.integers(2**31)))
-    # links came into the catalogue later, and these draws are to stay comparable
-    entries = [entry for entry in simulation.catalogue() if not isinstance(entry.effect, LinkLength)]
+    # these came into the catalogue later, and the draws are to stay comparable
+    entries = [entry for entry in simulation.catalogue() if not isinstance(entry.effect, LinkLength | EarlierCapsules)]
     chosen: list[Effect] = []
     wanted = int(rng.integers(2, 4))
     for _ in range(TRIES):

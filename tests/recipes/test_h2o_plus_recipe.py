@@ -191,7 +191,7 @@ def test_a_run_goes_into_a_new_folder_by_default_and_never_into_another_run_s(co
         (["backbone=huber"], "must be expectile, sparse or exponential"),
         (["gap_strength=2"], "belongs to a gap"),
         (["n_steps=0"], "must be an integer of at least 1"),
-        (["n_steps=500"], "less than the 500 steps of each world"),
+        (["n_steps=500"], "less than the 200 steps of each world"),
         (["num_qvalue_nets=0"], "must be an integer from 1 to 10000"),
         (["env=halfcheetah", "data=recorded"], "name a data set"),
         (["keep=best"], "must be last or best_in_simulator"),
