@@ -38,7 +38,12 @@ def test_an_option_on_the_command_line_comes_before_the_preset():
 
 @pytest.mark.parametrize(
     ("config", "env", "is_mended"),
-    [("h2o_plus", "wheel_legged", True), ("h2o_plus", "halfcheetah", False), ("train", "wheel_legged", False)],
+    [
+        ("h2o_plus", "wheel_legged", True),
+        ("h2o_plus", "wheel_legged_forward", True),
+        ("h2o_plus", "halfcheetah", False),
+        ("train", "wheel_legged", False),
+    ],
 )
 def test_the_first_command_alone_mends_the_robot_s_simulator(config, env, is_mended):
     cfg = composed(config, f"env={env}")
