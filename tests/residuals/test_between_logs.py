@@ -105,6 +105,14 @@ def test_a_report_names_the_logs_that_do_not_contain_a_value_and_keeps_them_in_i
     assert "in one log only" in report_page(loaded)
 
 
+@pytest.mark.parametrize(("second", "word"), [(0.5000001, "agree on"), (0.52, "differ in")])
+def test_logs_do_not_differ_by_less_than_the_digits_that_a_report_shows(second, word):
+    gravity, mass, friction = few_pictures(full_report()).found
+    gravity = replace(gravity, in_logs={"scale": InLogs((0, 1), (0.5, second), (1e-9, 1e-9), 0.5)})
+    report = replace(few_pictures(full_report()), found=(gravity, mass, friction))
+    assert f"The 2 fitted logs {word} gravity × 0.5" in report.sentence()
+
+
 @pytest.mark.parametrize("scatter", [0.0, 1.0, 2.0, 10.0])
 @pytest.mark.parametrize("logs", [2, 4])
 def test_the_value_of_another_log_lies_in_the_interval_of_a_few_logs(logs, scatter):

@@ -51,6 +51,12 @@ class LoggedValue:
         return f"{'agree' if own.agree else f'differ, {self.range}'} (p = {number(own.p_value, 2)})"
 
     @property
+    def agrees(self) -> bool | None:
+        """Whether the logs agree, or differ by less than the digits that are shown; None for a single log."""
+        low, high = map(number, self.in_logs.range)
+        return True if low == high and self.in_logs.agree is False else self.in_logs.agree
+
+    @property
     def range(self) -> str:
         """Lowest and highest value over the logs."""
         low, high = self.in_logs.range
@@ -85,8 +91,8 @@ def agreement_words(report: ReportContents) -> list[str]:
     values = logged_values(report)
     if not values:
         return []
-    agree = [one.words for one in values if one.in_logs.agree]
-    differ = [f"{one.words} ({one.range})" for one in values if one.in_logs.agree is False]
+    agree = [one.words for one in values if one.agrees]
+    differ = [f"{one.words} ({one.range})" for one in values if one.agrees is False]
     lacking = [f"{one.words} ({one.lacking})" for one in values if one.lacking]
     logs = f"The {len(values[0].in_logs.logs)} fitted logs"
     return [
