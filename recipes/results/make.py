@@ -19,7 +19,9 @@ from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from pathlib import Path
 
+import cells
 import pages
+import training_tables
 from omegaconf import OmegaConf
 
 import torchrl_h2o.quiet  # noqa: F401  (silences other packages)
@@ -45,7 +47,7 @@ def records_of(folder: Path) -> list[Record]:
     """
     if (folder / "report.json").exists():
         report = json.loads((folder / "report.json").read_text())
-        if folder.resolve().name not in pages.machines():
+        if folder.resolve().name not in cells.machines():
             raise ValueError(
                 f"{folder}: machines.yaml has no {folder.resolve().name}; the folder's name names the machine"
             )
@@ -86,7 +88,7 @@ def _record_of_training(folder: Path) -> Record:
     values = run_row(cfg, summary) | {"compiled": str(cfg.compiled), "device": cfg.get("device", "cpu")}
     made_by = {key: summary[key] for key in MADE_BY}
     del values["commit"], values["versions"]
-    settings = [str((values | made_by)[key]) for key in pages.SETTINGS]
+    settings = [str((values | made_by)[key]) for key in training_tables.SETTINGS]
     names = (values["method"], values["env"].replace("/", "-"), sha256(" ".join(settings).encode()).hexdigest()[:8])
     table = "off_dynamics_runs" if values["env"] in map(env_of_file, OFF_DYNAMICS_FILES) else "training"
     return Record(table, "_".join((*names, f"seed{values['seed']}")), made_by, values)
@@ -125,7 +127,7 @@ def tables_of(records: Sequence[Record]) -> dict[str, str]:
             by_row[record.values["family"] if table == "drawn" else ""].append(record)
         for row, own in by_row.items():
             require_one_commit(f"{table} {row}".strip(), own)
-    runs = {table: pages.frame(its) for table, its in by_table.items()}
+    runs = {table: cells.frame(its) for table, its in by_table.items()}
     return {name: make_table(runs) for name, make_table in pages.TABLES.items()}
 
 
@@ -164,7 +166,7 @@ def make(folder: Path, *, check: bool = False) -> list[str]:
 def draw(folder: Path) -> None:
     """Draw the figure of the rounds between simulator and reality from the stored records."""
     if records := list(read_records(folder / "runs", "sim_to_real")):
-        draw_rounds_of_methods(folder / "sim_to_real.png", rounds_of(pages.frame(records)))
+        draw_rounds_of_methods(folder / "sim_to_real.png", rounds_of(cells.frame(records)))
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -8,6 +8,7 @@ import pytest
 from tests.composed import composed
 from tests.small_runs import ROBOT, SMALL, run
 from torchrl_h2o.options import SimToRealOptions, check_options
+from torchrl_h2o.training.config_file import load_config
 
 ROUNDS = [*SMALL, *ROBOT, "updates=20", "rounds=2", "seconds=0.2", "data_seconds=0.5", "hydra.run.dir=out"]
 
@@ -33,6 +34,7 @@ def test_each_round_adds_the_log_of_its_run_and_a_resumed_run_repeats_none(comma
     times = [path.stat().st_mtime_ns for path in out.glob("round_*/log/**/*")]
     run(command("resume=out", script="sim_to_real.py"))
     assert rounds_of(out) == [first, second]
+    assert times
     assert times == [path.stat().st_mtime_ns for path in out.glob("round_*/log/**/*")]
     replayed = run(command("checkpoint=out/round_2", "episodes=1", "film=null", script="evaluate.py"))
     assert "H2O+ in reality" in replayed
@@ -43,6 +45,9 @@ def test_each_round_adds_the_log_of_its_run_and_a_resumed_run_repeats_none(comma
 def test_other_methods_go_round_without_mending(command, tmp_path, chosen):
     run(command(*ROUNDS, *chosen, script="sim_to_real.py"))
     assert [one["found"] for one in rounds_of(tmp_path / "out")] == [[], []]
+    mended = load_config(tmp_path / "out" / "round_2").mended
+    worlds = [] if mended is None else [str(world) for world in mended.worlds]
+    assert len(set(worlds)) == (10 if "randomise=0.2" in chosen else 0)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from tests.small_runs import interrupt_at, trained
 from torchrl_h2o.data import write_ted
 from torchrl_h2o.training.checkpoint import checkpoint_file, read_checkpoint, save_checkpoint
 from torchrl_h2o.training.environments import make_simulator
+from torchrl_h2o.training.judging import best_trial
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods.h2o_plus import H2O_PLUS
 from torchrl_h2o.training.methods.sac import SAC
@@ -62,7 +63,9 @@ def test_the_policy_is_never_worse_in_the_simulator_than_where_the_training_bega
         lambda env, policy, episodes, seed: Evaluation([of_policy[float(policy.weight.detach())]], [1]),
     )
     best = BestPolicy(policies[0], None, 1)
-    assert [best.consider(one)["return_trial"] for one in policies[1:]] == list(returns[1:])
+    considered = [best.consider(one) for one in policies[1:]]
+    assert [one["return_trial"] for one in considered] == list(returns[1:])
+    assert best_trial(considered) == max(returns)
     assert best.policy.weight == policies[kept].weight
 
 

@@ -64,7 +64,8 @@ def markdown(points: pd.DataFrame, found: Mapping[str, Mapping[str, str]] | None
         for file in files
     ]
     head = ["file", *columns, *map(title_of, OFF_DYNAMICS_METHODS)]
-    return "\n\n".join([markdown_table(head, rows), _count(means.dropna()), NOTES])
+    complete = means.dropna()
+    return "\n\n".join([markdown_table(head, rows), *([_count(complete)] if len(complete) else []), NOTES])
 
 
 def _count(complete: pd.DataFrame) -> str:

@@ -8,7 +8,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -119,8 +119,8 @@ def warnings_of(
     return found
 
 
-def best_trial(rows: Iterable[Mapping[str, Any]]) -> float | None:
-    """Returns the highest lower bound of the return in the simulator, by which ``keep`` chose the policy.
+def best_trial(rows: Sequence[Mapping[str, Any]]) -> float | None:
+    """Returns the lower bound of the return in the simulator of the policy that ``keep=best_in_simulator`` returns.
 
     It is the highest of several bounds, so the policy's expected return there may still be lower.
 
@@ -128,13 +128,13 @@ def best_trial(rows: Iterable[Mapping[str, Any]]) -> float | None:
         rows: metrics of a training.
 
     Returns:
-        The return; None with ``keep=last``.
+        The bound; None with ``keep=last``.
 
     Examples:
-        >>> best_trial([{"updates": 1000, "return_trial": 20.0}, {"updates": 2000, "return_trial": 10.0}])
+        >>> best_trial([{"updates": 1000, "return_kept": 20.0}, {"updates": 2000, "return_kept": 20.0}])
         20.0
     """
-    return max((row["return_trial"] for row in rows if "return_trial" in row), default=None)
+    return rows[-1].get("return_kept") if rows else None
 
 
 def write_failure(directory: Path, failure: Mapping[str, Any], settings: Mapping[str, Any]) -> None:

@@ -170,14 +170,14 @@ class BestPolicy:
             actor: the policy with its current parameters.
 
         Returns:
-            The lower bound of the mean return, as ``return_trial``.
+            Lower bounds of mean returns: the actor's, as ``return_trial``, and the best policy's, as ``return_kept``.
         """
         if self._highest is None:  # at the first evaluation, also of a resumed training
             self._highest = self._lower_bound(self.policy)
         if (return_trial := self._lower_bound(actor)) >= self._highest:
             self._highest = return_trial
             self.policy.load_state_dict(actor.state_dict())
-        return {"return_trial": return_trial}
+        return {"return_trial": return_trial, "return_kept": self._highest}
 
     def _lower_bound(self, policy: torch.nn.Module) -> float:
         return evaluate(self.simulator, policy, self.episodes, TRIAL_SEED).lower_bound

@@ -49,7 +49,6 @@ class Task:
         *,
         gap: str | None = None,
         gap_strength: float | None = None,
-        mended: Mapping[str, Any] | None = None,
     ) -> Task:
         """Builds a task from a configuration.
 
@@ -57,7 +56,6 @@ class Task:
             env: the ``env`` section of the configuration.
             gap: name of one of the paper's dynamics gaps, for the simulator.
             gap_strength: strength of the gap. Defaults to the paper's value.
-            mended: effects that the run has found with ``mend``, see :meth:`mended`.
 
         Raises:
             ValueError: for an unknown gap.
@@ -67,7 +65,7 @@ class Task:
             simulator.append(paper_gap(gap, gap_strength))
         reality = tuple(instantiate(effect) for effect in env.reality)
         config = cast(dict[str, Any], OmegaConf.to_container(env, resolve=True))
-        return cls(config, reality, tuple(simulator), gap).mended(mended)
+        return cls(config, reality, tuple(simulator), gap)
 
     def mended(self, found: Mapping[str, Any] | None) -> Task:
         """Returns the task with further effects in its simulator.

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+import cells
 import mujoco
 import numpy as np
-import pages
 import pandas as pd
 import pytest
 import randomization
 import torch
+import training_tables
 from machine_series import SERIES, USUAL, WORLDS
 from motored_env import ReachingEnv
 from options import run_options
@@ -193,18 +194,18 @@ def test_runs_with_other_options_do_not_mix_in_a_folder(run):
 
 
 def test_the_page_shows_the_lines_and_scores_that_the_benchmark_records():
-    assert tuple(WORLDS) == pages.WORLDS
-    assert {series.score[0] for series in SERIES.values()} <= set(pages.SCORES)
+    assert tuple(WORLDS) == training_tables.WORLDS
+    assert {series.score[0] for series in SERIES.values()} <= set(training_tables.SCORES)
     made_by = {"commit": "abc1234", "instruction_set": "AVX2", "cpu_s": 60.0}
     told = {"series": "arm", "updates": 8000, "worlds": ["unmended"] * 2 + ["measured ranges"] * 2, "seed": [0, 1] * 2}
     returns = {"return": [1.0, 2.0, 3.0, 5.0]}
     rows = pd.DataFrame(told | returns).to_dict("records")
     runs = [Record("randomization", "", made_by, row) for row in rows]
-    page = pages.randomization_table({"randomization": pages.frame(runs)})
+    page = training_tables.randomization_table({"randomization": cells.frame(runs)})
     assert page.index("| measured ranges | 4 [3, 5] | 2 |") < page.index("| unmended | 1.5 [1, 2] | 2 |")
     assert "higher than with unmended (by 2.5 [2, 3])." in page
     assert "abc1234" in page
-    assert pages.randomization_table({}) == pages.NOT_RUN
+    assert training_tables.randomization_table({}) == cells.NOT_RUN
 
 
 @pytest.mark.parametrize(

@@ -153,9 +153,9 @@ def test_the_pages_that_ship_are_those_that_the_stored_runs_make():
 
 
 def test_the_families_of_the_page_are_those_of_the_benchmark():
-    told = {name: family["draws"] for name, family in make.pages.drawn_families().items()}
+    told = {name: family["draws"] for name, family in make.cells.drawn_families().items()}
     assert told == {name: family.size for name, family in FAMILIES.items()}
-    assert all(draw < told[name] for name, family in make.pages.drawn_families().items() for draw in family["chose"])
+    assert all(draw < told[name] for name, family in make.cells.drawn_families().items() for draw in family["chose"])
 
 
 def test_the_files_of_a_benchmark_of_others_stand_with_what_was_found_and_what_it_leaves(folder):
@@ -173,5 +173,5 @@ def test_the_files_of_a_benchmark_of_others_stand_with_what_was_found_and_what_i
     assert "| body mass × 2 | explained in part; not recommended |" in page
     assert "| walker2d_gravity_0.5_expert | 0.25 | 0.001 | 0.001 | 0.25 | 0.001 | 0.001 | 0.002 | 2 |" in page
     assert "Searches of commit abc1234." in page
-    assert "in 0 of 0 files" in page
+    assert "beats the best" not in page  # there are no scores
     assert "1 of 2 simulators mended" in make.tables_of(list(read_records(folder / "runs")))["overview"]
