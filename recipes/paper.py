@@ -3,7 +3,6 @@
 python recipes/paper.py table=returns                          # every task, gap, method and seed of the main table
 python recipes/paper.py table=returns methods=[h2o_plus,iql] gaps=[gravity] seeds=[0,1] updates=100000
 python recipes/paper.py figure=wheel_legged seeds=[0,1,2] hydra/launcher=joblib hydra.launcher.n_jobs=2
-python recipes/paper.py figure=data_size log=standing_still.txt sizes=[2.5,83]      # by the amount of real data
 python recipes/paper.py table=methods tasks=[mine] results=mine.csv     # your own task, config/env/mine.yaml
 python recipes/paper.py table=mixing hydra/launcher=submitit_slurm      # or hydra/launcher=ray
 

@@ -3,7 +3,6 @@
 python recipes/report.py                              # all groups with results
 python recipes/report.py groups=[returns] updates=50000
 python recipes/report.py groups=[wheel_legged] runs=outputs/paper    # with the robot's trajectories
-python recipes/report.py groups=[data_size]           # return against the amount of real data
 python recipes/report.py groups=[] by_seed=[wheel_legged]      # seconds balanced, a line per variant, a column per seed
 python recipes/report.py results=. groups=[mine] +references.Hopper-v5=[0,3200]    # mine.csv; scores 0 and 100
 """
@@ -22,7 +21,7 @@ from torchrl_h2o.comparison.results_file import RESULTS, read_rows, require_grou
 from torchrl_h2o.comparison.robot_figures import draw_robot
 from torchrl_h2o.comparison.robot_trajectories import robot_results
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError
-from torchrl_h2o.comparison.tables import of_one_budget, report, report_data_size, report_off_dynamics, report_seeds
+from torchrl_h2o.comparison.tables import of_one_budget, report, report_off_dynamics, report_seeds
 
 
 @hydra_main("config", "report", ReportOptions)
@@ -38,9 +37,6 @@ def main(cfg: DictConfig) -> None:
             if not len(rows):
                 asked = "" if cfg.updates is None else f" of {cfg.updates} updates"
                 print(f"{group}: no run{asked} in {results / group}.csv")
-                continue
-            if group == "data_size":
-                report_data_size(rows, to, cfg.reps)
                 continue
             if group == "off_dynamics":
                 report_off_dynamics(rows, to)

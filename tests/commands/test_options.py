@@ -124,8 +124,7 @@ OTHERS = {
         "paper",
         "table=retuns",
     ): "table=retuns: must be returns, mixing, gaps, methods, off_dynamics or null; did you mean returns?",
-    ("paper", "figure=backbone"): "figure=backbone: must be backbones, wheel_legged, data_size or null; did you mean "
-    "backbones?",
+    ("paper", "figure=backbone"): "figure=backbone: must be backbones, wheel_legged or null; did you mean backbones?",
     (
         "paper",
         "table=returns methods=[h2oplus]",

@@ -86,8 +86,6 @@ def test_a_choice_that_there_is_not_is_said_before_anything_runs(overrides, said
     [
         (["table=returns", "gaps=[gravty]"], r"gaps=\[gravty\]: must be .*did you mean gravity\?"),
         (["table=returns", "methods=iql"], r"methods=iql: must be null or a list of names"),
-        (["figure=data_size", "sizes=10"], r"sizes=10: must be null or a list of one or more numbers above 0"),
-        (["figure=data_size", "log=missing.txt"], "log=missing.txt: there is no such file"),
         (["table=returns", "seeds=[]"], r"seeds=\[\]: must be a list of one or more integers"),
     ],
 )
@@ -112,7 +110,7 @@ def test_what_each_run_says_for_itself_is_no_override_of_all(grid, override, sai
     check_overrides(["updates=10", "env.make.max_episode_steps=40", "mixing=0.3"], list(TABLES["returns"].runs((0,))))
 
 
-@pytest.mark.parametrize("grid", [TABLES["mixing"], TABLES["gaps"], FIGURES["data_size"]])
+@pytest.mark.parametrize("grid", [TABLES["mixing"], TABLES["gaps"]])
 def test_runs_that_differ_have_different_identities(grid):
     found = {}
     for run in grid.runs((0,)):
@@ -136,50 +134,3 @@ def test_every_run_is_an_override_that_hydra_reads():
     for grid in (TABLES | FIGURES).values():
         for run in grid.runs((0,)):
             parser.parse_overrides(run)
-
-
-def test_the_data_size_figure_has_every_method_at_every_size_and_sac_once(tmp_path):
-    log = tmp_path / "log.txt"
-    log.touch()
-    grid = chosen_grid(paper("figure=data_size", f"log={log}"))
-    runs = list(grid.runs((0, 1)))
-    assert len(runs) == 2 * (4 * 7 + 2 * 7 + 7 + 7 + 2)
-    assert len({tuple(run) for run in runs}) == len(runs)
-    assert runs[58:] == [[*run[:-1], "seed=1"] for run in runs[:58]]  # all of one seed, then the next
-    assert chosen(runs[:58], "env") == {"wheel_legged": 29 + 7, "wheel_legged_forward": 15, "wheel_legged_poor": 7}
-    assert chosen(runs[:58], "data_seconds") == {"2.5": 14, "10": 7, "30": 7 + 7}
-    assert chosen(runs[:58], "data") == {str(log): 7}
-    assert chosen(runs[:58], "mend") == {"true": 16, "posterior": 8}
-    plain = [run for run in runs[:58] if "method=sac" in run and "mend=true" not in run]
-    assert plain == [["method=sac", f"env={env}", "seed=0"] for env in ("wheel_legged", "wheel_legged_forward")]
-
-
-def test_a_part_of_the_data_size_figure_is_a_selection():
-    cfg = paper("figure=data_size", "tasks=[wheel_legged,wheel_legged_poor]", "methods=[iql,sac]", "sizes=[2.5,83]")
-    assert list(chosen_grid(cfg).runs((3,))) == [
-        ["method=iql", "env=wheel_legged", "data_seconds=2.5", "seed=3"],
-        ["method=sac", "env=wheel_legged", "seed=3"],
-        ["method=iql", "env=wheel_legged", "seed=3"],
-    ]
-    assert not any("data=" in override for run in chosen_grid(paper("figure=data_size")).runs((0,)) for override in run)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (["methods=[darc]"], r"methods=\[darc\]: choose iql, cql"),
-        (["sizes=[5]"], r"sizes=\[5\]: choose 2.5, 10.0"),
-        (["tasks=[log]"], r"log=standing_still.txt"),
-        (["gaps=[gravity]"], r"gaps would have no effect"),
-    ],
-)
-def test_a_selection_that_the_data_size_figure_does_not_have_is_said(overrides, said):
-    with pytest.raises(ValueError, match=said):
-        chosen_grid(paper("figure=data_size", *overrides))
-
-
-def test_amounts_of_data_are_selections_of_one_figure_only():
-    with pytest.raises(ValueError, match="only figure=data_size has amounts of real data: leave out sizes"):
-        chosen_grid(paper("figure=wheel_legged", "sizes=[10]"))
-    with pytest.raises(ValueError, match=r"choose with sizes="):
-        check_overrides(["data_seconds=5"], list(FIGURES["data_size"].runs((0,))))

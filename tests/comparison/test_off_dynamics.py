@@ -55,7 +55,7 @@ def test_only_the_mended_runs_have_the_options_of_the_first_command(folder):
         (["gaps=[gravity]"], "so gaps would have no effect"),
         (["folder_of_data=null"], "needs the folder"),
         (["table=methods", "tasks=[mine]"], "methods has no folder of data"),
-        (["figure=data_size", "table=null"], "so folder_of_data would have no effect"),
+        (["figure=backbones", "table=null"], "backbones has no folder of data"),
     ],
 )
 def test_a_choice_that_there_is_not_is_said_before_anything_runs(folder, overrides, said):

@@ -77,89 +77,7 @@ def _run(env: str, data: str | None, gap: str | None, strength: float | None, me
     return [*chosen, f"data={data}", f"gap={gap}", *([] if strength is None else [f"gap_strength={strength}"])]
 
 
-WHOLE = 83.0  # s, all real data: the recording and the real robot's log both have 16,588 rows, 82.94 s
-SIZES = (2.5, 10.0, 30.0, WHOLE)
-LOG = "log"  # task: standing still with the real robot's log as real data
-#: environment or :data:`LOG`, and the amounts of real data in s
-DATA_SIZE_TASKS = {
-    "wheel_legged": SIZES,
-    "wheel_legged_forward": (SIZES[0], WHOLE),
-    "wheel_legged_poor": (30.0,),
-    LOG: (WHOLE,),
-}
 MENDED = "_mended"  # suffix of a method that is trained in the simulator mended from the same data
-POSTERIOR = "_posterior"  # the same, with values drawn from the report's intervals and alternatives in each world
-MEND = {"": "", MENDED: "true", POSTERIOR: "posterior"}  # value of the option ``mend`` for each suffix
-DATA_SIZE_METHODS = (
-    "iql",
-    "cql",
-    "sac",
-    "h2o",
-    "h2o_plus",
-    f"sac{MENDED}",
-    f"h2o_plus{MENDED}",
-    f"h2o_plus{POSTERIOR}",
-)
-
-
-def split_suffix(name: str) -> tuple[str, str]:
-    """Split a name in :data:`DATA_SIZE_METHODS` into the method and its suffix in :data:`MEND`.
-
-    Example:
-        >>> split_suffix("h2o_plus_mended"), split_suffix("iql")
-        (('h2o_plus', '_mended'), ('iql', ''))
-    """
-    suffix = next((suffix for suffix in (MENDED, POSTERIOR) if name.endswith(suffix)), "")
-    return name.removesuffix(suffix), suffix
-
-
-@dataclass(frozen=True)
-class DataSizeGrid:
-    """Runs of the robot with different amounts of real data.
-
-    All methods and seeds use the same rows: the first seconds of the data. SAC in the simulator that is not mended
-    learns from simulated rows alone. It depends on the data only through the normalisation of the observations, so it
-    is run once per task, with the normalisation of the whole recording.
-
-    Args:
-        methods: names in :data:`DATA_SIZE_METHODS`.
-        tasks: names in :data:`DATA_SIZE_TASKS`.
-        sizes: amounts of real data in s, of those in :data:`DATA_SIZE_TASKS`.
-        log: file of the real robot's log; None leaves out its runs.
-
-    Example:
-        >>> grid = DataSizeGrid(methods=("iql", "sac_mended"), tasks=("wheel_legged",), sizes=(2.5,))
-        >>> for run in grid.runs((0,)):
-        ...     print(*run)
-        method=iql env=wheel_legged data_seconds=2.5 seed=0
-        method=sac env=wheel_legged data_seconds=2.5 mend=true seed=0
-    """
-
-    methods: tuple[str, ...] = DATA_SIZE_METHODS
-    tasks: tuple[str, ...] = tuple(DATA_SIZE_TASKS)
-    sizes: tuple[float, ...] = SIZES
-    log: str | None = None
-
-    def runs(self, seeds: tuple[int, ...]) -> Iterator[list[str]]:
-        """Yield the overrides of each run. All runs of the first seed come first, so that they finish first.
-
-        Args:
-            seeds: seeds of the runs.
-        """
-        tasks = [task for task in self.tasks if task != LOG or self.log is not None]
-        worlds = [(task, size) for task in tasks for size in DATA_SIZE_TASKS[task] if size in self.sizes]
-        for seed in seeds:
-            runs = [(*self._run(*world, method), f"seed={seed}") for world in worlds for method in self.methods]
-            yield from map(list, dict.fromkeys(runs))
-
-    def _run(self, task: str, size: float, method: str) -> list[str]:
-        name, suffix = split_suffix(method)
-        env = "wheel_legged" if task == LOG else task
-        if name == "sac" and not suffix:
-            return [f"method={name}", f"env={env.removesuffix('_poor')}"]
-        chosen = [f"method={name}", f"env={env}", *([f"data={self.log}"] if task == LOG else [])]
-        chosen += [f"data_seconds={size:g}"] if size != WHOLE else []
-        return chosen + ([f"mend={MEND[suffix]}"] if suffix else [])
 
 
 #: files of the benchmark of others and methods, the most informative first, because runs are in this order
@@ -208,12 +126,11 @@ class OffDynamicsGrid:
             yield from map(list, dict.fromkeys(runs))
 
     def _run(self, file: str, method: str) -> list[str]:
-        name, suffix = split_suffix(method)
         env = env_of_file(file)
         if method == "sac":
             file = next(one for one in OFF_DYNAMICS_FILES if env_of_file(one) == env)
-        chosen = [f"method={name}", f"env={env}", f"data={self.folder}/{file}.hdf5"]
-        return chosen + ([f"mend={MEND[suffix]}", "warm_start=true", "keep=best_in_simulator"] if suffix else [])
+        chosen = [f"method={method.removesuffix(MENDED)}", f"env={env}", f"data={self.folder}/{file}.hdf5"]
+        return chosen + (["mend=true", "warm_start=true", "keep=best_in_simulator"] if method.endswith(MENDED) else [])
 
 
 def env_of_file(file: str) -> str:
@@ -244,7 +161,6 @@ FIGURES = {
         variants=(("backbone=expectile",), ("backbone=sparse",)),
     ),
     "wheel_legged": Grid(SIX, tasks=("wheel_legged", "wheel_legged_forward")),
-    "data_size": DataSizeGrid(),  # not in the paper
 }
 
 
@@ -253,7 +169,7 @@ def group_name(cfg: DictConfig) -> str:
     return cfg.table if cfg.figure is None else cfg.figure
 
 
-def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid | OffDynamicsGrid:
+def chosen_grid(cfg: DictConfig) -> Grid | OffDynamicsGrid:
     """Build the requested grid. Options on the command line replace the paper's values.
 
     Raises:
@@ -261,14 +177,10 @@ def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid | OffDynamicsGrid:
     """
     name = group_name(cfg)
     grid = (TABLES | FIGURES)[name]
-    if isinstance(grid, DataSizeGrid):
-        return chosen_data_sizes(cfg)
     if isinstance(grid, OffDynamicsGrid):
         return chosen_off_dynamics(cfg)
     if cfg.folder_of_data is not None:
         raise ValueError(f"{name} has no folder of data: leave out folder_of_data, or take table=off_dynamics")
-    if idle := [key for key in ("sizes", "log") if cfg[key] is not None]:
-        raise ValueError(f"only figure=data_size has amounts of real data: leave out {' and '.join(idle)}")
     lists = {key: cfg[key] for key in ("methods", "datasets", "gaps", "strengths", "tasks") if cfg[key] is not None}
     chosen = {key: tuple(value) for key, value in lists.items()}
     for unknown in set(chosen.get("methods", ())) - set(METHODS):
@@ -286,29 +198,20 @@ def chosen_grid(cfg: DictConfig) -> Grid | DataSizeGrid | OffDynamicsGrid:
     return grid
 
 
-def chosen_data_sizes(cfg: DictConfig) -> DataSizeGrid:
-    """Build the grid with the selections ``methods``, ``tasks``, ``sizes`` and ``log`` of the command line.
-
-    Raises:
-        ValueError: for an unknown value, or a selection that this figure does not have.
-    """
-    if idle := [key for key in ("datasets", "gaps", "strengths", "folder_of_data") if cfg[key] is not None]:
-        raise ValueError(f"data_size has no data sets and gaps, so {' and '.join(idle)} would have no effect")
-    chosen = _selected(cfg, {"methods": DATA_SIZE_METHODS, "tasks": tuple(DATA_SIZE_TASKS), "sizes": SIZES})
-    if cfg.log is None and LOG in chosen.get("tasks", ()):
-        raise ValueError("tasks=[log] needs the file of the real robot's log: log=standing_still.txt")
-    return DataSizeGrid(**chosen, log=None if cfg.log is None else str(Path(cfg.log).resolve()))
-
-
 def chosen_off_dynamics(cfg: DictConfig) -> OffDynamicsGrid:
     """Build the grid with the selections ``methods`` and ``tasks``, and ``folder_of_data``, of the command line.
 
     Raises:
         ValueError: for an unknown value, a selection that this table does not have, or no folder.
     """
-    if idle := [key for key in ("datasets", "gaps", "strengths", "sizes", "log") if cfg[key] is not None]:
+    if idle := [key for key in ("datasets", "gaps", "strengths") if cfg[key] is not None]:
         raise ValueError(f"off_dynamics has the files of a folder, so {' and '.join(idle)} would have no effect")
-    chosen = _selected(cfg, {"methods": OFF_DYNAMICS_METHODS, "tasks": OFF_DYNAMICS_FILES})
+    chosen = {}
+    for key, known in (("methods", OFF_DYNAMICS_METHODS), ("tasks", OFF_DYNAMICS_FILES)):
+        for unknown in set(cfg[key] or ()) - set(known):
+            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(known)}{did_you_mean(unknown, known)}")
+        if cfg[key] is not None:
+            chosen[key] = tuple(cfg[key])
     if cfg.folder_of_data is None:
         raise ValueError("off_dynamics needs the folder datasets/ of github.com/dmksjfl/OTDF: folder_of_data=datasets")
     folder = Path(cfg.folder_of_data).resolve()
@@ -316,19 +219,6 @@ def chosen_off_dynamics(cfg: DictConfig) -> OffDynamicsGrid:
     if missing := [file for file in grid.tasks if not (folder / f"{file}.hdf5").is_file()]:
         raise ValueError(f"folder_of_data={cfg.folder_of_data}: it has no {missing[0]}.hdf5; choose with tasks=[...]")
     return grid
-
-
-def _selected(cfg: DictConfig, known: dict[str, tuple]) -> dict[str, tuple]:
-    """The selections of the command line, each of known values; ValueError for others."""
-    chosen = {}
-    for key, values in known.items():
-        if cfg[key] is None:
-            continue
-        for unknown in set(cfg[key]) - set(values):
-            names = list(map(str, values))
-            raise ValueError(f"{key}=[{unknown}]: choose {', '.join(names)}{did_you_mean(unknown, names)}")
-        chosen[key] = tuple(cfg[key])
-    return chosen
 
 
 def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
@@ -342,7 +232,7 @@ def check_overrides(overrides: list[str], runs: list[list[str]]) -> None:
         ValueError: for such an override; the message gives the option to use instead.
     """
     selects = {"method": "methods", "env": "tasks", "data": "datasets", "gap": "gaps", "gap_strength": "strengths"}
-    selects |= {"seed": "seeds", "data_seconds": "sizes", "mend": "methods"}
+    selects |= {"seed": "seeds", "mend": "methods"}
     of_runs = {key_of(override) for run in runs for override in run}
     if "gap" in of_runs:
         of_runs.add("gap_strength")  # runs without a gap would reject it

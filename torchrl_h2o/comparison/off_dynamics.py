@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from torchrl_h2o.comparison.data_size import title_of
-from torchrl_h2o.comparison.grids import MEND, MENDED, OFF_DYNAMICS_FILES, OFF_DYNAMICS_METHODS, env_of_file
+from torchrl_h2o.comparison.grids import MENDED, OFF_DYNAMICS_FILES, OFF_DYNAMICS_METHODS, env_of_file
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.scores import REFERENCES, MixedRunsError, normalised
+from torchrl_h2o.training.methods import METHODS
 
 ASKED = 80.0  # score that the mended simulator is to reach with half of the gravity
 GRAVITY = "gravity"
@@ -24,16 +24,21 @@ unmodified task, and they have no simulator that they could adjust. Of ODRL's se
 is the fair one to compare with: all columns here have it, and the simulator's parameters can be set besides."""
 
 
+def title_of(name: str) -> str:
+    """Return the title of a name in :data:`OFF_DYNAMICS_METHODS`, such as "IQL" or "SAC, mended simulator"."""
+    title = METHODS[name.removesuffix(MENDED)].title.removesuffix(" in the simulator")
+    return title + (", mended simulator" if name.endswith(MENDED) else "")
+
+
 def points_of(runs: pd.DataFrame) -> pd.DataFrame:
     """Arrange the rows of a results file by file, method (of the grid's methods), seed and score.
 
     Raises:
         MixedRunsError: if runs differ in their number of updates, or a method has two runs of a seed.
     """
-    suffixes = {value: suffix for suffix, value in MEND.items()}
     rows = []
     for run in runs.to_dict("records"):
-        method, env = run["method"] + suffixes.get(run["mend"], "?"), run["env"]
+        method, env = run["method"] + {"": "", "true": MENDED}.get(run["mend"], "?"), run["env"]
         own = [Path(run["data"]).stem] if method != "sac" else [f for f in OFF_DYNAMICS_FILES if env_of_file(f) == env]
         score = normalised(float(run["return_mean"] or "nan"), REFERENCES[env])
         rows += [(file, method, int(run["seed"]), score) for file in own]

@@ -10,7 +10,7 @@ from torchrl_h2o.comparison.grids import FIGURES, TABLES
 from torchrl_h2o.options import AnyMethodOptions, Options
 from torchrl_h2o.options.sources import AnyPath, DataSource
 from torchrl_h2o.options.train import Seeds
-from torchrl_h2o.options.types import Count, Gap, OneOf, Positive, option
+from torchrl_h2o.options.types import Count, Gap, OneOf, option
 
 Names = Annotated[list[str], Field(min_length=1, description="a list of names, such as [iql,sac] or [wheel_legged]")]
 Returns = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -26,8 +26,6 @@ class PaperOptions(AnyMethodOptions):
     gaps: Annotated[list[Gap], Field(min_length=1)] | None = None
     strengths: Annotated[list[float | None], Field(min_length=1)] | None
     tasks: Names | None
-    sizes: Annotated[list[Positive], Field(min_length=1, examples=[[2.5, 83]])] | None
-    log: AnyPath | None
     folder_of_data: AnyPath | None
     seeds: Seeds = option([0, 1, 2, 3, 4])
     retries: Annotated[int, Field(ge=0)]

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from torchrl_h2o.comparison import data_size, off_dynamics
+from torchrl_h2o.comparison import off_dynamics
 from torchrl_h2o.comparison.aggregates import BASE, Scores, common_scores, improvements, interquartile_means
-from torchrl_h2o.comparison.data_size_figure import draw_data_size
 from torchrl_h2o.comparison.figures import draw_aggregates, draw_curves
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.comparison.results_file import curves_of, read_rows
@@ -82,25 +81,6 @@ def report(
     curves = curves[curves["updates"].isin(set(runs["updates"]))]
     if len(curves):
         draw_curves(to / f"{group}_curves.png", placed(curves, group in ABLATIONS), TITLES)
-
-
-def report_data_size(runs: pd.DataFrame, to: Path, reps: int) -> None:
-    """Write data_size.md and data_size.png, and print the table.
-
-    Args:
-        runs: rows of the results file of ``figure=data_size``; any part of the grid.
-        to: folder to write to.
-        reps: number of bootstrap samples.
-
-    Raises:
-        MixedRunsError: if two runs differ in settings that the figure does not show.
-    """
-    points = data_size.points_of(runs)
-    if not len(points):
-        raise MixedRunsError("data_size.csv holds no run of the figure that uses real data")
-    budgets = " or ".join(f"{updates:,}" for updates in sorted(map(int, runs["updates"].unique())))
-    _write(to, "data_size", f"{data_size.markdown(points)}\nAfter {budgets} updates, with the last policy.\n")
-    draw_data_size(to / "data_size.png", points, reps)
 
 
 def report_off_dynamics(runs: pd.DataFrame, to: Path) -> None:
