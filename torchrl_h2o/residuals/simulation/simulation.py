@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_h2o.data.audit.log import find_pairs
 from torchrl_h2o.effects import CatalogueEntry, Effect, ModelEffect, Pipeline, VaryingEffect, catalogue, joint_names
+from torchrl_h2o.effects.model.compilation import with_small_textures
 from torchrl_h2o.envs.physics import ALONE, FULL_PHYSICS, roll_out
 from torchrl_h2o.residuals.simulation.activations import (
     activations_along,
@@ -140,8 +141,8 @@ class Simulation:
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model with the model effects in it."""
-        return self.pipeline.compile(self.spec())
+        """The compiled model with the model effects in it, and with textures of one pixel."""
+        return self.pipeline.compile(with_small_textures(self.spec()))
 
     @property
     def control_step(self) -> float:
@@ -192,7 +193,7 @@ class Simulation:
 
     def catalogue(self) -> tuple[CatalogueEntry, ...]:
         """Returns candidate effects that the simulator may lack, sized by the model with the present effects."""
-        spec = self.spec()
+        spec = with_small_textures(self.spec())
         self.pipeline.edit(spec)
         velocities = sorted(pair.velocity for pair in find_pairs(self.state_map, self.model))
         return catalogue(spec, num_observations=len(self.state_map.names), dt=self.control_step, velocities=velocities)
