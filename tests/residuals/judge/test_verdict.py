@@ -146,10 +146,13 @@ def test_right_effects_make_nothing_worse(noise):
     assert (right.kind, right.reasons) == (EXPLAINED, ())
 
 
-def test_a_value_beyond_belief_is_not_recommended():
-    unbelievable = verdict((Gravity(0.02),), (Gravity(0.02),), noise=0.0)
-    assert not unbelievable.recommended
-    assert "implausibly far" in unbelievable.reasons[0]
+def test_a_value_beyond_belief_is_recommended_only_if_hardly_an_error_is_left_with_it():
+    light = Gravity(0.02)
+    exact, in_part = (verdict(truth, (light,), noise=0.0) for truth in ((light,), (light, JointFrictionLoss(0.1))))
+    assert exact.recommended
+    assert exact.caveats[0].startswith("Gravity × 0.02 is implausibly far from the model's value, but hardly an error")
+    assert not in_part.recommended
+    assert "implausibly far" in in_part.reasons[0]
 
 
 def test_a_joint_that_hardly_moves_explains_no_friction():

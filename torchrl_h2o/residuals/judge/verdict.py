@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_h2o.effects import Effect, JointRange
+from torchrl_h2o.effects.effect import EntryNames
 from torchrl_h2o.likelihood import ENOUGH, Difference
 from torchrl_h2o.residuals.estimated_states import sensor_noise
 from torchrl_h2o.residuals.judge.caveats import friction_beside_noise, only_ratios
@@ -54,7 +55,8 @@ def reach_verdict(
 
     Nothing is missing if there are no effects and neither a network that learns from what is left, nor the
     autocorrelation of the residuals, nor the error far ahead shows a difference. Otherwise the effects explain what is
-    missing wholly, in part or not at all. Effects that raise the error of the report's sentence explain nothing.
+    missing wholly, in part or not at all. Effects that raise the error of the report's sentence explain nothing, and a
+    value that a machine hardly has is believed only if hardly an error is left with it.
 
     Args:
         simulation: the simulator before effects are put in.
@@ -76,6 +78,12 @@ def reach_verdict(
         () if predictions is None or error.headline is None else predictions.hardly_better(mended, _acting(effects))
     )
     against = (*against, *undetermined, *hardly)
+    little = _leaves_little(error, predictions)
+    odd, accepted = implausible_values(effects, simulation.names), ()
+    if odd and little and not against:
+        accepted = tuple(f"{one[0].upper()}{one[1:]}, but hardly an error is left with it." for one in odd)
+    else:
+        against = (*against, *odd)
     raised = False
     if (head := error.headline) is not None:
         worse = () if predictions is None else predictions.made_worse
@@ -86,8 +94,9 @@ def reach_verdict(
     caveats = (
         *friction_beside_noise(simulation, mended, effects),
         *only_ratios(simulation, effects),
+        *accepted,
     )
-    if raised or (signs and not _leaves_little(error, predictions)):
+    if raised or (signs and not little):
         where = where_most(mended, measured)
         kind = NOT_EXPLAINED if against else EXPLAINED_IN_PART
         return Verdict(kind, (*against, *signs), recommended=not against, where=where, caveats=caveats)
@@ -181,14 +190,17 @@ def reasons_against(
             reasons.append("the effects found do not lower the error on data that chose nothing")
     elif learnt := predictions.learnt:
         reasons.append(f"the noise found stands for something that can be predicted: {learnt[0]}")
-    names = simulation.names
-    reasons += [f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect))]
     return tuple(reasons)
 
 
 def _acting(effects: Sequence[Effect]) -> list[Effect]:
     """The effects that change the motion; noise does not."""
     return [effect for effect in effects if not effect.random]
+
+
+def implausible_values(effects: Sequence[Effect], names: EntryNames) -> tuple[str, ...]:
+    """The effects with a value that a machine hardly has, in words: each speaks against them if errors are left."""
+    return tuple(f"{effect_words(effect, names)} is {why}" for effect in effects if (why := _why_implausible(effect)))
 
 
 def _why_implausible(effect: Effect) -> str:
