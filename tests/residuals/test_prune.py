@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.residuals.pendulum import double_pendulum, recorded
-from torchrl_h2o.effects import ActionBias, ActionGain, Gravity, JointDamping, JointForce, JointFrictionLoss
+from torchrl_h2o.effects import ActionBias, ActionGain, BodyMass, Gravity, JointDamping, JointForce, JointFrictionLoss
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.prune import prune, replaced
 from torchrl_h2o.residuals.search import known_set
@@ -72,3 +72,33 @@ def test_a_usual_effect_takes_the_place_of_an_unusual_one_that_explains_hardly_m
     monkeypatch.setattr("torchrl_h2o.residuals.prune.with_one_more", lambda *args, **options: [damping])
     monkeypatch.setattr("torchrl_h2o.residuals.prune.prune", lambda ground, found: found)
     assert replaced(ground, gravity, [], lambda: None)[0] is (damping if takes_the_place else gravity)
+
+
+def test_two_effects_that_are_wrong_together_are_replaced_one_after_the_other(monkeypatch):
+    """Neither alone has a better one in its place. Beside what explains as much as the first, the second has."""
+    simulation = double_pendulum()
+    gain, mass = ActionGain(0.9), BodyMass(1.1)
+    one_joint, other_joint = JointDamping(0.01, "shoulder"), JointDamping(0.01, "elbow")
+    totals = {(gain, one_joint): 0.0, (mass, one_joint): 0.0, (mass, other_joint): 1.0, (gain, other_joint): -5.0}
+    totals |= {(effect,): -9.0 for effect in (gain, mass, one_joint, other_joint)}
+    scatter = np.random.default_rng(0).standard_normal(40)
+    scatter -= scatter.mean()
+    sets = [
+        replace(known_set(simulation.catalogue(), effects), scores=score + scatter * (score == 0.0))
+        for effects, score in totals.items()
+    ]
+    by_names = {one.names: one for one in sets}
+    start, right = sets[0], sets[2]
+
+    def beside(ground, fewer, instead_of, pairs=False):
+        return [] if pairs else [one for one in sets[:4] if fewer.names < one.names and one.names != instead_of.names]
+
+    monkeypatch.setattr(Ground, "found", lambda _, entries, effects: by_names[frozenset(one.name for one in entries)])
+    monkeypatch.setattr(Ground, "fitted", Ground.found)
+    monkeypatch.setattr("torchrl_h2o.residuals.prune.Candidates.of", lambda _, fewer, __: fewer)
+    monkeypatch.setattr("torchrl_h2o.residuals.prune.with_one_more", beside)
+    monkeypatch.setattr("torchrl_h2o.residuals.prune.prune", lambda _, found: found)
+    ground = Ground.of(simulation, recorded(simulation.with_effects(gain), 400))
+    found, alike = replaced(ground, start, [], lambda: None)
+    assert found is right
+    assert alike == [[], []]

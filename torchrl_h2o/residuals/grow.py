@@ -22,6 +22,7 @@ from torchrl_h2o.residuals.sweep import Direction
 TRIED = 16  # candidates of the largest estimated gain whose gain is then simulated
 BEGUN = 8  # of these, the best that are fitted in one step
 ALIKE = 3.0  # evidence, in nats, up to which two sets explain the data equally well
+PART = 0.1  # share of an effect's gain that others must gain in its place before they are fitted
 RENEWED = 8  # values by which derivatives are computed again beside a candidate
 MOST_REFUSED = 9  # candidates that are refused one after another before none is added
 FEW = 2  # effects that are added together as if they were one
@@ -185,7 +186,7 @@ def with_one_more(
     ground: Ground,
     candidates: Candidates,
     passed_over: Collection[frozenset[str]] = (),
-    rival: str | None = None,
+    instead_of: Found | None = None,
     pairs: bool = False,
 ) -> list[Found]:
     """The set with each of the few best candidates, whose values are fitted in a few steps.
@@ -194,27 +195,31 @@ def with_one_more(
         ground: where sets are compared.
         candidates: the candidates beside the set.
         passed_over: names of the entries of candidates that are not tried.
-        rival: name of an entry; others are tried in its place if they are estimated to gain a quarter as much.
+        instead_of: the set with another effect, which is not tried. Only candidates are fitted that gain a tenth of
+            what it gains.
         pairs: whether to try two candidates together.
     """
     rough, found, joints = candidates.rough, candidates.found, candidates.joints
     least = 0.5 * ENOUGH * len(rough.blocks) / len(ground.base.fit.blocks)
+    if instead_of is not None:
+        passed_over = [*passed_over, instead_of.names - found.names]
     leads = [
         lead
         for lead in candidates.leads
-        if lead.names - found.names not in {frozenset({rival}), *passed_over} and not lead.names <= found.names
+        if lead.names - found.names not in passed_over and not lead.names <= found.names
     ]
-    if rival is None or pairs:
+    if instead_of is None or pairs:
         leads = [lead for lead in leads if lead.evidence > least]
-    else:
-        gain = max((lead.gain for lead in candidates.leads if lead.names == {rival}), default=0.0)
-        leads = [lead for lead in leads if lead.gain > 0.25 * gain]
     if pairs:
         leads = candidates.gains.pairs([lead for lead in leads if not _kinds(lead) & _kinds_of(found)])
     is_new = joints is not None and joints.names - found.names not in {frozenset(), *passed_over}
-    if rival is None and not pairs and joints and is_new and joints.evidence > least:
+    if instead_of is None and not pairs and joints and is_new and joints.evidence > least:
         leads = [joints, *(lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names)]
-    best = _best_simulated(rough, [candidates.sizes(lead) for lead in leads[:TRIED]])
+    bar = -math.inf
+    if instead_of is not None:
+        without = _score(rough, found.effects)
+        bar = without + PART * (_score(rough, instead_of.effects) - without)
+    best = _best_simulated(rough, [candidates.sizes(lead) for lead in leads[:TRIED]], bar)
     return [one for one in _sketched(ground, candidates, best) if is_usable(ground, one, found)]
 
 
@@ -226,8 +231,8 @@ def _kinds_of(found: Found) -> set[type]:
     return {type(effect) for effect in found.effects}
 
 
-def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> list[Set]:
-    """The sets of the best candidates by their score, each at the best of its sizes.
+def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]], bar: float = -math.inf) -> list[Set]:
+    """The sets of the best candidates by their score, each at the best of its sizes, if it is above a bar.
 
     Other sizes than the first are simulated of those candidates alone that are among the best at it.
     """
@@ -237,7 +242,7 @@ def _best_simulated(rough: Predictions, candidates: Sequence[Sequence[Set]]) -> 
         sizes = [(score, first), *((_score(rough, size[1]), size) for size in others)]
         scored[index] = (*max(sizes, key=lambda one: one[0]), ())
     scored.sort(key=lambda one: -one[0])
-    return [one for score, one, _ in scored[:BEGUN] if score > -math.inf]
+    return [one for score, one, _ in scored[:BEGUN] if score > bar]
 
 
 def _score(rough: Predictions, effects: Sequence[Effect]) -> float:

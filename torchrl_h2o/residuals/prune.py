@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from itertools import chain
 
-from torchrl_h2o.effects import is_negligible
+from torchrl_h2o.effects import Effect, is_negligible
 from torchrl_h2o.likelihood import Difference
 from torchrl_h2o.residuals.elements import all_elements
 from torchrl_h2o.residuals.ground import GROWN, Found, Ground, kind_of
@@ -28,6 +28,7 @@ from torchrl_h2o.residuals.sweep import Direction
 
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
 SWAPS = 4  # largest number of effects that are replaced by others
+FOLLOWED = 3  # sets that explain the data as well, from which the search goes on
 
 
 def prune(ground: Ground, found: Found) -> Found:
@@ -86,28 +87,72 @@ def replaced(
 ) -> tuple[Found, list[list[Found]]]:
     """Replaces effects by better or more usual ones, and lists for each effect those that explain the data as well.
 
-    The same effect on each of several joints or motors stays; terms of a force are replaced one by one.
+    A set that explains the data as well as the one found is as good a place to go on from. So the other effects of the
+    best of these sets are replaced, too: two effects may be wrong together, each of them right beside the other.
+    """
+    for swaps_left in reversed(range(SWAPS + 1)):
+        better, alike = _rivals(ground, found, directions, advance, bool(swaps_left))
+        if not better and swaps_left:
+            better = _beyond(ground, found, alike, directions, advance)
+        if not better:
+            break
+        found = prune(ground, most_usual(better))
+    return found, alike
+
+
+def _rivals(
+    ground: Ground, found: Found, directions: Sequence[Direction], advance: Callable[[], object], may_swap: bool
+) -> tuple[list[Found], list[list[Found]]]:
+    """Sets that are better by another effect in an effect's place, and for each effect those that are as good.
+
+    The same effect on each of several joints or motors stays; terms of a force are replaced one by one. The better sets
+    are those of the first effect that has such; there are none unless ``may_swap``.
     """
     alike: list[list[Found]] = []
-    swaps = 0
-    while len(alike) < len(found.entries):
+    for entry, effect in zip(found.entries, found.effects, strict=True):
         advance()
-        entry, effect = found.entries[len(alike)], found.effects[len(alike)]
-        if sum(kind_of(other) == kind_of(effect) for other in found.effects) > 1:
+        if not _is_alone(effect, found):
             alike.append([])
             continue
         fewer = ground.fitted(*found.without({entry.name}))
         candidates = Candidates.of(ground, fewer, directions)
-        others = _alike(ground, found, fewer, with_one_more(ground, candidates, rival=entry.name))
+        others = _alike(ground, found, fewer, with_one_more(ground, candidates, instead_of=found))
         if not others:  # two effects say no more than one that explains the data as well
-            pairs = with_one_more(ground, candidates, [frozenset({entry.name})], pairs=True)
+            pairs = with_one_more(ground, candidates, instead_of=found, pairs=True)
             others = _alike(ground, found, fewer, pairs)
-        better = [one for one in others if is_preferred(one, found) and _is_worth_it(ground, one, found, directions)]
-        if better and swaps < SWAPS:
-            found, alike, swaps = prune(ground, most_usual(better)), [], swaps + 1
-        else:
-            alike.append(sorted(others, key=lambda one: -one.scores.mean()))
-    return found, alike
+        if may_swap and (better := _better(ground, others, found, directions)):
+            return better, alike
+        alike.append(sorted(others, key=lambda one: -one.scores.mean()))
+    return [], alike
+
+
+def _beyond(
+    ground: Ground,
+    found: Found,
+    alike: Sequence[Sequence[Found]],
+    directions: Sequence[Direction],
+    advance: Callable[[], object],
+) -> list[Found]:
+    """Sets that are better than the one found and differ in an effect from one that explains the data as well."""
+    rivals = sorted(chain.from_iterable(alike), key=lambda one: -one.scores.mean())
+    for rival in rivals[:FOLLOWED]:
+        for entry, effect in zip(rival.entries, rival.effects, strict=True):
+            if entry.name in found.names and _is_alone(effect, rival):
+                advance()
+                fewer = ground.found(*rival.without({entry.name}))
+                candidates = Candidates.of(ground, fewer, directions)
+                others = _alike(ground, rival, fewer, with_one_more(ground, candidates, instead_of=rival))
+                if better := _better(ground, others, found, directions):
+                    return better
+    return []
+
+
+def _is_alone(effect: Effect, found: Found) -> bool:
+    return sum(kind_of(other) == kind_of(effect) for other in found.effects) == 1
+
+
+def _better(ground: Ground, others: Sequence[Found], found: Found, directions: Sequence[Direction]) -> list[Found]:
+    return [one for one in others if is_preferred(one, found) and _is_worth_it(ground, one, found, directions)]
 
 
 def _alike(ground: Ground, found: Found, fewer: Found, sketched: Sequence[Found]) -> list[Found]:
