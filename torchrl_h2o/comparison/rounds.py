@@ -13,8 +13,6 @@ from torchrl_h2o.comparison.figures import save_figure
 from torchrl_h2o.comparison.markdown import markdown_table
 from torchrl_h2o.training.methods import METHODS
 
-RUN = ["task", "method", "seed"]
-
 
 def rounds_of(runs: pd.DataFrame) -> pd.DataFrame:
     """Arranges stored runs of sim_to_real.py as a row per round, with the names of task and method.
