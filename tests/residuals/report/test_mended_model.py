@@ -31,7 +31,7 @@ from torchrl_h2o.effects import (
     RollingResistance,
     Timestep,
 )
-from torchrl_h2o.envs import WheelLeggedEnv
+from torchrl_h2o.envs import WheelLeggedEnv, mujoco_model
 from torchrl_h2o.residuals import Simulation
 from torchrl_h2o.residuals.report.mended_model import save_mended_model
 
@@ -107,6 +107,14 @@ def test_the_file_predicts_what_the_mended_simulation_does(case, tmp_path):
     expected, before = one_step(simulation.with_effects(*effects)), one_step(simulation)
     np.testing.assert_allclose(one_step(of_file), expected, rtol=0.0, atol=1e-10)
     assert np.nanmax(np.abs(expected - before)) > 0.1
+
+
+def test_a_simulation_draws_no_textures_and_the_file_has_those_of_the_model(tmp_path):
+    simulation = Simulation.from_env(GymEnv("HalfCheetah-v5"))
+    assert simulation.model.ntexdata < 100
+    save_mended_model(simulation, [Gravity(1.2)], tmp_path)
+    drawn = mujoco.MjModel.from_xml_path(str(tmp_path / "mended.xml"))
+    assert drawn.ntexdata == mujoco_model(GymEnv("HalfCheetah-v5")).ntexdata > 1e5
 
 
 def test_what_is_left_out_is_described_with_the_units_of_the_joint(tmp_path):
