@@ -28,7 +28,7 @@ from torchrl_h2o.residuals.sweep import Direction
 
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
 SWAPS = 4  # largest number of effects that are replaced by others
-FOLLOWED = 3  # sets that explain the data as well, from which the search goes on
+FOLLOWED = 2  # sets that explain the data as well, from which the search goes on
 
 
 def prune(ground: Ground, found: Found) -> Found:
