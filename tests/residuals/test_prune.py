@@ -10,7 +10,7 @@ from torchrl_h2o.effects import ActionBias, ActionGain, BodyMass, Gravity, Joint
 from torchrl_h2o.residuals.ground import Ground
 from torchrl_h2o.residuals.prune import prune, replaced
 from torchrl_h2o.residuals.search import known_set
-from torchrl_h2o.residuals.sweep import sweep
+from torchrl_h2o.residuals.sweep import Direction, sweep
 
 KINDS = (ActionBias, ActionGain, Gravity, JointDamping, JointForce)
 FRICTION = JointFrictionLoss(0.001, "shoulder"), JointFrictionLoss(0.02, "elbow")
@@ -74,7 +74,7 @@ def test_a_usual_effect_takes_the_place_of_an_unusual_one_that_explains_hardly_m
     assert replaced(ground, gravity, [], lambda: None)[0] is (damping if takes_the_place else gravity)
 
 
-def test_two_effects_that_are_wrong_together_are_replaced_one_after_the_other(monkeypatch):
+def test_an_effect_that_is_on_the_wrong_joint_beside_another_wrong_one_is_put_on_the_right_one(monkeypatch):
     """Neither alone has a better one in its place. Beside what explains as much as the first, the second has."""
     simulation = double_pendulum()
     gain, mass = ActionGain(0.9), BodyMass(1.1)
@@ -99,6 +99,7 @@ def test_two_effects_that_are_wrong_together_are_replaced_one_after_the_other(mo
     monkeypatch.setattr("torchrl_h2o.residuals.prune.with_one_more", beside)
     monkeypatch.setattr("torchrl_h2o.residuals.prune.prune", lambda _, found: found)
     ground = Ground.of(simulation, recorded(simulation.with_effects(gain), 400))
-    found, alike = replaced(ground, start, [], lambda: None)
+    directions = [Direction(entry, {}, np.zeros(0)) for entry in simulation.catalogue()]
+    found, alike = replaced(ground, start, directions, lambda: None)
     assert found is right
     assert alike == [[], []]

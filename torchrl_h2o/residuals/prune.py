@@ -28,7 +28,7 @@ from torchrl_h2o.residuals.sweep import Direction
 
 SURE = 3.0  # multiple of the evidence that an effect needs, beyond which an estimate of it is enough
 SWAPS = 4  # largest number of effects that are replaced by others
-FOLLOWED = 2  # sets that explain the data as well, from which the search goes on
+FOLLOWED = 3  # sets that explain the data as well, from which the search goes on
 
 
 def prune(ground: Ground, found: Found) -> Found:
@@ -88,7 +88,8 @@ def replaced(
     """Replaces effects by better or more usual ones, and lists for each effect those that explain the data as well.
 
     A set that explains the data as well as the one found is as good a place to go on from. So the other effects of the
-    best of these sets are replaced, too: two effects may be wrong together, each of them right beside the other.
+    best of these sets are tried on other joints, motors or geoms. Two effects may be wrong together, such as a weak
+    motor and the friction of one wheel in place of a heavy body and the friction of both.
     """
     for swaps_left in reversed(range(SWAPS + 1)):
         better, alike = _rivals(ground, found, directions, advance, bool(swaps_left))
@@ -133,14 +134,17 @@ def _beyond(
     directions: Sequence[Direction],
     advance: Callable[[], object],
 ) -> list[Found]:
-    """Sets that are better than the one found and differ in an effect from one that explains the data as well."""
+    """Better sets than the one found: those that explain the data as well, with an effect on other elements."""
     rivals = sorted(chain.from_iterable(alike), key=lambda one: -one.scores.mean())
     for rival in rivals[:FOLLOWED]:
         for entry, effect in zip(rival.entries, rival.effects, strict=True):
-            if entry.name in found.names and _is_alone(effect, rival):
+            elsewhere = [
+                one for one in directions if type(one.entry.effect) is type(effect) and one.entry.name != entry.name
+            ]
+            if elsewhere and entry.name in found.names and _is_alone(effect, rival):
                 advance()
                 fewer = ground.found(*rival.without({entry.name}))
-                candidates = Candidates.of(ground, fewer, directions)
+                candidates = Candidates.of(ground, fewer, elsewhere)
                 others = _alike(ground, rival, fewer, with_one_more(ground, candidates, instead_of=rival))
                 if better := _better(ground, others, found, directions):
                     return better
