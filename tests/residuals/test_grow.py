@@ -112,6 +112,25 @@ def test_joints_that_were_refused_together_are_not_tried_again_beside_one_of_the
     assert refused not in [one.names - less.names for one in with_one_more(ground, candidates, [refused])]
 
 
+def test_in_an_effects_place_only_candidates_are_fitted_that_gain_a_part_of_what_it_gains(monkeypatch):
+    ground = Ground.of(SIMULATION, recorded(SIMULATION.with_effects(Gravity(1.3)), 800))
+    gravity, nothing = (
+        ground.found(*pair) for pair in (((entry_of(Gravity(), CATALOGUE),), (Gravity(1.3),)), ((), ()))
+    )
+    candidates = Candidates.of(ground, nothing, sweep(ground.rough(()), CATALOGUE))
+    rough, fitted = candidates.rough, []
+    assert candidates.gains.score == pytest.approx(rough.score(()))
+    monkeypatch.setattr("torchrl_h2o.residuals.grow._sketched", lambda _, __, sets: fitted.append(sets) or [])
+    for part in (-1e9, 0.1, 0.9):
+        monkeypatch.setattr("torchrl_h2o.residuals.grow.PART", part)
+        with_one_more(ground, candidates, instead_of=gravity)
+    every, some, few = fitted
+    assert len(every) > len(some) >= len(few)
+    gains = [rough.score(effects) - rough.score(()) for _, effects in some]
+    assert min(gains, default=1e9) > 0.1 * (rough.score((Gravity(1.3),)) - rough.score(()))
+    assert all("Gravity" not in (one.name for one in entries) for entries, _ in every)
+
+
 def test_of_sets_that_explain_equally_well_the_one_of_all_joints_is_taken():
     of_all, of_one = (
         Found((entry_of(effect, CATALOGUE),), (effect,), scores)

@@ -145,6 +145,11 @@ class Gains:
         return root, np.log(root)
 
     @property
+    def score(self) -> float:
+        """Mean score of the blocks with the present effects, in nats; see :meth:`Predictions.score`."""
+        return float(self.share @ (log_density(self.white) + np.log(self.inverse))) / self.num_blocks
+
+    @property
     def num_blocks(self) -> int:
         """Number of blocks."""
         return int(self.block.max()) + 1

@@ -195,8 +195,8 @@ def with_one_more(
         ground: where sets are compared.
         candidates: the candidates beside the set.
         passed_over: names of the entries of candidates that are not tried.
-        instead_of: the set with another effect, which is not tried. Only candidates are fitted that gain a tenth of
-            what it gains.
+        instead_of: the set with another effect, which is not tried. Only candidates are fitted that gain at least the
+            share ``PART`` of what it gains.
         pairs: whether to try two candidates together.
     """
     rough, found, joints = candidates.rough, candidates.found, candidates.joints
@@ -217,7 +217,7 @@ def with_one_more(
         leads = [joints, *(lead for lead in leads if len(lead.names) == 1 or not lead.names <= joints.names)]
     bar = -math.inf
     if instead_of is not None:
-        without = _score(rough, found.effects)
+        without = candidates.gains.score
         bar = without + PART * (_score(rough, instead_of.effects) - without)
     best = _best_simulated(rough, [candidates.sizes(lead) for lead in leads[:TRIED]], bar)
     return [one for one in _sketched(ground, candidates, best) if is_usable(ground, one, found)]

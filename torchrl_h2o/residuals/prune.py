@@ -152,10 +152,12 @@ def _beyond(
 
 
 def _is_alone(effect: Effect, found: Found) -> bool:
+    """Whether a set has no other effect of this kind."""
     return sum(kind_of(other) == kind_of(effect) for other in found.effects) == 1
 
 
 def _better(ground: Ground, others: Sequence[Found], found: Found, directions: Sequence[Direction]) -> list[Found]:
+    """Those of other sets that may take the place of the one found."""
     return [one for one in others if is_preferred(one, found) and _is_worth_it(ground, one, found, directions)]
 
 
