@@ -84,10 +84,8 @@ def train(cfg: DictConfig, folder: Path) -> None:
         gamma=cfg.gamma,
     )
 
-    # Environments: to collect, to evaluate during training, and to choose the best policy
+    # Environment in which transitions are collected
     simulator = task.make_training_simulator(cfg.num_worlds, preprocessing)
-    evaluator = evaluator_of(cfg, task, preprocessing)  # in reality; with overlap=true, beside the next updates
-    trials = task.make_training_simulator(cfg.trial_episodes, preprocessing) if keeps_best(cfg) else None
     observation_dim = simulator.observation_spec["observation"].shape[-1]
     action_spec = simulator.action_spec_unbatched
     action_dim = action_spec.shape[-1]
@@ -120,10 +118,10 @@ def train(cfg: DictConfig, folder: Path) -> None:
     # Contents of a checkpoint; with keep=best_in_simulator also the policy with the highest return in the simulator
     parts = {"actor": actor, "loss": loss, "optimiser": optimiser, "schedule": schedule}
     parts |= {"replay": replay, "episodes": episodes}
-    best = None
-    if trials is not None:
-        best = BestPolicy(actor, trials, cfg.trial_episodes)
+    best = BestPolicy(actor) if keeps_best(cfg) else None
+    if best is not None:
         parts["policy"] = best.policy
+    evaluator = evaluator_of(cfg, task, preprocessing, best)  # with overlap=true beside the next updates
     training = Training("H2O+", folder, budget, **parts)
     setup_s = time.perf_counter() - start
 
@@ -162,7 +160,6 @@ def train(cfg: DictConfig, folder: Path) -> None:
                     evaluator,
                     actor,
                     epoch,
-                    **({} if best is None else best.consider(actor)),
                     ratio_of_sim=float(ratio_loss.dynamics_ratio(batch)[~batch["real"]].mean()),
                     **{name: term.item() for name, term in losses.items()},
                 )

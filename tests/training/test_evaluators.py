@@ -16,19 +16,21 @@ from torchrl_h2o.training.evaluators import evaluator_of
 from torchrl_h2o.training.loop import train
 from torchrl_h2o.training.methods import METHODS
 from torchrl_h2o.training.progress import Budget, Training
-from torchrl_h2o.training.returns import Evaluation
+from torchrl_h2o.training.returns import BestPolicy
 
 
 @pytest.fixture
 def evaluators(compose):
-    """Evaluators of the same run in this process and in a second one, and a policy."""
-    chosen = []
-    for overlap in ("false", "true"):
-        cfg, _ = compose(f"overlap={overlap}")
-        chosen.append(evaluator_of(cfg, task_of(cfg), preprocessing_of(cfg)))
+    """Evaluators of the same run in this process and in a second one, the best policies of both, and a policy."""
     torch.manual_seed(0)
-    spec = task_of(cfg).make_reality().action_spec_unbatched
-    yield *chosen, make_actor(4, spec, [8, 8])
+    cfg, _ = compose()
+    actor = make_actor(4, task_of(cfg).make_reality().action_spec_unbatched, [8, 8])
+    chosen, best = [], []
+    for overlap in ("false", "true"):
+        cfg, _ = compose(f"overlap={overlap}", "keep=best_in_simulator")
+        best.append(BestPolicy(actor))
+        chosen.append(evaluator_of(cfg, task_of(cfg), preprocessing_of(cfg), best[-1]))
+    yield *chosen, best, actor
     for evaluator in chosen:
         evaluator.close()
 
@@ -46,13 +48,16 @@ def refuse_with_a_lambda(observation):
 @pytest.mark.slow
 def test_a_second_process_gives_the_returns_and_the_errors_of_this_one(evaluators):
     """One test, because starting a process takes as long as all of it."""
-    here, beside, actor = evaluators
-    for _ in range(2):  # the policy as it is at the start
+    here, beside, best, actor = evaluators
+    for _ in range(3):  # the policy as it is at the start
         here.start(actor)
         beside.start(actor)
         for parameter in actor.parameters():
             parameter.data.mul_(1.5)
-        assert beside.result() == here.result()
+        found = here.result()
+        assert beside.result() == found
+        assert found["return_kept"] >= found["return_trial"]
+    torch.testing.assert_close(best[0].policy.state_dict(), best[1].policy.state_dict())
 
     beside.start(TensorDictModule(refuse, in_keys=["observation"], out_keys=["action"]))
     with pytest.raises(ValueError, match="no action for"):
@@ -71,7 +76,7 @@ def test_a_second_process_gives_the_returns_and_the_errors_of_this_one(evaluator
 
 @pytest.mark.slow
 def test_a_second_process_whose_result_nobody_reads_ends_without_an_error(evaluators, capfd):
-    _, beside, actor = evaluators
+    _, beside, _, actor = evaluators
     (process,) = multiprocessing.active_children()
     beside.start(actor)
     while not beside.is_done:
@@ -92,7 +97,7 @@ class Waiting:
         self.weights.append(policy.weight.item())
 
     def result(self):
-        return Evaluation([self.weights[-1]], [1])
+        return {"return_real": self.weights[-1]}
 
 
 def advance(folder, evaluator, done_before=None, stop_before=None):

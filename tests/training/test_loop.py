@@ -55,18 +55,19 @@ def test_the_policy_that_was_best_in_the_simulator_is_handed_over(compose, tmp_p
 
 
 @pytest.mark.parametrize(("returns", "kept"), [((5.0, 3.0, 4.0), 0), ((5.0, 7.0, 6.0), 1), ((5.0, 4.0, 8.0), 2)])
-def test_the_policy_is_never_worse_in_the_simulator_than_where_the_training_began(monkeypatch, returns, kept):
-    policies = [torch.nn.Linear(1, 1) for _ in returns]
-    of_policy = {float(one.weight.detach()): value for one, value in zip(policies, returns, strict=True)}
-    monkeypatch.setattr(
-        "torchrl_h2o.training.returns.evaluate",
-        lambda env, policy, episodes, seed: Evaluation([of_policy[float(policy.weight.detach())]], [1]),
-    )
-    best = BestPolicy(policies[0], None, 1)
-    considered = [best.consider(one) for one in policies[1:]]
+def test_the_policy_is_never_worse_in_the_simulator_than_where_the_training_began(returns, kept):
+    weights = range(len(returns))
+    actor = torch.nn.Linear(1, 1, bias=False)
+    actor.weight.data.fill_(0.0)
+    best, considered = BestPolicy(actor), []
+    for weight in weights[1:]:
+        actor.weight.data.fill_(weight)
+        tried = best.to_evaluate(actor)
+        actor.weight.data.fill_(-1.0)  # the training goes on during the evaluation
+        considered.append(best.consider([Evaluation([returns[int(policy.weight)]], [1]) for policy in tried]))
     assert [one["return_trial"] for one in considered] == list(returns[1:])
     assert best_trial(considered) == max(returns)
-    assert best.policy.weight == policies[kept].weight
+    assert best.policy.weight == kept
 
 
 def test_a_policy_is_judged_by_the_lower_bound_of_its_return():

@@ -6,9 +6,10 @@ import multiprocessing
 import pickle
 import signal
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from multiprocessing.connection import Connection
 
 import torch
@@ -16,14 +17,18 @@ from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
 from torchrl_h2o.training.preprocessing import Preprocessing
-from torchrl_h2o.training.returns import Evaluation, evaluate
+from torchrl_h2o.training.returns import SEED, TRIAL_SEED, BestPolicy, Evaluation, evaluate
 from torchrl_h2o.training.task import Task
+
+Outcome = tuple[Evaluation, list[Evaluation]]  # in reality, and of each policy in the simulator
 
 ENDS_WITHIN = 3.0  # s, after which a second process that still evaluates is ended
 
 
-def evaluator_of(cfg: DictConfig, task: Task, preprocessing: Preprocessing) -> Evaluator:
-    """Builds the evaluator of a run, in ``reality``.
+def evaluator_of(
+    cfg: DictConfig, task: Task, preprocessing: Preprocessing, best: BestPolicy | None = None
+) -> Evaluator:
+    """Builds the evaluator of a run: in ``reality``, and with ``keep=best_in_simulator`` also in the simulator.
 
     With ``overlap=true`` it evaluates in a second process. The returns are the same, because an evaluation has its own
     random numbers.
@@ -32,34 +37,111 @@ def evaluator_of(cfg: DictConfig, task: Task, preprocessing: Preprocessing) -> E
         cfg: the run's configuration.
         task: its task.
         preprocessing: preprocessing of the observations.
+        best: stores the policy that is the best in the simulator; None with ``keep=last``.
     """
-    make_env = partial(task.make_reality, cfg.eval_episodes, preprocessing)
-    return (SecondProcess if cfg.overlap else ThisProcess)(make_env, cfg.eval_episodes)
+    make_trials = partial(task.make_training_simulator, cfg.trial_episodes, preprocessing)
+    grounds = Grounds(
+        Episodes(partial(task.make_reality, cfg.eval_episodes, preprocessing), cfg.eval_episodes, SEED),
+        None if best is None else Episodes(make_trials, cfg.trial_episodes, TRIAL_SEED),
+    )
+    return Evaluator((SecondProcess if cfg.overlap else ThisProcess)(grounds), best)
+
+
+class Evaluator:
+    """Evaluates one policy at a time.
+
+    Args:
+        process: where it evaluates.
+        best: stores the policy that is the best in the simulator; None evaluates in ``reality`` alone.
+    """
+
+    def __init__(self, process: ThisProcess | SecondProcess, best: BestPolicy | None) -> None:
+        self._process, self._best = process, best
+
+    @property
+    def is_done(self) -> bool:
+        """Whether :meth:`result` returns without waiting."""
+        return self._process.is_done
+
+    def start(self, policy: torch.nn.Module) -> None:
+        """Begins to evaluate a policy with its present parameters."""
+        self._process.start([policy] if self._best is None else self._best.to_evaluate(policy))
+
+    def result(self) -> dict[str, float]:
+        """Waits for the evaluation, and stores the policy if it is the best in the simulator so far.
+
+        Returns:
+            Metrics by column of metrics.csv.
+        """
+        in_reality, in_simulator = self._process.result()
+        return {**in_reality.metrics(), **({} if self._best is None else self._best.consider(in_simulator))}
+
+    def close(self) -> None:
+        """Ends the evaluator's process, if it has one."""
+        self._process.close()
+
+
+class Episodes:
+    """The episodes of an evaluation. Their environment is built when it is first needed.
+
+    Args:
+        make_env: builds the environment.
+        episodes: number of episodes.
+        seed: seed of the first one.
+    """
+
+    def __init__(self, make_env: Callable[[], EnvBase], episodes: int, seed: int) -> None:
+        self._make_env, self._episodes, self._seed = make_env, episodes, seed
+
+    @cached_property
+    def _env(self) -> EnvBase:
+        return self._make_env()
+
+    def run(self, policy: torch.nn.Module) -> Evaluation:
+        """Runs all of them with a policy."""
+        return evaluate(self._env, policy, self._episodes, self._seed)
+
+
+@dataclass(frozen=True)
+class Grounds:
+    """Where policies are evaluated.
+
+    Args:
+        reality: episodes in ``reality``.
+        simulator: episodes in the simulator; None for none.
+    """
+
+    reality: Episodes
+    simulator: Episodes | None
+
+    def evaluate(self, policies: Sequence[torch.nn.Module]) -> Outcome:
+        """Evaluates the last policy in ``reality``, and each one in the simulator."""
+        tried = [] if self.simulator is None else [self.simulator.run(policy) for policy in policies]
+        return self.reality.run(policies[-1]), tried
 
 
 class ThisProcess:
-    """Evaluates one policy at a time: in this process, as soon as it gets one.
+    """Evaluates in this process, as soon as it gets policies.
 
     Args:
-        make_env: builds ``reality``.
-        episodes: number of episodes of an evaluation.
+        grounds: where.
     """
 
     is_done = True
 
-    def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
-        self._env, self._episodes = make_env(), episodes
+    def __init__(self, grounds: Grounds) -> None:
+        self._grounds = grounds
 
-    def start(self, policy: torch.nn.Module) -> None:
-        """Begins to evaluate a policy with its present parameters."""
-        self._result = evaluate(self._env, policy, self._episodes)
+    def start(self, policies: Sequence[torch.nn.Module]) -> None:
+        """Begins to evaluate policies, see :meth:`Grounds.evaluate`."""
+        self._result = self._grounds.evaluate(policies)
 
-    def result(self) -> Evaluation:
-        """The evaluation of the last policy; waits for it."""
+    def result(self) -> Outcome:
+        """The evaluations of the last policies; waits for them."""
         return self._result
 
     def close(self) -> None:
-        """Ends the evaluator's process, if it has one."""
+        """Ends the process, if it is a second one."""
 
 
 class SecondProcess:
@@ -68,10 +150,10 @@ class SecondProcess:
     The second process ends when the pipe closes, also if this process is killed.
     """
 
-    def __init__(self, make_env: Callable[[], EnvBase], episodes: int) -> None:
+    def __init__(self, grounds: Grounds) -> None:
         context = multiprocessing.get_context("spawn")  # a forked process would share locks of torch's threads
         self._pipe, theirs = context.Pipe()
-        arguments = (theirs, make_env, episodes, torch.get_num_threads())
+        arguments = (theirs, grounds, torch.get_num_threads())
         self._process = context.Process(target=_evaluate_what_comes, args=arguments, daemon=True)
         self._process.start()
         theirs.close()
@@ -81,11 +163,11 @@ class SecondProcess:
         """Whether :meth:`result` returns without waiting."""
         return self._pipe.poll()
 
-    def start(self, policy: torch.nn.Module) -> None:
+    def start(self, policies: Sequence[torch.nn.Module]) -> None:
         with _other_end():
-            self._pipe.send_bytes(pickle.dumps(policy))
+            self._pipe.send_bytes(pickle.dumps(policies))
 
-    def result(self) -> Evaluation:
+    def result(self) -> Outcome:
         with _other_end():
             outcome = self._pipe.recv()
         if isinstance(outcome, Exception):
@@ -99,9 +181,6 @@ class SecondProcess:
         self._process.join()
 
 
-Evaluator = ThisProcess | SecondProcess
-
-
 @contextmanager
 def _other_end() -> Iterator[None]:
     """Says what to do if the process at the other end of the pipe has ended."""
@@ -113,18 +192,17 @@ def _other_end() -> Iterator[None]:
         ) from None
 
 
-def _evaluate_what_comes(pipe: Connection, make_env: Callable[[], EnvBase], episodes: int, threads: int) -> None:
+def _evaluate_what_comes(pipe: Connection, grounds: Grounds, threads: int) -> None:
     """Evaluates the policies that come through a pipe, until it is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; this one ends with the other
     torch.set_num_threads(threads)
-    env = make_env()
     while True:
         try:
-            policy = pickle.loads(pipe.recv_bytes())
+            policies = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError):  # OSError: the other end was closed before it had read the last result
             return
         try:
-            outcome = evaluate(env, policy, episodes)
+            outcome = grounds.evaluate(policies)
         except Exception as error:  # raised in the training's process
             outcome = _sendable(error)
         try:

@@ -74,7 +74,6 @@ class Trainee:
         self.components = self.learner.components
         self.make_pairs = partial(make_pairs, cfg, task, preprocessing=self._preprocessing, replay=replay)
         self._open = ExitStack()
-        self.evaluator = self._open.enter_context(closing(evaluator_of(cfg, task, self._preprocessing)))
         self._collector = self._best = None
         if self.learner.simulates:
             simulator = task.make_training_simulator(cfg.num_worlds, self._preprocessing)
@@ -82,9 +81,10 @@ class Trainee:
             self._rollouts = iter(self._collector)
             self.components["episodes"] = self._episodes = OngoingEpisodes(self._collector)
             if keeps_best(cfg):
-                trials = task.make_training_simulator(cfg.trial_episodes, self._preprocessing)
-                self._best = BestPolicy(self._actor, trials, cfg.trial_episodes)
+                self._best = BestPolicy(self._actor)
                 self.components["policy"] = self._best.policy
+        evaluator = evaluator_of(cfg, task, self._preprocessing, self._best)
+        self.evaluator = self._open.enter_context(closing(evaluator))
 
     @property
     def policy(self) -> torch.nn.Module:
@@ -117,15 +117,6 @@ class Trainee:
         simulated = next(self._rollouts)
         simulated["next", "reward"] = self._preprocessing.reward(simulated["next", "reward"])
         self.learner.replay.extend(simulated)
-
-    def look(self) -> dict[str, float]:
-        """Metrics of the current networks; with ``keep=best_in_simulator``, stores the policy if it is the best so far.
-
-        Returns:
-            Metrics by name, without those of an evaluation in ``reality``.
-        """
-        best = {} if self._best is None else self._best.consider(self.actor)
-        return {**best, **self.learner.figures(*self.learner.batches)}
 
     def close(self) -> None:
         """Ends the processes of the collector and of the evaluator."""
@@ -168,7 +159,7 @@ def train(method: Method, cfg: DictConfig, real: TensorDictBase, directory: Path
                 training.check(losses)
             schedule.step()
             if evaluating:
-                figures = {name: loss.item() for name, loss in losses.items()}
-                figures = {**trainee.look(), **figures}
+                figures = learner.figures(*learner.batches)
+                figures |= {name: loss.item() for name, loss in losses.items()}
                 training.evaluate(trainee.evaluator, trainee.actor, epoch, **figures)
     return trainee.policy, training

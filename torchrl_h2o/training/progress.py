@@ -183,7 +183,7 @@ class Training:
         The row is written to metrics.csv, and the mean return is shown beside the progress bar.
 
         Args:
-            evaluator: evaluates in ``reality``; if it does so in a second process, the training goes on meanwhile.
+            evaluator: evaluates; if it does so in a second process, the training goes on meanwhile.
             policy: the policy.
             epoch: number of the epoch.
             **metrics: further metrics of the row.
@@ -197,7 +197,7 @@ class Training:
         if self._awaited is None:
             return
         (evaluator, epoch, metrics), self._awaited = self._awaited, None
-        self.progress["rows"].append(self._row(epoch, {**evaluator.result().metrics(), **metrics}))
+        self.progress["rows"].append(self._row(epoch, {**evaluator.result(), **metrics}))
         write_metrics(self.directory, self.name, self.progress["rows"])
         self._bar.set_postfix(return_real=f"{self.progress['rows'][-1]['return_real']:.0f}")
 

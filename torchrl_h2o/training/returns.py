@@ -154,30 +154,34 @@ class BestPolicy:
 
     Args:
         actor: the policy that is to be trained; this class keeps a copy.
-        simulator: the environment of the evaluations.
-        episodes: number of episodes per evaluation.
     """
 
-    def __init__(self, actor: torch.nn.Module, simulator: EnvBase, episodes: int) -> None:
+    def __init__(self, actor: torch.nn.Module) -> None:
         self.policy = deepcopy(actor)
-        self.simulator, self.episodes = simulator, episodes
         self._highest: float | None = None
+        self._trained = self.policy
 
-    def consider(self, actor: torch.nn.Module) -> dict[str, float]:
-        """Evaluates the actor in the simulator and stores it if no earlier one was better.
+    def to_evaluate(self, actor: torch.nn.Module) -> list[torch.nn.Module]:
+        """Copies the actor as it is now.
+
+        Returns:
+            The copy; at the first evaluation, also of a resumed training, the policy so far before it.
+        """
+        self._trained = deepcopy(actor)
+        return [self._trained] if self._highest is not None else [self.policy, self._trained]
+
+    def consider(self, evaluations: Sequence[Evaluation]) -> dict[str, float]:
+        """Stores the copied actor if no earlier policy was better.
 
         Args:
-            actor: the policy with its current parameters.
+            evaluations: in the simulator, of each policy of :meth:`to_evaluate`.
 
         Returns:
             Lower bounds of mean returns: the actor's, as ``return_trial``, and the best policy's, as ``return_kept``.
         """
-        if self._highest is None:  # at the first evaluation, also of a resumed training
-            self._highest = self._lower_bound(self.policy)
-        if (return_trial := self._lower_bound(actor)) >= self._highest:
-            self._highest = return_trial
-            self.policy.load_state_dict(actor.state_dict())
+        *first, return_trial = (evaluation.lower_bound for evaluation in evaluations)
+        highest = first[0] if self._highest is None else self._highest
+        if return_trial >= highest:
+            self.policy.load_state_dict(self._trained.state_dict())
+        self._highest = max(return_trial, highest)
         return {"return_trial": return_trial, "return_kept": self._highest}
-
-    def _lower_bound(self, policy: torch.nn.Module) -> float:
-        return evaluate(self.simulator, policy, self.episodes, TRIAL_SEED).lower_bound

@@ -169,11 +169,10 @@ def train_population(
                 if number in learner.failures:
                     training.note_failure(name, learner.failures[number])
                 elif evaluating:
-                    trainee.learner.batches = learner.batches_of(number)
+                    figures = trainee.learner.figures(*learner.batches_of(number))
                     losses = {key: term[number].item() for key, term in terms.items()}
                     trainee.evaluator.start(trainee.actor)
-                    figures = {**trainee.evaluator.result().metrics(), **trainee.look(), **losses}
-                    training.log_member(epoch, name, **figures)
+                    training.log_member(epoch, name, **trainee.evaluator.result(), **figures, **losses)
     return {name: _outcome(name, trainee, training) for name, trainee in trainees.items()}
 
 
